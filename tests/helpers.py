@@ -8,6 +8,7 @@ import gymnasium as gym
 import numpy as np
 
 import rejeu
+from rejeu.agents import Agent
 from rejeu.loops.learner import Readings
 from tests.sharing import shared_learners
 
@@ -45,7 +46,7 @@ def count_updates(agent: rejeu.SAC) -> list[int]:
 
 def assert_same_parameters(one: rejeu.SAC, two: rejeu.SAC) -> None:
     """Asserts that all parameters are equal, bit for bit."""
-    first, second = one.get_parameters(), two.get_parameters()
+    first, second = Agent.get_parameters(one), Agent.get_parameters(two)  # those of rejeu.sb3 are nested
     assert list(first) == list(second)
     for name, value in first.items():
         np.testing.assert_array_equal(value, second[name], err_msg=name)
@@ -53,5 +54,5 @@ def assert_same_parameters(one: rejeu.SAC, two: rejeu.SAC) -> None:
 
 def same_parameters(one: rejeu.SAC, two: rejeu.SAC) -> bool:
     """Returns whether all parameters are equal, bit for bit."""
-    first, second = one.get_parameters(), two.get_parameters()
+    first, second = Agent.get_parameters(one), Agent.get_parameters(two)  # those of rejeu.sb3 are nested
     return all(np.array_equal(value, second[name]) for name, value in first.items())
