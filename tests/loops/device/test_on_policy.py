@@ -10,11 +10,15 @@ import pytest
 
 import rejeu
 from rejeu.callbacks import Checkpoint
+from rejeu.envs.functional.cart_pole import CartPole
 from tests.jax_environments import Forbidden
 from tests.sharing import shared_learners
 
 SMALL: dict[str, Any] = {"n_steps": 16, "policy_kwargs": {"net_arch": [8]}, "seed": 3}
 PPO = {"batch_size": 8, "n_epochs": 2}
+LIMIT = 15
+SHORT = CartPole(max_episode_steps=LIMIT)
+"""Many episodes are truncated, and some terminate."""
 
 
 def make(kind: Any, env: Any, n_envs: int = 2, **settings: Any) -> Any:
@@ -40,9 +44,9 @@ def assert_same_runs(one: Any, two: Any, tolerance: float) -> None:
 @pytest.mark.parametrize(
     ("kind", "env", "settings"),
     [
-        (rejeu.PPO, "jax/CartPole-v1", {**PPO, "learning_rate": "lin_1e-3", "normalize": True}),
-        (rejeu.A2C, "jax/CartPole-v1", {"n_steps": 5}),
-        (rejeu.PQN, "jax/CartPole-v1", {**PPO, "exploration_fraction": 0.5}),
+        (rejeu.PPO, SHORT, {**PPO, "learning_rate": "lin_1e-3", "normalize": True}),
+        (rejeu.A2C, SHORT, {"n_steps": 5}),
+        (rejeu.PQN, SHORT, {**PPO, "exploration_fraction": 0.5}),
         pytest.param(rejeu.PPO, "jax/Pendulum-v1", {**PPO, "target_kl": 1e-4}, marks=pytest.mark.exhaustive),
         pytest.param(rejeu.PPO, "jax/Pendulum-v1", {**PPO, "use_sde": True}, marks=pytest.mark.exhaustive),
         pytest.param(rejeu.RecurrentPPO, "jax/CartPole-v1", PPO, marks=pytest.mark.exhaustive),
@@ -61,6 +65,8 @@ def test_training_equals_the_loop_of_the_host(kind: Any, env: Any, settings: dic
     assert host.stops is None
     assert device.n_updates > 2
     assert_same_runs(device, host, 1e-3)
+    if env is SHORT:
+        assert LIMIT in host.history["length"]
 
 
 def test_results_do_not_depend_on_where_chunks_end() -> None:
