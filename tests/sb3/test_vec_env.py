@@ -107,7 +107,7 @@ class Batch(VecEnv):
         self.closed = True
 
     def get_attr(self, attr_name, indices=None):
-        raise NotImplementedError
+        return [getattr(self, attr_name) for _ in (range(2) if indices is None else indices)]
 
     def set_attr(self, attr_name, value, indices=None):
         raise NotImplementedError

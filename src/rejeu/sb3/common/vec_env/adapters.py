@@ -236,7 +236,7 @@ class VecEnvAdapter(VectorEnv):
 def _first_attr(venv: VecEnv, name: str) -> Any:
     """Returns an attribute of the first environment, or None."""
     try:
-        found = venv.get_attr(name, 0)
+        found = venv.get_attr(name, [0])
     except (AttributeError, NotImplementedError):
         return None
     return found[0] if found else None
