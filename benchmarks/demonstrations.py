@@ -7,8 +7,9 @@
 ``offline``: two datasets of 20,000 steps, of the final policy of a SAC expert and of its policy after a part of its training
 with random actions in a tenth of the steps; BC, TD3+BC, IQL and ReBRAC learn from each alone. ``imitation``: BC from 10
 episodes of Gymnasium's scripted expert on LunarLander-v3, and DAgger with it, for the same number of gradient steps in each
-round. ``share``: SAC with HER with and without 20 episodes of an expert in half of each batch; the steps after which 90 % of
-the last 20 evaluation episodes succeeded. Each result is written when it is there, with command, commit and versions.
+round. ``share``: SAC with HER alone, with 20 episodes of an expert in half of each batch, and so after cloning them; the steps
+after which 90 % of 20 evaluation episodes succeeded, all that were taken if they never did. Each result is written when it is
+there, with command, commit and versions.
 """
 
 from __future__ import annotations
@@ -136,14 +137,14 @@ def imitation(arguments: argparse.Namespace) -> None:
 
 
 def share(arguments: argparse.Namespace) -> None:
-    """Compares learning with and without demonstrations in half of each batch."""
+    """Compares learning without demonstrations, with a share of them, and with a share after cloning."""
     env_id, results = arguments.env, []
     settings: dict[str, Any] = {
         "replay_buffer_class": "HerReplayBuffer",
-        "policy_kwargs": {"net_arch": [64, 64]},
+        "policy_kwargs": {"net_arch": [64, 64], "layer_norm": True},
         "batch_size": 128,
         "learning_rate": 1e-3,
-        "gamma": 0.98,
+        "gamma": arguments.gamma,
         "learning_starts": 500,
         "buffer_size": 100_000,
     }
@@ -153,10 +154,12 @@ def share(arguments: argparse.Namespace) -> None:
     folder = Path(tempfile.mkdtemp()) / "shown"
     shown = record(expert, env_id, 20, folder, seed=0)
     for seed in arguments.seeds:
-        for with_them in (False, True):
-            more = {"demonstrations": folder} if with_them else {}
+        for way in ("none", "share", "clone and share"):
+            more = {} if way == "none" else {"demonstrations": folder}
             agent = rejeu.SAC("MultiInputPolicy", env_id, seed=seed, **settings, **more)
             agent.on_device = False
+            if way == "clone and share":
+                clone(agent, shown, arguments.updates, batch_size=128, seed=seed)
             evaluate = Evaluate(env_id, arguments.every, 20, seed=10_000 + seed)
 
             def goes_on(agent: Any, turn: Any, evaluate: Evaluate = evaluate) -> bool:
@@ -166,7 +169,7 @@ def share(arguments: argparse.Namespace) -> None:
             agent.learn(arguments.steps, [evaluate, goes_on])
             rates = [(one.step, one.evaluation.success_rate) for one in evaluate.results]
             steps = next((step for step, rate in rates if rate >= 0.9), None)
-            one = {"seed": seed, "demonstrations": with_them, "steps_to_90": steps, "rates": rates}
+            one = {"seed": seed, "demonstrations": way, "steps_to_90": steps, "rates": rates}
             results.append({**one, "shown_return": shown.mean_return, "seconds": time.perf_counter() - began})
             write(arguments, results)
 
@@ -185,7 +188,8 @@ def summarized(results: list[dict[str, Any]]) -> list[dict[str, Any]]:
     measure = "steps_to_90" if "steps_to_90" in rows[0] else "mean_return"
     groups: dict[tuple[Any, ...], list[float]] = {}
     for row in rows:
-        groups.setdefault(tuple(row[name] for name in kinds), []).append(row[measure])
+        value = row["rates"][-1][0] if row[measure] is None else row[measure]
+        groups.setdefault(tuple(row[name] for name in kinds), []).append(value)
     return [{**dict(zip(kinds, key, strict=True)), **(summary(values) or {})} for key, values in groups.items()]
 
 
@@ -197,6 +201,7 @@ def main() -> None:
     parser.add_argument("--updates", type=int, default=10_000)
     parser.add_argument("--steps", type=int, default=40_000)
     parser.add_argument("--every", type=int, default=500)
+    parser.add_argument("--gamma", type=float, default=0.98)
     parser.add_argument("--expert-steps", type=int, default=30_000)
     parser.add_argument("--out", type=Path)
     arguments = parser.parse_args()
