@@ -55,7 +55,7 @@ def train_one(preset: presets.Preset, seed: int, arguments: argparse.Namespace) 
     backend = arguments.backend or preset.backend
     began = time.perf_counter()
 
-    def environments(n: int, seed: int) -> VectorEnv:
+    def environments(n: int, seed: int, backend: str = backend) -> VectorEnv:
         if arguments.shown is None:
             return make_vector(preset.env_id, n, backend, seed, **arguments.env)
         return make_vector(lambda: partly_shown(preset.env_id, arguments.shown), n, "gymnasium", seed)
@@ -85,7 +85,7 @@ def train_one(preset: presets.Preset, seed: int, arguments: argparse.Namespace) 
         )
     if arguments.best:
         agent.restore_best()
-    evaluation_env = environments(10, 1_000_000 + 100 * seed)
+    evaluation_env = environments(10, 1_000_000 + 100 * seed, arguments.evaluation_backend or backend)
     evaluation = agent.evaluate(arguments.episodes, env=evaluation_env)
     return {
         "seed": seed,
@@ -125,6 +125,7 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, help="train so long instead, everything from making the agent counted")
     parser.add_argument("--episodes", type=int, default=100)
     parser.add_argument("--backend")
+    parser.add_argument("--evaluation-backend", help="of the last evaluation; default: as in training")
     parser.add_argument("--env", type=json.loads, default={}, help="arguments of the environment, as JSON")
     parser.add_argument("--set", type=json.loads, default={}, help="hyperparameters other than the preset's, as JSON")
     parser.add_argument("--best", action="store_true", help="evaluate the best weights by evaluations on the way")
