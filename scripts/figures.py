@@ -86,6 +86,7 @@ def result_of(data: dict[str, Any], judged_by_success: tuple[str, ...] = JUDGED_
     if "--shown" in words:
         size = data["hyperparameters"]["policy_kwargs"].get("lstm_hidden_size")
         settings += [HIDDEN, "without memory" if size is None else f"memory of {size}"]
+    settings += [options["--name"].rsplit("-", 1)[-1]] if options.get("--name", "").startswith("parts-") else []
     settings += [f"sigma={v:g}" for k, v in json.loads(options.get("--env", "{}")).items() if k == "sigma"]
     is_success = env_id in judged_by_success
     values = [run["success_rate" if is_success else "mean_return"] for run in runs]
@@ -156,8 +157,9 @@ def learned(folder: str, length: str = "") -> str:
         "commit",
         "options",
     )
-    n = 5 if length == "short" else len(header)
-    return table(header[:n], [row[:n] for row in rows])
+    shown = {"short": slice(0, 5), "own": [0, 1, 2, 3, 5, 6, 7]}.get(length, slice(None))
+    kept = np.arange(len(header))[shown]
+    return table([header[i] for i in kept], [[row[i] for i in kept] for row in rows])
 
 
 def curve(algorithm: str) -> str:
