@@ -40,7 +40,8 @@ ACTIONS: dict[str, gym.Space] = {
     "whole numbers": spaces.Box(-4, 4, (2,), np.int32),
     "unbounded": spaces.Box(-np.inf, np.inf, (2,), np.float32),
 }
-CONTINUOUS, DISCRETE = ("SAC", "DDPG", "TD3", "TQC", "CrossQ"), ("DQN", "QRDQN", "PQN", "SAC", "DDPG")
+CONTINUOUS = ("SAC", "DDPG", "TD3", "TQC", "CrossQ", "FlashSAC", "XQC", "IQL", "TD3BC", "ReBRAC")
+DISCRETE = ("DQN", "QRDQN", "IQN", "PQN", "SAC", "DDPG")
 ON_POLICY = ("PPO", "A2C", "TRPO", "ARS", "RecurrentPPO", "MaskablePPO")
 KINDS = [
     *((name, "Box") for name in CONTINUOUS),
@@ -53,6 +54,8 @@ SMALL: dict[str, dict[str, Any]] = {
     "DQN": {"policy_kwargs": {"net_arch": [16]}, "dueling": True},
     "RecurrentPPO": {"policy_kwargs": {"lstm_hidden_size": 8}},
 }
+STATISTICS = ("mean", "variance", "n_seen", "scale", "offset")
+"""Last parts of the names of what normalizations hold."""
 
 
 class Still(gym.Env[Any, Any]):
@@ -70,17 +73,16 @@ class Still(gym.Env[Any, Any]):
 
 
 def agent_of(name: str, action: str, observation: str = "MLP", **settings: Any) -> agents.Agent:
-    """Returns an agent with random weights; with statistics of a few observations if it normalizes."""
+    """Returns an agent with random weights, and random statistics and gains of its normalizations."""
     policy = "MultiInputPolicy" if "Dict" in observation else "MlpPolicy"
     small = SMALL.get(name, {"policy_kwargs": {"net_arch": [16, 16]}})
     with shared_learners():
         agent = agents.AGENTS[name](policy, Still(observation, action), seed=0, **{**small, **settings})
-    if settings.get("normalize"):
-        rng = np.random.default_rng(0)
-        parameters = agent.get_parameters()
-        for key, array in parameters.items():
-            if key.startswith("statistics.obs"):
-                parameters[key] = np.asarray(rng.uniform(0.5, 2.0, array.shape), array.dtype)
+    rng, parameters = np.random.default_rng(0), agent.get_parameters()
+    drawn = [key for key in parameters if key.rpartition(".")[2] in STATISTICS]
+    for key in drawn:
+        parameters[key] = np.asarray(rng.uniform(0.5, 2.0, parameters[key].shape), parameters[key].dtype)
+    if drawn:
         agent.set_parameters(parameters)
     return agent
 

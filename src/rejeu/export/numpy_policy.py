@@ -28,12 +28,13 @@ ACTIVATIONS: dict[str, Function] = {
     "leakyrelu": lambda x: np.where(x >= 0, x, 0.01 * x),
     "sigmoid": lambda x: 1.0 / (1.0 + np.exp(-x)),
 }
-SQUASHED = ("SAC", "TQC", "CrossQ", "TD3", "DDPG")
+PROJECTED = ("FlashSAC", "XQC")
+SQUASHED = ("SAC", "TQC", "CrossQ", "TD3", "TD3BC", "ReBRAC", "DDPG", "IQL", *PROJECTED)
 ACTORS = {
     **dict.fromkeys(("PPO", "A2C", "TRPO", "MaskablePPO", "DQN", "IQN", "PQN"), "network"),
     **dict.fromkeys(SQUASHED, "actor"),
     "QRDQN": "network.outputs",
-    "ARS": "actor.network",
+    **dict.fromkeys(("ARS", "IQL"), "actor.network"),
 }
 """Where the policy's network is in the state of each algorithm."""
 WRONG = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
@@ -45,6 +46,7 @@ class NumpyPolicy:
     def __init__(self, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray], largest: int) -> None:
         """Builds the policy from the header and the arrays of a model file."""
         config, name = header["config"], header["algorithm"]
+        self._name = name
         self.observation_space = spaces.rebuild(header["observation_space"], largest)
         self.action_space = spaces.rebuild(header["action_space"], largest)
         self._leaves = spaces.leaves(self.observation_space)
@@ -140,21 +142,24 @@ class NumpyPolicy:
         return found
 
     def _torso(self, prefix: str) -> list[Function]:
-        """Returns the hidden layers: a stack, branches, or SimBa."""
+        """Returns the hidden layers: a stack, branches, SimBa, or FlashSAC's blocks."""
         if f"{prefix}.embedding.weight" not in self._arrays:
             parts = (prefix, f"{prefix}.state", f"{prefix}.common", f"{prefix}.last")
             return [step for part in parts for step in self._layers(part)]
-        steps, i = [self._linear(f"{prefix}.embedding")], 0
+        embedding, norm = self._linear(f"{prefix}.embedding"), self._norm(f"{prefix}.norm")
+        activation, blocks, i = ACTIVATIONS[self._shape["activation_fn"]], [], 0
         while f"{prefix}.blocks.{i}.expand.weight" in self._arrays:
-            inner = [
-                self._norm(f"{prefix}.blocks.{i}.norm"),
-                self._linear(f"{prefix}.blocks.{i}.expand"),
-                ACTIVATIONS[self._shape["activation_fn"]],
-                self._linear(f"{prefix}.blocks.{i}.contract"),
-            ]
-            steps.append(residual(inner))
+            block = f"{prefix}.blocks.{i}"
+            expand, contract = self._linear(f"{block}.expand"), self._linear(f"{block}.contract")
+            if self._name == "FlashSAC":
+                inner, outer = self._norm(f"{block}.inner"), self._norm(f"{block}.outer")
+                blocks.append(residual([expand, inner, activation, contract, outer, activation]))
+            else:
+                blocks.append(residual([self._norm(f"{block}.norm"), expand, activation, contract]))
             i += 1
-        return [*steps, self._norm(f"{prefix}.norm")]
+        if self._name == "FlashSAC":
+            return [norm, embedding, *blocks, self._norm(f"{prefix}.last")]
+        return [embedding, *blocks, norm]
 
     def _layers(self, prefix: str) -> list[Function]:
         """Returns a stack of layers; empty if there are none."""
@@ -171,7 +176,7 @@ class NumpyPolicy:
             )
             activation = [ACTIVATIONS[self._shape["activation_fn"]]]
             steps += [self._linear(f"{prefix}.layers.{i}")]
-            steps += activation + norm if is_renormalized else norm + activation
+            steps += activation + norm if self._name == "CrossQ" else norm + activation
             i += 1
         return steps
 
@@ -183,14 +188,21 @@ class NumpyPolicy:
         return np.maximum(embed(np.cos(fractions[:, None] * frequencies.astype(np.float32))), 0.0).astype(np.float32)
 
     def _linear(self, prefix: str) -> Function:
-        weight, bias = self._arrays[f"{prefix}.weight"], self._arrays[f"{prefix}.bias"]
+        weight = self._arrays[f"{prefix}.weight"]
+        if self._name in PROJECTED and not prefix.endswith(".head"):
+            return lambda x: x @ weight
+        bias = self._arrays[f"{prefix}.bias"]
         return lambda x: x @ weight + bias
 
     def _norm(self, prefix: str) -> Function:
-        """Returns a layer norm, or a batch renormalization by its running statistics."""
-        scale, offset = self._arrays[f"{prefix}.scale"], self._arrays[f"{prefix}.offset"]
+        """Returns a layer norm, an RMS norm, or a batch renormalization by its running statistics."""
+        scale = self._arrays[f"{prefix}.scale"]
+        if self._name == "FlashSAC" and prefix.endswith(".last"):
+            return lambda x: x / np.sqrt(np.square(x).mean(axis=-1, keepdims=True) + np.float32(1e-6)) * scale
+        offset = self._arrays[f"{prefix}.offset"]
         if f"{prefix}.n_batches" in self._arrays:
-            factor = scale / np.sqrt(self._arrays[f"{prefix}.variance"] + np.float32(1e-3))
+            epsilon = np.float32(1e-5 if self._name == "FlashSAC" else 1e-3)
+            factor = scale / np.sqrt(self._arrays[f"{prefix}.variance"] + epsilon)
             shift = offset - self._arrays[f"{prefix}.mean"] * factor
             return lambda x: x * factor + shift
 
