@@ -10,14 +10,14 @@ from rejeu.agents import find_preset
 from tests.tiers import exhaustive
 
 
-@pytest.mark.parametrize("preset", presets.ALL, ids=lambda preset: f"{preset.env_id}-{preset.algorithm}")
+@pytest.mark.parametrize("preset", presets.ALL, ids=lambda preset: f"{preset.env_id}-{preset.algorithm}{preset.name}")
 def test_every_preset_is_understood_by_its_algorithm(preset):
     validation.build(AGENTS[preset.algorithm].algorithm.Config, preset.hyperparameters)
     assert preset.source
 
 
 def test_no_environment_has_two_presets_of_one_algorithm():
-    names = [(preset.env_id, preset.algorithm) for preset in presets.ALL]
+    names = [(preset.env_id, preset.algorithm, preset.name) for preset in presets.ALL]
     assert len(names) == len(set(names))
 
 
@@ -60,6 +60,16 @@ def test_a_preset_with_a_name_is_for_any_environment():
     with pytest.raises(ValueError, match="the preset Rainbow is for DQN, not for PPO"):
         find_preset("CartPole-v1", "PPO", "Rainbow")
     assert find_preset("CartPole-v1", None, "Rainbow") == presets.named("Rainbow", "CartPole-v1")
+
+
+def test_sizes_are_presets_of_each_algorithm_and_used_only_by_name():
+    widths = lambda found: found.hyperparameters["policy_kwargs"]["net_arch"]["qf"]  # noqa: E731
+    found = {name: find_preset("Hopper-v5", name, "small") for name in ("FlashSAC", "XQC")}
+    assert {name: widths(one) for name, one in found.items()} == {"FlashSAC": [64, 64], "XQC": [128, 128]}
+    assert find_preset("Pendulum-v1", "XQC", "small").total_steps < found["XQC"].total_steps
+    assert find_preset("Pendulum-v1", "FlashSAC", "full").hyperparameters == {}
+    assert presets.find("HalfCheetah-v5") is None
+    assert presets.find("Pendulum-v1", "FlashSAC") is None
 
 
 GOALS = [

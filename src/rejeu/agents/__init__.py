@@ -222,7 +222,7 @@ def find_preset(env_id: str, algorithm: str | None, path: str | Path | None) -> 
     """
     if path is None:
         return all_presets.find(env_id, algorithm)
-    preset = all_presets.named(str(path), env_id) or all_presets.read(path)
+    preset = all_presets.named(str(path), env_id, algorithm) or all_presets.read(path)
     agent_of_file(preset.algorithm, path)
     if algorithm not in (None, preset.algorithm):
         raise ValueError(f"the preset {path} is for {preset.algorithm}, not for {algorithm}; leave out one of them")

@@ -26,7 +26,7 @@ def show(algorithms: Mapping[str, str]) -> None:
     """Prints the algorithms, and the presets by environment."""
     print("algorithms")
     print(columns([*algorithms.items()]))
-    print("\nenvironments with tuned hyperparameters, the preset of rejeu train first")
+    print("\nenvironments with tuned hyperparameters, the preset of rejeu train first; in brackets, names for --preset")
     rows: dict[str, list[tuple[str, ...]]] = {}
     for one in presets.every():
         result = presets.find_result(one.env_id, one.algorithm) or one.source

@@ -45,7 +45,8 @@ class Preset:
     n_envs: EnvCount
     """Number of parallel environments."""
     name: Annotated[str, Meta(max_length=200)] = ""
-    """What the settings are known as, such as ``Rainbow``, for ``--preset`` with any environment; empty if they have none."""
+    """What the settings are known as, such as ``Rainbow``, for ``--preset`` with any environment; empty if they have none. They
+    are used only by this name."""
     total_steps: Positive
     """Environment steps of a full run, over all environments."""
     evaluate_every: Positive
@@ -168,7 +169,7 @@ def find_result(env_id: str, algorithm: str) -> Result | None:
 
 
 ALL: tuple[Preset, ...] = built_in()
-"""Every preset of rejeu. The first one of an environment is the one that ``rejeu train`` uses."""
+"""Every preset of rejeu. The first one of an environment without a name is the one that ``rejeu train`` uses."""
 
 registered: dict[str, tuple[Preset, ...]] = {}
 """Presets of algorithms that are not rejeu's, by the name of the algorithm; see :func:`register`."""
@@ -204,14 +205,14 @@ def every() -> tuple[Preset, ...]:
     return (*ALL, *(preset for presets in registered.values() for preset in presets))
 
 
-def named(name: str, env_id: str) -> Preset | None:
-    """Returns the preset of that name, the one of this environment if there are several, or None if there is none.
+def named(name: str, env_id: str, algorithm: str | None = None) -> Preset | None:
+    """Returns the preset of that name, of several that of the algorithm and of the environment, or None if there is none.
 
     >>> named("Rainbow", "Acrobot-v1").algorithm
     'DQN'
     """
     known = [preset for preset in every() if preset.name == name != ""]
-    return next((preset for preset in known if preset.env_id == env_id), known[0] if known else None)
+    return max(known, key=lambda one: (one.algorithm == algorithm, one.env_id == env_id), default=None)
 
 
 def default(env_id: str, algorithm: str, hyperparameters: Mapping[str, Any] = MappingProxyType({})) -> Preset:
@@ -231,12 +232,13 @@ def default(env_id: str, algorithm: str, hyperparameters: Mapping[str, Any] = Ma
 def find(env_id: str, algorithm: str | None = None) -> Preset | None:
     """Returns the preset of an environment, the first one or that of ``algorithm``, or None if there is none.
 
-    An environment in JAX that equals another one has its presets.
+    An environment in JAX that equals another one has its presets. Those with a name are found by :func:`named` alone.
 
     >>> find("jax/Parking-v0").backend
     'jax'
     """
-    found = next((p for p in every() if p.env_id == env_id and algorithm in (None, p.algorithm)), None)
+    known = [preset for preset in every() if preset.env_id == env_id and not preset.name]
+    found = next((preset for preset in known if algorithm in (None, preset.algorithm)), None)
     if found is not None or env_id not in TWINS:
         return found
     twin = find(TWINS[env_id], algorithm)
