@@ -39,6 +39,8 @@ NOISE = rejeu.NormalActionNoise([0.0], [0.3])
 TEMPERATURE = {"ent_coef": "auto_0.01"}
 CALMING = {"learning_rate": rejeu.Linear(1e-2, 1e-3)}
 """Without target networks, the last steps must be smaller."""
+SCALED = {"normalize": None, "value_limit": 3.0, "noise_repeat": 1, "gradient_steps": 1}
+"""Values of the probes as they are."""
 EPSILON = {"train_freq": 1, "target_update_interval": 1, "exploration_fraction": 0.5}
 
 KINDS = {
@@ -47,6 +49,10 @@ KINDS = {
     "TD3": Kind("TD3", False, {"action_noise": NOISE}, delay=2),
     "TQC": Kind("TQC", False, {**TEMPERATURE, "n_quantiles": 5, "top_quantiles_to_drop_per_net": 1}),
     "CrossQ": Kind("CrossQ", False, {**TEMPERATURE, **CALMING, "policy_delay": 2}, delay=2),
+    "FlashSAC": Kind("FlashSAC", False, {**TEMPERATURE, **CALMING, **SCALED}, delay=2),
+    "XQC": Kind("XQC", False, {**TEMPERATURE, **CALMING, **SCALED}, delay=3),
+    "TD3BC": Kind("TD3BC", False, {"action_noise": NOISE, "normalize": None, "alpha": 100.0}, delay=2),
+    "ReBRAC": Kind("ReBRAC", False, {"action_noise": NOISE}, delay=2),
     "SAC, Discrete": Kind("SAC", True, TEMPERATURE),
     "DDPG, Discrete": Kind("DDPG", True, {}),
     "DQN": Kind("DQN", True, EPSILON),
