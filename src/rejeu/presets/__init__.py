@@ -45,8 +45,8 @@ class Preset:
     n_envs: EnvCount
     """Number of parallel environments."""
     name: Annotated[str, Meta(max_length=200)] = ""
-    """What the settings are known as, such as ``Rainbow``, for ``--preset`` with any environment; empty if they have none. They
-    are used only by this name."""
+    """What the settings are known as, such as ``Rainbow``, for ``--preset`` with any environment; empty if they have none.
+    They are used only by this name."""
     total_steps: Positive
     """Environment steps of a full run, over all environments."""
     evaluate_every: Positive
