@@ -218,6 +218,14 @@ def test_observation_bounds_do_not_tell_spaces_apart_and_action_bounds_do():
     assert not spaces.same(gym_spaces.Dict({"a": BOX}), gym_spaces.Dict({"b": BOX}), bounds=False)
 
 
+def test_actions_of_both_precisions_are_the_same_and_other_bounds_are_not():
+    low, high = np.float32(-0.4), np.float32(0.4)
+    one, two = gym_spaces.Box(low, high, (2,)), gym_spaces.Box(-0.4, 0.4, (2,), np.float64)
+    assert spaces.same(one, two, bounds=True)
+    assert spaces.same(gym_spaces.Tuple([one, BOX]), gym_spaces.Tuple([two, BOX]), bounds=True)
+    assert not spaces.same(one, gym_spaces.Box(-0.4, 0.5, (2,), np.float64), bounds=True)
+
+
 def test_flat_keys_are_those_of_dicts_of_arrays_alone():
     box = gym_spaces.Box(-1.0, 1.0, (2,))
     flat = gym_spaces.Dict({"z": box, "a.b": gym_spaces.Discrete(3), "m": box})

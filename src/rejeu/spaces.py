@@ -439,11 +439,23 @@ def check_env_actions(space: spaces.Space, action: np.ndarray, owner: str) -> No
 def same(space: spaces.Space, other: spaces.Space, bounds: bool) -> bool:
     """Returns whether two spaces hold arrays of the same structure, shapes and dtypes, and the same bounds if asked.
 
-    Backends declare different observation bounds for the same environment, and nothing depends on them.
+    Backends declare different observation bounds for the same environment, and nothing depends on them. Bounds are compared as
+    ``float32``: MuJoCo's actions have this dtype in Gymnasium, and ``float64`` in EnvPool.
     """
     if bounds:
-        return describe(space) == describe(other)
+        return describe(_single_precision(space)) == describe(_single_precision(other))
     return leaves(space) == leaves(other)
+
+
+def _single_precision(space: spaces.Space) -> spaces.Space:
+    if isinstance(space, spaces.Dict):
+        return spaces.Dict({key: _single_precision(part) for key, part in space.spaces.items()})
+    if isinstance(space, spaces.Tuple):
+        return spaces.Tuple([_single_precision(part) for part in space.spaces])
+    if isinstance(space, spaces.Box) and space.dtype.kind == "f":
+        with np.errstate(over="ignore"):
+            return spaces.Box(space.low.astype(np.float32), space.high.astype(np.float32), dtype=np.float32)
+    return space
 
 
 def describe(space: spaces.Space) -> Any:
