@@ -68,6 +68,7 @@ STAGES = {
     "buffers/uniform": ["tests/buffers/test_uniform.py", "tests/test_offline.py"],
     "buffers/": ["tests/buffers/test_NAME.py"],
     "loops/device/": ["tests/loops/device", "tests/test_schedules.py"],
+    "loops/on_policy": ["tests/test_normalization.py", "tests/test_schedules.py"],
     "loops/": ["tests/test_schedules.py", "tests/agents/test_agent.py"],
     "agents/": ["tests/test_schedules.py", "tests/agents/test_agent.py"],
     "core": ["tests/algorithms/test_off_policy_updates.py"],
