@@ -57,7 +57,7 @@ SHARED = (
     (RolloutConfig, "all on-policy algorithms", "../hyperparameters.md#on-policy-algorithms"),
 )
 """Configurations from which others are derived, and where their hyperparameters are explained: by whom, and the page."""
-JUDGED_BY_SUCCESS = ("FetchReach-v4", "parking-v0", "rejeu/Ball-v0")
+JUDGED_BY_SUCCESS = ("FetchPush-v4", "FetchReach-v4", "parking-v0", "rejeu/Ball-v0")
 """Environments whose result is the success rate."""
 HIDDEN = "velocities hidden"
 """How results are named of environments of whose observations ``--shown`` leaves only some components."""
@@ -90,7 +90,8 @@ def result_of(data: dict[str, Any], judged_by_success: tuple[str, ...] = JUDGED_
     settings += [f"sigma={v:g}" for k, v in json.loads(options.get("--env", "{}")).items() if k == "sigma"]
     is_success = env_id in judged_by_success
     values = [run["success_rate" if is_success else "mean_return"] for run in runs]
-    low, high = (min(values), max(values)) if is_success else data["summary"]["mean_return"]["interval"]
+    interval = data["summary"]["mean_return"]["interval"] if not is_success else None
+    low, high = interval or (min(values), max(values))
     minutes = options.get("--minutes")
     seconds = [run["seconds"] for run in runs]
     return Result(
