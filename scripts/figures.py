@@ -301,12 +301,13 @@ def time_of(result: Result) -> str:
 
 
 def parking() -> str:
-    """Time and results of ``rejeu train parking-v0``."""
+    """Time and results of the preset of parking-v0."""
     result = next(result for result in measured() if result.env_id == "parking-v0")
     low, high = (100 * share for share in (result.low, result.high))
     return (
-        f"Training takes {time_of(result)} on two CPU cores, compilation included ({result.seeds} seeds). The trained models "
-        f"succeed in\n{low:g} to {high:g} % of {result.episodes} episodes of highway-env's `parking-v0`."
+        f"Training takes {time_of(result)} on two CPU cores, compilation included ({result.seeds} seeds); evaluations and "
+        f"the video come on top.\nThe trained models succeed in {low:g} to {high:g} % of {result.episodes} episodes of "
+        "highway-env's `parking-v0`."
     )
 
 
