@@ -271,6 +271,12 @@ def test_envpool_knows_its_time_limit():
     vector.close()
 
 
+def test_envpool_has_no_time_limit_where_it_declares_zero():
+    vector = make_vector("BabyAI-GoToLocalS8N5-v0", 1, "envpool")
+    assert vector.max_episode_steps is None
+    vector.close()
+
+
 # Success.
 
 

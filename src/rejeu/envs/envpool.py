@@ -213,7 +213,7 @@ class EnvPool(VectorEnv):
         self.observation_space = _corrected_bounds(self._pool.observation_space)
         self.action_space = self._pool.action_space
         limit = int(self._pool.spec.config.max_episode_steps)
-        self.max_episode_steps = None if limit >= NO_LIMIT else limit
+        self.max_episode_steps = limit if 0 < limit < NO_LIMIT else None
         self.reward_threshold = reward_threshold(env_id, self._pool.spec.reward_threshold)
         self._leaves = leaves(self.observation_space)
         self._log = self._new_log()
