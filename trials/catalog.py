@@ -63,6 +63,7 @@ CAUSES = {
     r"flex_vertedge": 'dm-control 1.0.50 fails with MuJoCo 4.0: add "mujoco<4"',
     r"minigrid\[wfc": "needs more packages: pip install 'minigrid[wfc]'",
     r"loading texture": "its textures are not in the package",
+    r"Sudoku database": "its puzzles are not in the package",
     r"no algorithm here takes": "the actions are of a kind that no algorithm takes",
     r"the observation space at": "an observation is of a kind that no network takes (MiniGrid: ImgObsWrapper)",
 }
@@ -523,8 +524,15 @@ def cause(row: dict[str, Any]) -> str:
 
 
 def collect(folder: Path) -> None:
-    """Writes the table of all groups: a line for each family, and the ids that failed or stood out by what was found."""
+    """Writes the table of all groups: a line for each family, and the ids that failed or stood out by what was found.
+
+    Groups that the folder does not have stay as the table has them.
+    """
     result: dict[str, Any] = {**provenance({str(folder): "FOLDER"}), "groups": {}, "families": [], "failures": []}
+    before, new = json.loads(read_text(RESULT) or "{}"), {path.stem for path in folder.glob("*.jsonl")}
+    result["groups"] = {name: one for name, one in before.get("groups", {}).items() if name not in new}
+    for part in ("families", "failures"):
+        result[part] = [row for row in before.get(part, []) if row["group"] not in new]
     for path in sorted(folder.glob("*.jsonl")):
         name, rows = path.stem, [*{row["id"]: row for row in read_rows(path)}.values()]
         result["groups"][name] = json.loads(read_text(path.with_suffix(".json")))
@@ -550,6 +558,8 @@ def collect(folder: Path) -> None:
         for (family, why), ids in sorted(by_cause.items()):
             result["failures"].append({"group": name, "family": family, "cause": why, "number": len(ids), "ids": ids})
     result |= {key: sum(row[key] for row in result["families"]) for key in ("ids", "tried", "work")}
+    for part in ("families", "failures"):
+        result[part].sort(key=lambda row: row["group"])
     write(RESULT, result)
     print({key: result[key] for key in ("ids", "tried", "work")})
 
