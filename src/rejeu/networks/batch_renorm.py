@@ -112,7 +112,7 @@ class BatchRenorm(eqx.Module):
 class RenormalizedMLP(eqx.Module):
     """Hidden layers: a renormalization of the input, then each a linear map, a nonlinearity and a renormalization."""
 
-    layers: tuple[Linear, ...]
+    layers: tuple[Callable[[Array], Array], ...]
     norms: tuple[BatchRenorm, ...]
     """Of the input, then of what each layer gives: one more than layers."""
     activation: str = eqx.field(static=True)

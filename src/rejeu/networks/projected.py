@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from rejeu.networks.batch_renorm import NEVER, BatchRenorm
+from rejeu.networks.batch_renorm import NEVER, BatchRenorm, RenormalizedMLP
 from rejeu.networks.layers import ACTIVATIONS, RMSNorm, product
 
 Network = TypeVar("Network")
@@ -54,13 +54,8 @@ def head(key: Array, n_inputs: int, n_outputs: int) -> UnitLinear:
     return UnitLinear(key, n_inputs, n_outputs, bias=True)
 
 
-class NormalizedMLP(eqx.Module):
+class NormalizedMLP(RenormalizedMLP):
     """A normalization of the input, then layers, each a linear map, a normalization and a nonlinearity (XQC)."""
-
-    layers: tuple[UnitLinear, ...]
-    norms: tuple[BatchRenorm, ...]
-    """Of the input, then of what each linear map gives: one more than layers."""
-    activation: str = eqx.field(static=True)
 
     def __init__(self, key: Array, n_inputs: int, widths: Sequence[int], activation: str) -> None:
         sizes = (n_inputs, *widths)
@@ -68,11 +63,6 @@ class NormalizedMLP(eqx.Module):
         self.layers = tuple(UnitLinear(k, i, o) for k, i, o in zip(keys, sizes[:-1], sizes[1:], strict=False))
         self.norms = tuple(BatchRenorm(size, NEVER) for size in sizes)
         self.activation = activation
-
-    @property
-    def n_outputs(self) -> int:
-        """Width of the last layer."""
-        return self.norms[-1].scale.shape[-1]
 
     def __call__(self, x: Array) -> Array:
         """Maps ``(batch, n_inputs)`` to ``(batch, n_outputs)`` by the running statistics."""
