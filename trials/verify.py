@@ -1,5 +1,7 @@
 """One update of every algorithm that rejeu shares with Stable-Baselines3 and its Contrib package, against the original.
 
+Hindsight, n-step returns and running statistics are compared too, and prioritized replay with a reference in NumPy.
+
 The two parts run in the environments of the two libraries::
 
     python trials/verify.py record FOLDER             # with stable-baselines3 and sb3-contrib
@@ -76,6 +78,54 @@ def spaces_of(name: str) -> tuple[Any, Any]:
 
     action = spaces.Box(-1.0, 1.0, (ACTIONS,), np.float32) if name in BOX else spaces.Discrete(CHOICES)
     return spaces.Box(-5.0, 5.0, (OBS,), np.float32), action
+
+
+def history() -> list[dict[str, np.ndarray]]:
+    """Returns steps of environments whose episodes have 1 to 9 steps, the last of which is terminated or truncated.
+
+    Observations and goals are numbers of ``goal_observation``, and differ from each other.
+    """
+    rng = np.random.default_rng(0)
+    episode, time, length = np.arange(ENVS), np.zeros(ENVS, int), rng.integers(1, 10, ENVS)
+    steps = []
+    for _ in range(200):
+        last, terminated = time + 1 == length, rng.random(ENVS) < 0.5
+        place = {"obs": 100 * episode + time, "next_obs": 100 * episode + time + 1, "goal": episode + 0.5}
+        ends = {"terminated": last & terminated, "truncated": last & ~terminated}
+        steps.append({**place, **ends, "action": rng.uniform(-1, 1, ENVS), "reward": rng.normal(size=ENVS)})
+        episode, time = np.where(last, episode + ENVS, episode), np.where(last, 0, time + 1)
+        length = np.where(last, rng.integers(1, 10, ENVS), length)
+    return steps
+
+
+def goal_observation(place: np.ndarray, goal: np.ndarray) -> dict[str, np.ndarray]:
+    """Returns observations ``(n, 1)`` of places, with the goals that they achieve."""
+    parts = {"observation": place, "achieved_goal": -place, "desired_goal": goal}
+    return {key: part.astype(np.float32)[:, None] for key, part in parts.items()}
+
+
+def goal_space() -> Any:
+    """Returns the space of these observations."""
+    from gymnasium import spaces
+
+    box = spaces.Box(-np.inf, np.inf, (1,), np.float32)
+    return spaces.Dict(dict.fromkeys(("observation", "achieved_goal", "desired_goal"), box))
+
+
+def goal_reward(achieved: np.ndarray, desired: np.ndarray, info: Any = None) -> np.ndarray:
+    """Returns another number for every pair of goals, ``float32 (n,)``."""
+    return (achieved[:, 0] - 2 * desired[:, 0]).astype(np.float32)
+
+
+HINDSIGHT, KEPT, DRAWS = ("future", "final", "episode"), 100, (100, 250)
+"""Strategies that both have, steps that a buffer keeps of each environment, and batches and their size."""
+
+
+def table(*columns: Any) -> np.ndarray:
+    """Returns the rows of these arrays ``(n, 1)`` and observations, each once, in order; the first is the place."""
+    keys = ("observation", "achieved_goal", "desired_goal")
+    parts = [part for one in columns for part in ([one[key] for key in keys] if isinstance(one, dict) else [one])]
+    return np.unique(np.concatenate([np.asarray(part, np.float32).reshape(-1, 1) for part in parts], axis=1), axis=0)
 
 
 # With Stable-Baselines3.
@@ -278,7 +328,34 @@ def parts(folder: Path) -> None:
             found[name].append(value.copy())
     normalized = {f"normalized.{name}": np.array(values) for name, values in found.items()}
     n_step = {f"n_step.{name}": value for name, value in n_step.items()}
-    np.savez_compressed(folder / "parts.npz", ends=ends, rewards=rewards, **ars, **n_step, **normalized)
+    others = {**ars, **n_step, **normalized, **hindsight()}
+    np.savez_compressed(folder / "parts.npz", ends=ends, rewards=rewards, **others)
+
+
+def hindsight() -> dict[str, np.ndarray]:
+    """Records the different transitions that ``HerReplayBuffer`` returns, by strategy."""
+    import gymnasium as gym
+    from stable_baselines3 import HerReplayBuffer
+
+    env: Any = SimpleNamespace(env_method=lambda _, achieved, desired, infos, indices: [goal_reward(achieved, desired)])
+    action = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
+    np.random.seed(0)  # noqa: NPY002
+    found = {}
+    for strategy in HINDSIGHT:
+        buffer = HerReplayBuffer(
+            KEPT * ENVS, goal_space(), action, env, "cpu", ENVS, goal_selection_strategy=strategy, n_sampled_goal=4
+        )
+        for step in history():
+            obs, next_obs = (goal_observation(step[key], step["goal"]) for key in ("obs", "next_obs"))
+            infos = [{"TimeLimit.truncated": bool(is_cut)} for is_cut in step["truncated"]]
+            done = step["terminated"] | step["truncated"]
+            buffer.add(obs, next_obs, step["action"][:, None], step["reward"], done, infos)
+        drawn = [buffer.sample(DRAWS[1]) for _ in range(DRAWS[0])]
+        parts = [
+            table(one.observations, one.next_observations, one.actions, one.rewards, 1 - one.dones) for one in drawn
+        ]
+        found[f"hindsight.{strategy}"] = np.unique(np.concatenate(parts), axis=0)
+    return found
 
 
 # With rejeu.
@@ -488,7 +565,91 @@ def compared_parts(folder: Path) -> list[dict[str, Any]]:
                 apart.append(difference(ours, recorded["scaled_reward"][t - 1]))
             running[recorded["ended"][t - 1]] = 0.0
     note = "VecNormalize, from the 100th step on: its statistics begin with a count of 1e-4"
-    return [*found, {"algorithm": "normalization", "numbers": max(apart), "note": note}]
+    found += [{"algorithm": "normalization", "numbers": max(apart), "note": note}]
+    return [*found, compared_hindsight(data), compared_priorities()]
+
+
+def filled(buffer: Any, steps: list[dict[str, np.ndarray]]) -> Any:
+    """Returns a buffer after these steps of ``history``."""
+    for step in steps:
+        if buffer.ring.head[0] < 0:
+            buffer.begin(goal_observation(step["obs"], step["goal"]))
+        next_obs = goal_observation(step["next_obs"], step["goal"])
+        buffer.add(step["action"][:, None], step["reward"], step["terminated"], next_obs)
+        if (done := step["terminated"] | step["truncated"]).any():
+            episode = step["goal"] - 0.5 + ENVS
+            buffer.begin(goal_observation(100 * episode, episode + 0.5), np.flatnonzero(done))
+    return buffer
+
+
+def goal_ring(rows: int, counters: tuple[str, ...] = ()) -> Any:
+    """Returns a ring of ``rows`` rows for each environment."""
+    from rejeu import spaces
+    from rejeu.buffers.ring import Ring
+
+    space = goal_space()
+    return Ring(rows * ENVS, ENVS, spaces.leaves(space), spaces.structure(space), (1,), np.float32, counters=counters)
+
+
+def compared_hindsight(data: dict[str, Any]) -> dict[str, Any]:
+    """Returns the row of hindsight: the transitions that may be drawn must be the same, in every number."""
+    from rejeu.buffers.hindsight import HerReplayBuffer, HindsightConfig, counters
+    from rejeu.envs.goals import GoalFunctions
+
+    apart, n_compared, rng = [], 0, np.random.default_rng(0)
+    for strategy in HINDSIGHT:
+        config = HindsightConfig(goal_selection_strategy=strategy)
+        ring = goal_ring(KEPT * 13 // 10, counters(config))  # there, final observations take no rows
+        buffer = filled(HerReplayBuffer(ring, 0.9, config, GoalFunctions(goal_reward)), history())
+        drawn = [buffer.sample(rng, DRAWS[1:]) for _ in range(DRAWS[0])]
+        parts = [table(one.obs, one.next_obs, one.action, one.reward, one.discount > 0) for one in drawn]
+        theirs = data[f"hindsight.{strategy}"]
+        given = np.unique(np.concatenate(parts), axis=0)
+        given = given[np.isin(given[:, 0], theirs[:, 0])]
+        apart.append(difference(given, theirs) if given.shape == theirs.shape else np.inf)
+        n_compared += len(theirs)
+    note = (
+        f"HerReplayBuffer: the {n_compared} transitions with their own and all possible goals, by future, final and episode, "
+        "of whole episodes; those that still run, or are overwritten in part, are not sampled there"
+    )
+    return {"algorithm": "hindsight", "numbers": max(apart), "note": note}
+
+
+def compared_priorities() -> dict[str, Any]:
+    """Returns the row of prioritized replay, beside the equations of the paper in NumPy."""
+    from rejeu.buffers.prioritized import Priorities, PriorityConfig
+    from rejeu.buffers.uniform import ReplayBuffer
+
+    alpha, beta, epsilon, size = 0.7, 0.5, 1e-2, 32
+    ring = goal_ring(KEPT)
+    buffer = ReplayBuffer(ring, 0.9, priorities=Priorities(ring, PriorityConfig(alpha, beta, epsilon)))
+    rng, again = np.random.default_rng(0), np.random.default_rng(0)
+    rows: list[list[float]] = [
+        [] for _ in range(ENVS)
+    ]  # priorities: a final observation has a row with 0, the newest none yet
+    largest, apart = 1.0, []
+    for step in history():
+        filled(buffer, [step])
+        for env, over in enumerate(step["terminated"] | step["truncated"]):
+            rows[env] += [largest, 0.0] if over else [largest]
+        p = np.zeros(KEPT * ENVS)
+        at = {KEPT * env + i % KEPT: (env, i) for env, one in enumerate(rows) for i in range(len(one))[1 - KEPT :]}
+        for position, (env, i) in at.items():
+            p[position] = rows[env][i]
+        n_steps = np.count_nonzero(p)
+        p /= p.sum()
+        batch, drawn = buffer.draw(rng, (size,))
+        chosen = np.searchsorted(np.cumsum(p), (np.arange(size) + again.random(size)) / size, side="right")
+        again.shuffle(chosen)
+        weight = (n_steps * p[chosen]) ** -beta
+        apart += [difference(drawn.position, chosen), difference(batch.weight, weight / weight.max())]
+        td_error = np.abs(np.sin(chosen + ring.head[0]))
+        buffer.update_priorities([(drawn, td_error)])
+        for position, new in zip(chosen, (td_error + epsilon) ** alpha, strict=True):
+            env, i = at[position]
+            rows[env][i], largest = new, max(largest, new)
+    note = "the equations of the paper in NumPy: choices, importance weights and new priorities; neither library has it"
+    return {"algorithm": "prioritized replay", "numbers": max(apart), "note": note}
 
 
 if __name__ == "__main__":
