@@ -338,22 +338,20 @@ def hindsight() -> dict[str, np.ndarray]:
     from stable_baselines3 import HerReplayBuffer
 
     env: Any = SimpleNamespace(env_method=lambda _, achieved, desired, infos, indices: [goal_reward(achieved, desired)])
-    action = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
+    actions = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
     np.random.seed(0)  # noqa: NPY002
     found = {}
     for strategy in HINDSIGHT:
-        buffer = HerReplayBuffer(
-            KEPT * ENVS, goal_space(), action, env, "cpu", ENVS, goal_selection_strategy=strategy, n_sampled_goal=4
-        )
+        buffer = HerReplayBuffer(KEPT * ENVS, goal_space(), actions, env, "cpu", ENVS, goal_selection_strategy=strategy)
         for step in history():
             obs, next_obs = (goal_observation(step[key], step["goal"]) for key in ("obs", "next_obs"))
             infos = [{"TimeLimit.truncated": bool(is_cut)} for is_cut in step["truncated"]]
             done = step["terminated"] | step["truncated"]
             buffer.add(obs, next_obs, step["action"][:, None], step["reward"], done, infos)
-        drawn = [buffer.sample(DRAWS[1]) for _ in range(DRAWS[0])]
-        parts = [
-            table(one.observations, one.next_observations, one.actions, one.rewards, 1 - one.dones) for one in drawn
-        ]
+        parts = []
+        for _ in range(DRAWS[0]):
+            obs, action, next_obs, done, reward, *_ = buffer.sample(DRAWS[1])
+            parts.append(table(obs, next_obs, action, reward, 1 - done))
         found[f"hindsight.{strategy}"] = np.unique(np.concatenate(parts), axis=0)
     return found
 
@@ -624,10 +622,8 @@ def compared_priorities() -> dict[str, Any]:
     ring = goal_ring(KEPT)
     buffer = ReplayBuffer(ring, 0.9, priorities=Priorities(ring, PriorityConfig(alpha, beta, epsilon)))
     rng, again = np.random.default_rng(0), np.random.default_rng(0)
-    rows: list[list[float]] = [
-        [] for _ in range(ENVS)
-    ]  # priorities: a final observation has a row with 0, the newest none yet
     largest, apart = 1.0, []
+    rows: list[list[float]] = [[], []]  # the priority of each step, and 0 for each final observation
     for step in history():
         filled(buffer, [step])
         for env, over in enumerate(step["terminated"] | step["truncated"]):
