@@ -114,6 +114,15 @@ def test_scaled_actions_never_leave_bounds_that_float32_rounds():
     assert all(space.contains(a) for a in spaces.scale_action(space, action))
 
 
+def test_a_whole_number_of_one_value_is_an_action():
+    """Of RubiksCube in EnvPool, the depth of the slice to turn."""
+    space = gym_spaces.Box(np.int32([0, 0]), np.int32([5, 0]), dtype=np.int32)
+    assert spaces.check_box_action(space, "SAC") is space
+    scaled = spaces.scale_action(space, np.float32([[-1.0, -1.0], [1.0, 1.0]]))
+    np.testing.assert_array_equal(scaled, [[0, 0], [5, 0]])
+    np.testing.assert_array_equal(spaces.unscale_action(space, scaled)[:, 1], [0, 0])
+
+
 def test_random_actions_fill_the_range_of_the_algorithm():
     action = spaces.random_action(ASYMMETRIC, 2000, np.random.default_rng(0))
     assert (action.shape, action.dtype) == ((2000, 3), np.float32)

@@ -220,7 +220,7 @@ def check_box_action(space: spaces.Space, algorithm: str) -> spaces.Box:
             f"{algorithm} needs finite action bounds, got low={space.low.tolist()}, high={space.high.tolist()}; "
             "wrap the environment with gymnasium.wrappers.RescaleAction or declare the bounds it really has"
         )
-    if not (space.high > space.low).all():
+    if space.dtype.kind == "f" and not (space.high > space.low).all():
         raise ValueError(
             f"every action bound must satisfy low < high, got low={space.low.tolist()}, high={space.high.tolist()}"
         )
