@@ -57,12 +57,14 @@ CAUSES = {
     r"compatibility-env": "no environment, but a wrapper of those for DeepMind's interface",
     r"old version|DeprecatedEnv|mujoco.py|needs mujoco": "an old version that can no longer be made; the newest one works",
     r"ConcatVecEnv resets": "SuperSuit's vector does not say how it resets, and is refused",
+    r"has \d players": "a game of several players, each with its own rewards, is refused",
     r"spaces not consistent": "its agents have different observations",
     r"No OpenGL": "its observations are pictures, and there was no OpenGL (MUJOCO_GL=egl)",
     r"PhysicsError": "random actions make its simulation invalid",
     r"flex_vertedge": 'dm-control 1.0.50 fails with MuJoCo 4.0: add "mujoco<4"',
     r"minigrid\[wfc": "needs more packages: pip install 'minigrid[wfc]'",
     r"loading texture": "its textures are not in the package",
+    r"scenarios/\.cfg": "needs a scenario of your own, and EnvPool's environments take no arguments here",
     r"Sudoku database": "its puzzles are not in the package",
     r"no algorithm here takes": "the actions are of a kind that no algorithm takes",
     r"the observation space at": "an observation is of a kind that no network takes (MiniGrid: ImgObsWrapper)",
@@ -331,12 +333,15 @@ class Case:
         return "; ".join(errors)[:300] or None
 
     def agent(self) -> Any:
+        import numpy as np
+
         import rejeu
         from rejeu.agents import choose_algorithm
         from rejeu.algorithms.config import OffPolicyConfig
 
         vector = self.group.vector(self.env_id)
-        name = choose_algorithm(None, self.env_id, vector.action_space)
+        has_bounds = all(np.isfinite(getattr(vector.action_space, name, 0.0)).all() for name in ("low", "high"))
+        name = choose_algorithm(None, self.env_id, vector.action_space) if has_bounds else "PPO"
         is_off_policy = isinstance(rejeu.AGENTS[name].algorithm.Config(), OffPolicyConfig)
         settings: dict[str, Any] = (
             {"buffer_size": 2_000, "batch_size": 32, "train_freq": 4} if is_off_policy else {"n_steps": 64}
@@ -483,8 +488,10 @@ def run(name: str, folder: Path, minutes: float, longest: float, only: list[str]
                     n, since = now, time.monotonic()
                 if time.monotonic() - since > longest or time.monotonic() > until + longest:
                     is_late = True
-                    os.killpg(child.pid, signal.SIGKILL)  # with the programs that environments started
+                    child.kill()
                     child.wait()
+            with suppress(ProcessLookupError):
+                os.killpg(child.pid, signal.SIGKILL)  # the programs that environments started and left
             errors.seek(0)
             last = (errors.read().strip().splitlines() or [""])[-1][:200]
         todo = todo[len(read_rows(path)) - n_before :]
@@ -526,13 +533,14 @@ def cause(row: dict[str, Any]) -> str:
 def collect(folder: Path) -> None:
     """Writes the table of all groups: a line for each family, and the ids that failed or stood out by what was found.
 
-    Groups that the folder does not have stay as the table has them.
+    Groups and families that the folder does not have stay as the table has them.
     """
     result: dict[str, Any] = {**provenance({str(folder): "FOLDER"}), "groups": {}, "families": [], "failures": []}
-    before, new = json.loads(read_text(RESULT) or "{}"), {path.stem for path in folder.glob("*.jsonl")}
-    result["groups"] = {name: one for name, one in before.get("groups", {}).items() if name not in new}
+    before = json.loads(read_text(RESULT) or "{}")
+    new = {(path.stem, row["family"]) for path in folder.glob("*.jsonl") for row in read_rows(path)}
+    result["groups"] = dict(before.get("groups", {}))
     for part in ("families", "failures"):
-        result[part] = [row for row in before.get(part, []) if row["group"] not in new]
+        result[part] = [row for row in before.get(part, []) if (row["group"], row["family"]) not in new]
     for path in sorted(folder.glob("*.jsonl")):
         name, rows = path.stem, [*{row["id"]: row for row in read_rows(path)}.values()]
         result["groups"][name] = json.loads(read_text(path.with_suffix(".json")))
@@ -542,7 +550,8 @@ def collect(folder: Path) -> None:
             if why := cause(row):
                 by_cause[row["family"], why].append(row["id"])
         known = result["groups"][name].pop("families", {})
-        for family in sorted({*by_family, *known}):
+        kept = {row["family"] for row in result["families"] if row["group"] == name}
+        for family in sorted({*by_family, *known} - kept):
             of_family = by_family[family]
             resumed = [row["resume"] for row in of_family if "resume" in row]
             result["families"].append({

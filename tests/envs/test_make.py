@@ -219,6 +219,22 @@ def test_envpool_takes_every_seed_that_an_agent_does(seed):
 # EnvPool.
 
 
+@pytest.mark.parametrize(("env_id", "n_players"), [("TicTacToe-v1", 2), ("SparrowMahjong-v1", 3)])
+def test_envpool_refuses_environments_of_several_players(env_id, n_players):
+    with pytest.raises(ValueError, match=f"{env_id} of EnvPool has {n_players} players"):
+        make_vector(env_id, 2, "envpool")
+
+
+def test_bounds_that_envpool_declares_for_want_of_others_are_infinite(monkeypatch, tmp_path):
+    """EnvPool's are the smallest positive and the largest float64; VizDoom's actions have no others."""
+    monkeypatch.chdir(tmp_path)  # where VizDoom writes a file
+    vector = make_vector("Basic-v1", 1, "envpool", seed=0)
+    try:
+        assert vector.action_space == gym.spaces.Box(-np.inf, np.inf, (3,), np.float64)
+    finally:
+        vector.close()
+
+
 def test_envpool_walks_one_trajectory_a_seed():
     walks = []
     for _ in range(2):

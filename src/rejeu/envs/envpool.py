@@ -207,11 +207,21 @@ class EnvPool(VectorEnv):
     backend = "envpool"
 
     def __init__(self, env_id: str, n_envs: int, seed: Seed = None) -> None:
+        """Makes the pool.
+
+        Raises:
+            ValueError: if the environment has several players.
+        """
         self.env_id = env_id
         self.n_envs = n_envs
         self._pool = self._make(int(np.random.SeedSequence().generate_state(1)[0]) if seed is None else seed)
+        if (n_players := self._pool.spec.config.max_num_players) > 1:
+            raise ValueError(
+                f"{env_id} of EnvPool has {n_players} players, each with its own rewards, and one agent is trained here; "
+                "write a Gymnasium environment for one of the players, or try backend='gymnasium'"
+            )
         self.observation_space = _corrected_bounds(self._pool.observation_space)
-        self.action_space = self._pool.action_space
+        self.action_space = _corrected_bounds(self._pool.action_space)
         limit = int(self._pool.spec.config.max_episode_steps)
         self.max_episode_steps = limit if 0 < limit < NO_LIMIT else None
         self.reward_threshold = reward_threshold(env_id, self._pool.spec.reward_threshold)
