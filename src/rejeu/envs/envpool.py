@@ -207,19 +207,9 @@ class EnvPool(VectorEnv):
     backend = "envpool"
 
     def __init__(self, env_id: str, n_envs: int, seed: Seed = None) -> None:
-        """Makes the pool.
-
-        Raises:
-            ValueError: if the environment has several players.
-        """
         self.env_id = env_id
         self.n_envs = n_envs
         self._pool = self._make(int(np.random.SeedSequence().generate_state(1)[0]) if seed is None else seed)
-        if (n_players := self._pool.spec.config.max_num_players) > 1:
-            raise ValueError(
-                f"{env_id} of EnvPool has {n_players} players, each with its own rewards, and one agent is trained here; "
-                "write a Gymnasium environment for one of the players, or try backend='gymnasium'"
-            )
         self.observation_space = _corrected_bounds(self._pool.observation_space)
         self.action_space = _corrected_bounds(self._pool.action_space)
         limit = int(self._pool.spec.config.max_episode_steps)
@@ -344,13 +334,13 @@ def check_envpool_knows(env_id: str) -> None:
 
     Raises:
         MissingExtra: if EnvPool is not installed.
-        ValueError: if it does not have the environment, with the backend or the id to use instead.
+        ValueError: if it does not have the environment, or if that has several players, with what to use instead.
     """
     if env_id not in import_envpool().list_all_envs():
-        known = register(env_id)
-        raise ValueError(
-            f"EnvPool does not have {env_id}; use backend='gymnasium'" if known else unknown_environment(env_id)
-        )
+        missing = f"EnvPool does not have {env_id}; use backend='gymnasium'"
+        raise ValueError(missing if register(env_id) else unknown_environment(env_id))
+    if (n := import_envpool().make_spec(env_id).config.max_num_players) > 1:
+        raise ValueError(f"{env_id} of EnvPool has {n} players, and rejeu trains one; use an environment with one")
 
 
 def envpool_knows(env_id: str) -> bool:
