@@ -57,7 +57,7 @@ CAUSES = {
     r"compatibility-env": "no environment, but a wrapper of those for DeepMind's interface",
     r"old version|DeprecatedEnv|mujoco.py|needs mujoco": "an old version that can no longer be made; the newest one works",
     r"ConcatVecEnv resets": "SuperSuit's vector does not say how it resets, and is refused",
-    r"has \d players": "a game of several players, each with its own rewards, is refused",
+    r"has \d players|reward of shape": "has several players, each with its own rewards, and is refused",
     r"spaces not consistent": "its agents have different observations",
     r"No OpenGL": "its observations are pictures, and there was no OpenGL (MUJOCO_GL=egl)",
     r"PhysicsError": "random actions make its simulation invalid",
@@ -487,8 +487,8 @@ def run(name: str, folder: Path, minutes: float, longest: float, only: list[str]
                 time.sleep(0.2)
                 if (now := len(read_rows(path))) != n:
                     n, since = now, time.monotonic()
-                if time.monotonic() - since > longest or time.monotonic() > until + longest:
-                    is_late = True
+                is_late = time.monotonic() - since > longest
+                if is_late or time.monotonic() > until + longest:
                     child.kill()
                     child.wait()
             with suppress(ProcessLookupError):
@@ -496,7 +496,8 @@ def run(name: str, folder: Path, minutes: float, longest: float, only: list[str]
             errors.seek(0)
             last = (errors.read().strip().splitlines() or [""])[-1][:200]
         todo = todo[len(read_rows(path)) - n_before :]
-        if child.returncode and todo and todo[0] in batch:
+        is_cut = time.monotonic() > until + longest and not is_late  # in the middle of one that may be quick
+        if child.returncode and todo and todo[0] in batch and not is_cut:
             why = f"took longer than {longest:g} s" if is_late else f"crash, exit status {child.returncode}: {last}"
             row = {"id": todo[0], "family": families[todo[0]], "failed": "process", "error": why}
             append(path, {**row, "seconds": round(time.monotonic() - since, 1)})
