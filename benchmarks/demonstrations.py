@@ -7,14 +7,18 @@
 ``offline``: two datasets of 20,000 steps, of the final policy of a SAC expert and of its policy after a part of its training
 with random actions in a tenth of the steps; BC, TD3+BC, IQL and ReBRAC learn from each alone. ``imitation``: BC from 10
 episodes of Gymnasium's scripted expert on LunarLander-v3, and DAgger with it, for the same number of gradient steps in each
-round. ``share``: SAC with HER alone, with 20 episodes of an expert in half of each batch, and so after cloning them; the steps
-after which 90 % of 20 evaluation episodes succeeded, all that were taken if they never did. Each result is written when it is
+round. ``share``: SAC with HER alone, with 20 episodes of an expert in half of each batch, after cloning them, and after the
+critics have also learned from them what the clone is worth. The expert is scripted for FetchPush, and elsewhere SAC with the
+same settings; ``--shown FOLDER`` keeps its episodes for the next call. All train for as many steps: recorded are the
+first step (0: before training) at which 90 % of 20 evaluation episodes succeeded, all steps if they never did, and the mean
+success rate of all evaluations. ``--continue`` keeps the runs of the result file. Each result is written when it is
 there, with command, commit and versions.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import sys
 import tempfile
@@ -26,8 +30,9 @@ import gymnasium as gym
 import numpy as np
 
 import rejeu
+from rejeu import presets
 from rejeu.callbacks import Evaluate
-from rejeu.demonstrations import Demonstrations, clone, dagger, learn_offline, record
+from rejeu.demonstrations import Demonstrations, clone, dagger, learn_offline, read, record
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks.learning import summary
@@ -135,61 +140,138 @@ def imitation(arguments: argparse.Namespace) -> None:
         write(arguments, results)
 
 
+SHARE: dict[str, tuple[int, str, dict[str, Any]]] = {
+    "jax/PointMaze-v0": (
+        1,
+        "auto",
+        {
+            "replay_buffer_class": "HerReplayBuffer",
+            "policy_kwargs": {"net_arch": [64, 64], "layer_norm": True},
+            "batch_size": 128,
+            "learning_rate": 1e-3,
+            "gamma": 0.98,
+            "learning_starts": 500,
+            "buffer_size": 100_000,
+        },
+    ),
+    **{
+        env_id: (preset.n_envs, backend, preset.hyperparameters)
+        for env_id, backend, preset in (
+            ("jax/Parking-v0", "auto", presets.find("parking-v0", "SAC")),
+            ("FetchPush-v4", "envpool", presets.find("FetchPush-v4", "SAC")),
+        )
+        if preset is not None
+    },
+}
+"""Number of environments, backend and hyperparameters of ``share``."""
+WAYS = {"none": "", "share": "", "clone": "clone", "clone and critics": "clone critics"}
+"""What is done before training, by the name of a way; all but the first have a share of demonstrations in each batch."""
+
+
+class Pusher:
+    """Goes behind the object, as seen from the goal, and pushes it there: a scripted expert of FetchPush."""
+
+    def predict(self, obs: Any, deterministic: bool = True) -> tuple[Any, None]:
+        gripper, thing, goal = obs["observation"][:3], obs["achieved_goal"], obs["desired_goal"]
+        distance = float(np.linalg.norm(goal[:2] - thing[:2]))
+        way = (goal[:2] - thing[:2]) / max(distance, 1e-6)
+        offset = gripper[:2] - thing[:2]
+        aside = offset - (offset @ way) * way
+        is_low, is_near = gripper[2] < thing[2] + 0.03, np.linalg.norm(offset) < 0.12
+        target = np.array([*(thing[:2] - 0.09 * way), thing[2] + 0.1])
+        if distance < 0.03:
+            target = np.array([*gripper[:2], gripper[2] + 0.1])
+        elif offset @ way < -0.02 and np.linalg.norm(aside) < (0.025 if is_low else 0.015):
+            ahead = min(distance, 0.05) * way - 1.5 * aside if is_low else 0.0
+            target = np.array([*(gripper[:2] + ahead), thing[2]])
+        elif gripper[2] < thing[2] + 0.07 and is_near:
+            target[:2] = gripper[:2]
+        return np.array([*np.clip(10 * (target - gripper), -1, 1), 0], np.float32), None
+
+
+def shown_by_expert(arguments: argparse.Namespace, folder: Path) -> Demonstrations:
+    """Returns 20 episodes of an expert, those in the folder if it holds some."""
+    if folder.exists():
+        return read(folder)
+    expert: Any = Pusher()
+    if not arguments.env.startswith("FetchPush"):
+        expert = learner(arguments, 1000).learn(arguments.expert_steps, Evaluate(arguments.env, 2_000, 50))
+        expert.restore_best()
+    return record(expert, arguments.env, 20, folder, seed=0)
+
+
+def learner(arguments: argparse.Namespace, seed: int, **more: Any) -> rejeu.SAC:
+    """Returns SAC with the settings of an environment."""
+    n_envs, backend, settings = SHARE[arguments.env]
+    env = rejeu.make_vector(arguments.env, n_envs, backend=backend, seed=seed)
+    return rejeu.SAC("MultiInputPolicy", env, seed=seed, **settings, **more)
+
+
 def share(arguments: argparse.Namespace) -> None:
-    """Compares learning without demonstrations, with a share of them, and with a share after cloning."""
-    env_id, results = arguments.env, []
-    settings: dict[str, Any] = {
-        "replay_buffer_class": "HerReplayBuffer",
-        "policy_kwargs": {"net_arch": [64, 64], "layer_norm": True},
-        "batch_size": 128,
-        "learning_rate": 1e-3,
-        "gamma": arguments.gamma,
-        "learning_starts": 500,
-        "buffer_size": 100_000,
-    }
-    expert = rejeu.SAC("MultiInputPolicy", env_id, seed=1000, **settings)
-    expert.learn(arguments.expert_steps, Evaluate(env_id, 2_000, 50))
-    expert.restore_best()
-    folder = Path(tempfile.mkdtemp()) / "shown"
-    shown = record(expert, env_id, 20, folder, seed=0)
-    for seed in arguments.seeds:
-        for way in ("none", "share", "clone and share"):
-            more = {} if way == "none" else {"demonstrations": folder}
-            agent = rejeu.SAC("MultiInputPolicy", env_id, seed=seed, **settings, **more)
-            agent.on_device = False
-            if way == "clone and share":
-                clone(agent, shown, arguments.updates, batch_size=128, seed=seed)
-            evaluate = Evaluate(env_id, arguments.every, 20, seed=10_000 + seed)
+    """Compares learning without demonstrations, with a share of them, and with a share after cloning them."""
+    folder = arguments.shown or Path(tempfile.mkdtemp()) / "shown"
+    shown = shown_by_expert(arguments, folder)
+    results = kept(arguments)
+    for seed, way in itertools.product(arguments.seeds, arguments.ways):
+        if any((one["seed"], one["demonstrations"]) == (seed, way) for one in results):
+            continue
+        began = time.perf_counter()
+        agent = learner(arguments, seed, **({} if way == "none" else {"demonstrations": folder}))
+        agent.on_device = False
+        if "clone" in WAYS[way]:
+            clone(agent, shown, arguments.updates, batch_size=128, seed=seed)
+        if "critics" in WAYS[way]:
+            learn_offline(agent, shown, arguments.updates, keep_policy=True)
+        env = rejeu.make_vector(arguments.env, 20, backend=SHARE[arguments.env][1], seed=10_000 + seed)
+        evaluate = Evaluate(env, arguments.every, 20, seed=10_000 + seed)
+        rates = [(0, agent.evaluate(20, seed=10_000 + seed, env=env).success_rate)]
+        agent.learn(arguments.steps, evaluate)
+        rates += [(one.step, one.evaluation.success_rate) for one in evaluate.results]
+        one = {"seed": seed, "demonstrations": way, "shown_return": shown.mean_return, "rates": rates}
+        one["steps_to_90"] = next((step for step, rate in rates if rate >= 0.9), arguments.steps)
+        one["mean_success"] = float(np.mean([rate for step, rate in rates]))
+        results.append({**one, "seconds": time.perf_counter() - began})
+        write(arguments, results)
 
-            def goes_on(agent: Any, turn: Any, evaluate: Evaluate = evaluate) -> bool:
-                return not evaluate.results or evaluate.results[-1].evaluation.success_rate < 0.9
 
-            began = time.perf_counter()
-            agent.learn(arguments.steps, [evaluate, goes_on])
-            rates = [(one.step, one.evaluation.success_rate) for one in evaluate.results]
-            steps = next((step for step, rate in rates if rate >= 0.9), None)
-            one = {"seed": seed, "demonstrations": way, "steps_to_90": steps, "rates": rates}
-            results.append({**one, "shown_return": shown.mean_return, "seconds": time.perf_counter() - began})
-            write(arguments, results)
+def result_file(arguments: argparse.Namespace) -> Path:
+    """Returns the file of the results."""
+    return arguments.out or RESULTS / f"{arguments.what}-{arguments.env.replace('/', '-')}.json"
+
+
+def kept(arguments: argparse.Namespace) -> list[dict[str, Any]]:
+    """Returns the results of the file with ``--continue``, else none."""
+    path = result_file(arguments)
+    return json.loads(path.read_text(encoding="utf-8"))["results"] if arguments.goes_on and path.exists() else []
 
 
 def write(arguments: argparse.Namespace, results: list[dict[str, Any]]) -> None:
     """Writes the results so far with their summary over the seeds, and prints the newest."""
     print(json.dumps(results[-1]), flush=True)
-    out = arguments.out or RESULTS / f"{arguments.what}-{arguments.env.replace('/', '-')}.json"
-    save(out, {**provenance(), "machine": machine(), "summary": summarized(results), "results": results}, "results")
+    content = {
+        **provenance({str(arguments.shown): "FOLDER"}),
+        "machine": machine(),
+        "summary": summarized(results),
+        "results": results,
+    }
+    save(result_file(arguments), content, "results")
 
 
 def summarized(results: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Returns the mean over the seeds and its interval, for each algorithm and dataset, round, or with and without a share."""
+    """Returns the mean over the seeds and its interval, for each algorithm and dataset, round, or way of demonstrations."""
     rows = [{**one, **part} for one in results for part in one.get("rounds", [{}])]
     kinds = [name for name in ("data", "algorithm", "round", "demonstrations") if name in rows[0]]
-    measure = "steps_to_90" if "steps_to_90" in rows[0] else "mean_return"
-    groups: dict[tuple[Any, ...], list[float]] = {}
-    for row in rows:
-        value = row["rates"][-1][0] if row[measure] is None else row[measure]
-        groups.setdefault(tuple(row[name] for name in kinds), []).append(value)
-    return [{**dict(zip(kinds, key, strict=True)), **(summary(values) or {})} for key, values in groups.items()]
+    measures = [name for name in ("mean_return", "steps_to_90", "mean_success") if name in rows[0]]
+    found = []
+    for measure in measures:
+        groups: dict[tuple[Any, ...], list[float]] = {}
+        for row in rows:
+            groups.setdefault(tuple(row[name] for name in kinds), []).append(row[measure])
+        for key, values in groups.items():
+            about: dict[str, Any] = summary(values) or {}
+            low, high = about["interval"] or (None, None)
+            found.append({"measure": measure, **dict(zip(kinds, key, strict=True)), **about, "low": low, "high": high})
+    return found
 
 
 def main() -> None:
@@ -200,8 +282,10 @@ def main() -> None:
     parser.add_argument("--updates", type=int, default=10_000)
     parser.add_argument("--steps", type=int, default=40_000)
     parser.add_argument("--every", type=int, default=500)
-    parser.add_argument("--gamma", type=float, default=0.98)
     parser.add_argument("--expert-steps", type=int, default=30_000)
+    parser.add_argument("--ways", nargs="+", choices=WAYS, default=list(WAYS))
+    parser.add_argument("--shown", type=Path, help="folder of the episodes of the expert of share")
+    parser.add_argument("--continue", action="store_true", dest="goes_on", help="keep the runs of the file, of share")
     parser.add_argument("--out", type=Path)
     arguments = parser.parse_args()
     {"offline": offline, "imitation": imitation, "share": share}[arguments.what](arguments)

@@ -106,6 +106,29 @@ def test_target_networks_follow_a_clone() -> None:
     assert eqx.tree_equal(state.actor, state.target_actor)
 
 
+@pytest.mark.parametrize(("name", "normalize"), [("SAC", True), ("TD3", False), ("TQC", False)])
+def test_critics_learn_what_was_recorded_while_the_policy_is_kept(name: str, normalize: bool) -> None:
+    """With ``gamma=0`` the value of a recorded action is its reward."""
+    env = Target()
+    mixed = record(Anywhere(env), env, 100, seed=0)
+    agent = getattr(rejeu, name)("MlpPolicy", env, gamma=0.0, learning_rate=3e-3, normalize=normalize, **SMALL)
+    clone(agent, mixed, 3)
+    actor = agent.learner.algorithm.actor(agent.learner.state(agent.run.state))
+    assert learn_offline(agent, mixed, 1500, keep_policy=True).keys() >= {"critic_loss", "actor_loss"}
+    assert eqx.tree_equal(actor, agent.learner.algorithm.actor(agent.learner.state(agent.run.state)))
+    obs = np.concatenate([episode.observations[:-1] for episode in mixed.episodes])
+    actions = np.concatenate([episode.actions for episode in mixed.episodes])
+    rewards = np.concatenate([episode.rewards for episode in mixed.episodes])
+    assert np.corrcoef(agent.q_values(obs, actions), rewards)[0, 1] > 0.9
+
+
+def test_a_policy_that_is_its_values_cannot_be_kept() -> None:
+    for name in ("DQN", "PPO"):
+        env, shown_to_it = shown("Discrete", 1)
+        with pytest.raises(ValueError, match=f"{name} has no critics"):
+            learn_offline(getattr(rejeu, name)("MlpPolicy", env, **SMALL), shown_to_it, 1, keep_policy=True)
+
+
 def test_an_agent_with_a_memory_is_refused() -> None:
     env, shown_to_it = shown("Box", 1)
     with pytest.raises(ValueError, match="has a memory"):
@@ -249,15 +272,24 @@ def test_every_batch_has_its_share(tmp_path: Path) -> None:
     assert (batch.reward == 0).any(axis=1).all()  # of goals in hindsight
 
 
-def test_a_run_with_demonstrations_resumes_equal(tmp_path: Path) -> None:
+@pytest.mark.parametrize("is_clone", [False, True])
+def test_a_run_with_demonstrations_resumes_equal(tmp_path: Path, is_clone: bool) -> None:
     pytest.importorskip("minari")
     env = gym.make("Pendulum-v1")
-    record(Anywhere(env), env, 1, tmp_path / "shown", seed=0)
+    data = record(Anywhere(env), env, 1, tmp_path / "shown", seed=0)
     settings: dict[str, Any] = {**SMALL, "demonstrations": tmp_path / "shown", "learning_starts": 20, "batch_size": 32}
+
+    def made() -> rejeu.SAC:
+        agent = rejeu.SAC("MlpPolicy", "Pendulum-v1", **settings)
+        if is_clone:
+            clone(agent, data, 5)
+            learn_offline(agent, data, 5, keep_policy=True)
+        return agent
+
     with shared_learners():
-        whole = rejeu.SAC("MlpPolicy", "Pendulum-v1", **settings).learn(80)
+        whole = made().learn(80)
         stop = lambda agent, turn: turn.step < 50  # noqa: E731
-        rejeu.SAC("MlpPolicy", "Pendulum-v1", **settings).learn(80, [Checkpoint(tmp_path / "run", every=1000), stop])
+        made().learn(80, [Checkpoint(tmp_path / "run", every=1000), stop])
         resumed = rejeu.SAC.resume(tmp_path / "run").learn()
     assert eqx.tree_equal(whole.learner.state(whole.run.state), resumed.learner.state(resumed.run.state))
 

@@ -52,6 +52,8 @@ def run_clone(arguments: Clone) -> tuple[int, dict[str, Any]]:
         session, stop = begin(task, seed, stack), stack.enter_context(Interrupt())
         expert = None if arguments.expert is None else expert_of(arguments.expert, arguments, made)
         demonstrations.check(session.agent, shown)
+        if arguments.critic_updates:
+            demonstrations.keeping_policy(session.agent)  # which raises before anything is trained
         folder = create(arguments.out, session.config.env, session.config.algorithm, seed)
         session = session._replace(folder=folder)
         runs.write(folder.config, session.config)
@@ -65,6 +67,8 @@ def run_clone(arguments: Clone) -> tuple[int, dict[str, Any]]:
                 demonstrations.clone(session.agent, shown, arguments.updates, learning_rate=rate, seed=seed)
             else:
                 learn_from_expert(session, expert, shown, arguments, seed)
+            if arguments.critic_updates:
+                demonstrations.learn_offline(session.agent, shown, arguments.critic_updates, keep_policy=True)
             session.agent.callbacks = stateful(learning.callbacks)
         status, result = session.finish(learning, stop, stopwatch)
         checkpoint = Checkpoint(folder.checkpoints)

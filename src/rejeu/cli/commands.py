@@ -97,6 +97,8 @@ class Clone(RunOptions):
     """Gradient steps; with --expert, in each round."""
     learning_rate: Annotated[Annotated[float, Meta(gt=0)], Shown("RATE")] = 1e-3
     """Step size of these gradient steps."""
+    critic_updates: Annotated[int, Meta(ge=0), Shown("N")] = 0
+    """Then gradient steps of the critics alone on the dataset: before rejeu resume trains SAC, TD3 or a relative of them."""
     expert: Annotated[Path | None, Shown("RUN")] = None
     """Folder of a run, or a .safetensors file, of the agent that labels what the clone does."""
     by_hand: bool = False

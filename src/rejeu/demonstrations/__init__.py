@@ -28,9 +28,10 @@ import optax
 from gymnasium.envs.registration import EnvSpec
 
 from rejeu import interrupt, spaces
-from rejeu.core import Algorithm, PyTree, averaged_fields
+from rejeu.core import Algorithm, Clock, Metrics, PyTree, averaged_fields, names
 from rejeu.envs.registry import make_env
 from rejeu.errors import MissingExtra
+from rejeu.loops.learner import Learner
 from rejeu.loops.off_policy import STEPS_OFFLINE, learn_from
 from rejeu.reporting.formatting import counted
 from rejeu.validation import number, whole
@@ -328,7 +329,9 @@ def dagger(
     return known
 
 
-def learn_offline(agent: Any, demonstrations: Demonstrations, updates: int) -> dict[str, float]:
+def learn_offline(
+    agent: Any, demonstrations: Demonstrations, updates: int, *, keep_policy: bool = False
+) -> dict[str, float]:
     """Takes gradient steps of an algorithm on recorded episodes alone, and returns the metrics of the last of them.
 
     Algorithms made for it are :class:`rejeu.TD3BC` and :class:`rejeu.IQL`; others overestimate actions that were never taken.
@@ -338,21 +341,40 @@ def learn_offline(agent: Any, demonstrations: Demonstrations, updates: int) -> d
         agent: learns with its own settings; schedules follow the updates.
         demonstrations: with its spaces.
         updates: number of gradient steps.
+        keep_policy: learn the values of the present policy, such as that of :func:`clone`, and leave it as it is. The
+            temperature of SAC and its relatives learns as well.
 
     Raises:
-        ValueError: if the spaces differ.
+        ValueError: if the spaces differ, or the policy is to be kept and the agent has no critics apart from it.
     """
     check(agent, demonstrations)
+    learner = keeping_policy(agent) if keep_policy else agent.learner
     run, updates = agent.run, whole("updates", updates, least=1)
     replay, done = agent.replay_of(demonstrations, run.env), 0
-    observe(agent, demonstrations)
+    if not keep_policy:
+        observe(agent, demonstrations)
     for n in chunks(updates):
-        learn_from(run, agent.learner, agent.config, replay, n, done / updates)
+        learn_from(run, learner, agent.config, replay, n, done / updates)
         done += n
         if interrupt.requested() is not None:
             break
     run.monitor.read()
     return {name: float(value) for name, value in (run.metrics or {}).items()}
+
+
+def keeping_policy(agent: Any) -> Learner:
+    """Returns the functions of an agent with updates that leave its policy as it is; raises as :func:`learn_offline`."""
+    algorithm = agent.learner.algorithm
+    if not any("critic" in name for name in names(agent.learner.shapes)):
+        raise ValueError(
+            f"{agent.name} has no critics that could learn while its policy is kept; use SAC, TD3 or a relative of them"
+        )
+
+    def update(state: PyTree, batch: Any, clock: Clock) -> tuple[PyTree, Metrics]:
+        new, metrics = algorithm.update(state, batch, clock)
+        return eqx.tree_at(algorithm.actor, new, algorithm.actor(state)), metrics
+
+    return Learner(algorithm._replace(update=update), None, agent.learner.skips)
 
 
 def chunks(updates: int) -> Iterable[int]:
@@ -426,8 +448,8 @@ def with_targets(state: PyTree) -> PyTree:
     def copied(node: Any) -> Any:
         if not is_state(node):
             return node
-        names = averaged_fields(type(node))
-        return dataclasses.replace(node, **{name: getattr(node, name.removeprefix("target_")) for name in names})
+        fields = averaged_fields(type(node))
+        return dataclasses.replace(node, **{name: getattr(node, name.removeprefix("target_")) for name in fields})
 
     return jax.tree.map(copied, state, is_leaf=is_state)
 
