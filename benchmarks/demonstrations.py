@@ -140,6 +140,13 @@ def imitation(arguments: argparse.Namespace) -> None:
         write(arguments, results)
 
 
+def hyperparameters(env_id: str) -> dict[str, Any]:
+    """Returns the hyperparameters of the preset of SAC for an environment."""
+    preset = presets.find(env_id, "SAC")
+    assert preset is not None
+    return preset.hyperparameters
+
+
 SHARE: dict[str, tuple[int, str, dict[str, Any]]] = {
     "jax/PointMaze-v0": (
         1,
@@ -154,16 +161,18 @@ SHARE: dict[str, tuple[int, str, dict[str, Any]]] = {
             "buffer_size": 100_000,
         },
     ),
-    **{
-        env_id: (preset.n_envs, backend, preset.hyperparameters)
-        for env_id, backend, preset in (
-            ("jax/Parking-v0", "auto", presets.find("parking-v0", "SAC")),
-            ("FetchPush-v4", "envpool", presets.find("FetchPush-v4", "SAC")),
-        )
-        if preset is not None
-    },
+    "jax/Parking-v0": (16, "auto", hyperparameters("parking-v0")),
+    "FetchPush-v4": (
+        8,
+        "envpool",
+        {
+            **hyperparameters("FetchPush-v4"),
+            "policy_kwargs": {"net_arch": [64, 64, 64], "layer_norm": True},
+            "batch_size": 128,
+        },
+    ),
 }
-"""Number of environments, backend and hyperparameters of ``share``."""
+"""Number of environments, backend and hyperparameters of ``share``; the network of FetchPush is smaller than its preset's."""
 WAYS = {"none": "", "share": "", "clone": "clone", "clone and critics": "clone critics"}
 """What is done before training, by the name of a way; all but the first have a share of demonstrations in each batch."""
 
