@@ -390,6 +390,9 @@ def random_action(space: spaces.Space, n: int, rng: np.random.Generator, mask: n
     """Returns ``n`` uniformly random actions in the algorithm's range (see :func:`scale_action`).
 
     With ``mask``, ``bool (n, n_actions)``, the actions are Discrete and among the allowed ones.
+
+    Raises:
+        TypeError: for a space of which no agent chooses.
     """
     if mask is not None:
         return nth_allowed(mask, rng.integers(mask.sum(axis=-1), dtype=np.int32))
@@ -401,10 +404,10 @@ def random_action(space: spaces.Space, n: int, rng: np.random.Generator, mask: n
         return rng.integers(space.nvec.ravel(), size=(n, space.nvec.size), dtype=np.int32)
     if isinstance(space, spaces.MultiBinary):
         return rng.integers(2, size=(n, int(np.prod(space.shape))), dtype=np.int32)
-    if isinstance(space, spaces.Dict | spaces.Tuple):
+    if isinstance(space, spaces.Dict | spaces.Tuple) and len(space.spaces):
         parts = [random_action(part, n, rng).reshape(n, -1) for part in members(space)]
         return np.concatenate(parts, axis=-1).astype(np.float32)
-    raise TypeError(f"cannot draw random actions of {space}")
+    raise TypeError(f"the actions are {space}; agents choose Box, Discrete, MultiDiscrete, MultiBinary, Dict and Tuple")
 
 
 def nth_allowed(mask: Any, n: Any) -> Any:

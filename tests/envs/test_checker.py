@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from rejeu.envs.checker import advice_on_observations, check_env
+from rejeu.envs.checker import advice_on_observations, check_env, findings
 from rejeu.errors import BadEnvironmentError
 from tests.environments import Reach, Sampled
 from tests.golden.vec_env_script import Walk
@@ -25,6 +25,25 @@ def test_environments_are_checked_and_advised_on():
     check_env(gym.make("Pendulum-v1").unwrapped, warn=False)
     with pytest.raises(TypeError, match="got str"):
         check_env("CartPole-v1")
+
+
+@pytest.mark.parametrize(
+    ("actions", "is_chosen"),
+    [
+        (gym.spaces.Dict({"turn": gym.spaces.Discrete(2), "go": gym.spaces.Tuple([Tidy.action_space])}), True),
+        (gym.spaces.Tuple([Tidy.action_space, gym.spaces.Text(3)]), False),
+        (gym.spaces.Dict({}), False),
+    ],
+)
+def test_nested_actions_are_fine_where_agents_choose_all_parts(actions, is_chosen):
+    class Nested(Tidy):
+        action_space = actions
+
+        def step(self, action):
+            return super().step(0)
+
+    found = [finding.text for finding in findings(Nested()) if finding.level == "error"]
+    assert ["agents choose Box, Discrete" in text for text in found] == ([] if is_chosen else [True])
 
 
 def test_goal_environments_are_checked_for_what_hindsight_needs():

@@ -19,7 +19,7 @@ from gymnasium.utils.env_checker import check_env as check_gymnasium_env
 from rejeu.envs import validation
 from rejeu.envs.goals import attribute
 from rejeu.errors import BadEnvironmentError
-from rejeu.spaces import GOAL_KEYS, check_goal_space, leaves, plain
+from rejeu.spaces import GOAL_KEYS, check_goal_space, leaves, plain, random_action
 
 MOST_STEPS = 2_000
 """Random steps after which episodes are assumed never to end, in an environment that declares no time limit."""
@@ -132,7 +132,7 @@ def _played(env: gym.Env, effort: Effort) -> dict[str, Finding]:
         raise TypeError(f"env must be a gymnasium.Env, got {type(env).__name__}; derive its class from gymnasium.Env")
     try:
         leaves(env.observation_space)
-        check_action_space(env.action_space)
+        random_action(env.action_space, 1, np.random.default_rng(SEED))
     except TypeError as error:
         return {"space": Finding("error", str(error))}
     found: dict[str, Finding] = {}
@@ -140,14 +140,6 @@ def _played(env: gym.Env, effort: Effort) -> dict[str, Finding]:
     if seen and isinstance(env.observation_space, spaces.Dict) and "desired_goal" in env.observation_space.spaces:
         found |= {finding.text: finding for finding in goal_findings(env, seen)}
     return found
-
-
-def check_action_space(space: gym.Space) -> None:
-    """Raises ``TypeError`` unless actions are of a kind that an agent can choose."""
-    if not isinstance(space, spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary):
-        raise TypeError(
-            f"the action space is {space}; agents choose Box, Discrete, MultiDiscrete or MultiBinary actions"
-        )
 
 
 def _play(env: gym.Env, found: dict[str, Finding], effort: Effort) -> list[Seen] | None:
