@@ -65,6 +65,7 @@ CAUSES = {
     r"minigrid\[wfc": "needs more packages: pip install 'minigrid[wfc]'",
     r"loading texture": "its textures are not in the package",
     r"scenarios/\.cfg": "needs a scenario of your own, and EnvPool's environments take no arguments here",
+    r"argument 'a_min'": "calls jax.numpy.clip by a name of its arguments that JAX 0.10 does not have",
     r"urlopen error": "downloads its images, and there was no network",
     r"Sudoku database": "its puzzles are not in the package",
     r"no algorithm here takes": "the actions are of a kind that no algorithm takes",
