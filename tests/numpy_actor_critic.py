@@ -203,21 +203,21 @@ def minibatches(orders: np.ndarray, size: int) -> Iterator[np.ndarray]:
 
 
 class RMSprop:
-    """RMSprop (Tieleman and Hinton 2012), which updates ``network`` in place as TensorFlow does.
+    """RMSprop (Tieleman and Hinton 2012), which updates ``network`` in place as PyTorch does.
 
-    The mean of squares starts at 1, and epsilon is added inside the square root: r / sqrt(v + epsilon).
+    The mean of squares starts at 0, and epsilon is added to its square root: r / (sqrt(v) + epsilon).
     """
 
     def __init__(self, network: Layers, rate: float, eps: float, decay: float = 0.99) -> None:
         self.network, self.rate, self.eps, self.decay = network, rate, eps, decay
-        self.second = [[np.ones_like(array) for array in layer] for layer in network]
+        self.second = [[np.zeros_like(array) for array in layer] for layer in network]
 
     def step(self, slopes: Layers) -> None:
         """Takes one step against the gradients ``slopes``."""
         for layer, slope, v in zip(self.network, slopes, self.second, strict=True):
             for i, g in enumerate(slope):
                 v[i] = self.decay * v[i] + (1.0 - self.decay) * g**2
-                layer[i][...] = layer[i] - self.rate * g / np.sqrt(v[i] + self.eps)
+                layer[i][...] = layer[i] - self.rate * g / (np.sqrt(v[i]) + self.eps)
 
 
 class A2C:

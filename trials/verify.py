@@ -392,7 +392,7 @@ NOTES = {
     "TRPO": "target_kl and cg_damping times the action dimensions, over which sb3-contrib takes the mean of the divergence",
     "TRPO, Discrete": "conjugate gradients in single precision",
     "CrossQ": "with the biased variance of a batch there, where sb3-contrib has the unbiased one",
-    "A2C": "with Adam: the default is TensorFlow's RMSprop here and PyTorch's there",
+    "A2C": "with Adam, whose first moment tells the gradient",
 }
 
 

@@ -7,9 +7,9 @@ value's targets ``R = A + V_old``::
     loss = -mean log pi(a | s) A + vf_coef mean (V(s) - R)^2 - ent_coef mean entropy(pi(. | s))
 
 By default advantages sum the rewards to the rollout's end and add the value there (``gae_lambda`` 1), and the optimizer is
-RMSprop, as in the paper. It is TensorFlow's: the mean ``v`` of squared gradients begins at 1, and a step is ``g / sqrt(v +
-rms_prop_eps)``. The first steps are short that way, where from 0 they would be ten times the learning rate for every weight;
-Stable-Baselines3, whose default is PyTorch's, names its ``RMSpropTFLike`` for steadier learning.
+RMSprop, as in the paper. It is PyTorch's, as in Stable-Baselines3: the mean ``v`` of squared gradients begins at 0, and a step
+is ``g / (sqrt(v) + rms_prop_eps)``. TensorFlow's, with epsilon under the root, hardly moves a policy whose gradients are small
+beside those of the values: it does not learn LunarLander. ``optimizer`` takes it as well, with ``"initial_scale": 1.0``.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from rejeu.validation import coerce, flag, number
 
 @dataclass(frozen=True, kw_only=True)
 class Config(OnPolicyConfig):
-    """Hyperparameters of A2C; the defaults are Stable-Baselines3's, except for the variant of RMSprop (see above)."""
+    """Hyperparameters of A2C; the defaults are Stable-Baselines3's."""
 
     learning_rate: float | Schedule = 7e-4
     n_steps: int = 5
@@ -57,7 +57,7 @@ class Config(OnPolicyConfig):
     use_rms_prop: bool = True
     """Use RMSprop as the paper does; False uses Adam."""
     rms_prop_eps: float = 1e-5
-    """Epsilon of RMSprop, added before the square root, and of Adam, added after it."""
+    """Epsilon of RMSprop or Adam, added to the square root."""
 
     optimizer: Any = None
     """As for the other algorithms, such as ``"adamw"`` or ``optax.lamb``. None follows ``use_rms_prop``."""
@@ -124,7 +124,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
 def optimizer_of(config: Config) -> optax.GradientTransformation:
     """Returns the optimizer of a configuration: RMSprop, unless it chooses another."""
     if config.optimizer is None and config.use_rms_prop:
-        return optax.scale_by_rms(optimizers.RMSPROP_DECAY, config.rms_prop_eps, initial_scale=1.0)
+        return optax.scale_by_rms(optimizers.RMSPROP_DECAY, config.rms_prop_eps, eps_in_sqrt=False)
     return optimizers.make(config.optimizer or "adam", eps=config.rms_prop_eps)
 
 

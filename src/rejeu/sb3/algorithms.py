@@ -206,9 +206,6 @@ class Original(Agent):
             env = TimeLimitTerminates(gym.make(env) if isinstance(env, str) else env)
             settings["replay_buffer_kwargs"] = {**replay, "handle_timeout_termination": True}
         name = policy.replace("LstmPolicy", "Policy") if isinstance(policy, str) else policy
-        if self.name == "A2C" and settings.get("use_rms_prop", True) and settings.get("optimizer") is None:
-            rule = {"optimizer_class": "RMSprop", "optimizer_kwargs": {"eps": settings.get("rms_prop_eps", 1e-5)}}
-            settings["policy_kwargs"] = rule | (settings.get("policy_kwargs") or {})
         if self.name == "ARS":  # whose policy is linear without hidden layers
             widths, name = ([], "MlpPolicy") if name == "LinearPolicy" else ([64, 64], name)
             settings["policy_kwargs"] = {"net_arch": widths, **(settings.get("policy_kwargs") or {})}
