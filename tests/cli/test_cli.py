@@ -8,14 +8,18 @@ import signal
 import subprocess
 import sys
 import warnings
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
 import pytest
 
 import rejeu
+from rejeu.agents import AGENTS
+from rejeu.algorithms.dqn import FOR_NEW
 from rejeu.callbacks import Evaluate
 from rejeu.cli import main, one_line
+from rejeu.cli.train import untuned
 from rejeu.reporting.logging import CsvFile
 from rejeu.reporting.report.page import plotly_script
 from rejeu.runs import config, folder
@@ -74,6 +78,9 @@ class Broken(gym.Env):
 gym.register("rejeu-test/Words-v0", Words)
 gym.register("rejeu-test/Switches-v0", Switches)
 gym.register("rejeu-test/Broken-v0", Broken)
+
+
+CUBE = gym.spaces.Box(-1, 1, (3,))
 
 
 def train(out, *more, env="Pendulum-v1", steps=850):
@@ -316,6 +323,23 @@ def test_set_leaves_the_preset_as_it_was():
     preset = rejeu.presets.find("parking-v0")
     config.apply(["policy_kwargs.net_arch=[1]"], preset.hyperparameters)
     assert preset.hyperparameters["policy_kwargs"]["net_arch"] != [1]
+
+
+def test_without_a_preset_dqn_has_values_of_its_own_but_on_images(tmp_path):
+    few, pixels = SimpleNamespace(n_envs=1, observation_space=CUBE), gym.spaces.Box(0, 255, (36, 36, 3), np.uint8)
+    assert untuned("DQN", few) == FOR_NEW
+    assert untuned("DQN", SimpleNamespace(n_envs=1, observation_space=gym.spaces.Dict(eye=pixels, arm=CUBE))) == {}
+    assert untuned("PQN", few) == {}
+    assert (
+        untuned("PQN", SimpleNamespace(n_envs=128, observation_space=CUBE)) == AGENTS["PQN"].algorithm.Config.for_many
+    )
+    for env, steps in (("Blackjack-v1", 2), ("CartPole-v1", 1)):  # the second has a preset
+        out = tmp_path / env
+        argv = ["train", env, "--algo", "DQN", "--steps", "20", "--out", str(out), "--evaluate-episodes", "1"]
+        assert main([*argv, "--set", "learning_starts=30", "gradient_steps=1"]) == 0
+        found = json.loads((out / "config.json").read_text())["hyperparameters"]
+        assert (found["n_steps"], found["gradient_steps"]) == (steps, 1)
+        assert found["policy_kwargs"]["net_arch"] == [128, 128]
 
 
 @exhaustive

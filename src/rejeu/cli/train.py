@@ -5,6 +5,7 @@ The command line decides, then the preset of the environment, then the defaults.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
@@ -28,6 +29,7 @@ from rejeu.presets import Preset
 from rejeu.runs import config as runs
 from rejeu.runs.config import DecidedRun, merged
 from rejeu.runs.folder import RunFolder, check_free, create, read_arrivals
+from rejeu.spaces import leaves
 
 MANY = 64
 """Number of environments from which an algorithm's values for many environments are used."""
@@ -127,6 +129,14 @@ def describe_backend(env: VectorEnv, made: Environment, preset: Preset | None) -
     return f'{env.backend}; EnvPool would be faster ({ENVPOOL_SIZE}): pip install "rejeu[envpool]"'
 
 
+def untuned(algorithm: str, env: VectorEnv) -> Mapping[str, Any]:
+    """Returns the hyperparameters of an algorithm in environments without a preset."""
+    config = AGENTS[algorithm].algorithm.Config
+    if env.n_envs >= MANY:
+        return config.for_many
+    return {} if any(leaf.kind == "image" for leaf in leaves(env.observation_space)) else config.for_new
+
+
 def make_config(
     arguments: Train,
     made: Environment,
@@ -142,8 +152,7 @@ def make_config(
         TypeError: for an unknown hyperparameter, with the nearest known one.
         ValueError: for an invalid value.
     """
-    for_many = AGENTS[algorithm].algorithm.Config.for_many if env.n_envs >= MANY else {}
-    base = presets.default(made.env_id, algorithm, for_many) if preset is None else preset
+    base = presets.default(made.env_id, algorithm, untuned(algorithm, env)) if preset is None else preset
     hyperparameters = merged(arguments.hyperparameters, base.hyperparameters)
     config = validation.build(AGENTS[algorithm].algorithm.Config, hyperparameters)
     nested = isinstance(env.observation_space, spaces.Dict | spaces.Tuple)
