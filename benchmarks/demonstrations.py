@@ -235,6 +235,8 @@ def share(arguments: argparse.Namespace) -> None:
         evaluate = Evaluate(env, arguments.every, 20, seed=10_000 + seed)
         rates = [(0, agent.evaluate(20, seed=10_000 + seed, env=env).success_rate)]
         agent.learn(arguments.steps, evaluate)
+        if agent.interrupted:
+            sys.exit("stopped; --continue repeats this run")
         rates += [(one.step, one.evaluation.success_rate) for one in evaluate.results]
         one = {"seed": seed, "demonstrations": way, "shown_return": shown.mean_return, "rates": rates}
         one["steps_to_90"] = next((step for step, rate in rates if rate >= 0.9), arguments.steps)
