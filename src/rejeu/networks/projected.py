@@ -39,8 +39,11 @@ class UnitLinear(eqx.Module):
 
     def __init__(self, key: Array, n_inputs: int, n_outputs: int, bias: bool = False) -> None:
         """Draws an orthogonal matrix, its columns scaled to norm 1; the bias is 0."""
-        weight = jax.nn.initializers.orthogonal()(key, (n_inputs, n_outputs), jnp.float32)
-        self.weight = unit(weight, axis=0)
+        # jaxlib's batches of QR decompositions wait for threads that other batches hold, forever if there are few (0.10.2).
+        draw = jax.custom_batching.sequential_vmap(
+            lambda key: jax.nn.initializers.orthogonal()(key, (n_inputs, n_outputs), jnp.float32)
+        )
+        self.weight = unit(draw(key), axis=0)
         self.bias = jnp.zeros((n_outputs,), jnp.float32) if bias else None
 
     def __call__(self, x: Array) -> Array:
