@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -357,3 +358,117 @@ def test_good_actions_of_iql_weigh_more(inverse_temperature: float) -> None:
     target = reward + discount * np.asarray(after.value(following))[:, 0]
     errors = np.asarray(action_values(before.critics, obs, action)) - target
     assert float(metrics["critic_loss"]) == pytest.approx(float((errors**2).mean(axis=1).sum()), rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("own", "theirs"),
+    [
+        (gym.spaces.Discrete(3), gym.spaces.Discrete(4)),
+        (gym.spaces.MultiDiscrete([2, 3]), gym.spaces.MultiDiscrete([2, 5])),
+        (gym.spaces.Box(-1.0, 1.0, (2,)), gym.spaces.Box(-9.0, 9.0, (2,))),
+    ],
+)
+def test_other_sizes_and_bounds_of_actions_are_refused(own: gym.Space, theirs: gym.Space) -> None:
+    env = Target()
+    env.action_space = own
+    other = dataclasses.replace(shown("Box", 1)[1], action_space=theirs)
+    with pytest.raises(ValueError, match="action space"):
+        clone(rejeu.PPO("MlpPolicy", env, **SMALL), other, 1)
+
+
+def test_observations_that_mean_something_else_are_refused() -> None:
+    env, known = shown("Box", 1)
+    for own, theirs in (
+        (gym.spaces.Discrete(3), gym.spaces.Discrete(4)),
+        (gym.spaces.Box(0, 255, (8, 8, 3), np.uint8), gym.spaces.Box(0.0, 1.0, (8, 8, 3))),
+    ):
+        env.observation_space = own
+        with pytest.raises(ValueError, match="observation space"):
+            clone(rejeu.PPO("MlpPolicy", env, **SMALL), dataclasses.replace(known, observation_space=theirs), 1)
+
+
+def test_damaged_demonstrations_are_refused() -> None:
+    env, known = shown("Discrete", 1)
+    agent = rejeu.PPO("MlpPolicy", env, **SMALL)
+    (episode,) = known.episodes
+    damaged = {
+        "NaN or infinite": dataclasses.replace(episode, observations=episode.observations * np.nan),
+        "actions from 9 to 9": dataclasses.replace(episode, actions=np.full_like(episode.actions, 9)),
+        "5 rewards, 3 actions": dataclasses.replace(episode, actions=episode.actions[:3]),
+        "hold no step": dataclasses.replace(episode, rewards=episode.rewards[:0]),
+    }
+    for message, one in damaged.items():
+        with pytest.raises(ValueError, match=message):
+            clone(agent, dataclasses.replace(known, episodes=(one,)), 1)
+    with pytest.raises(TypeError, match="what read"):
+        clone(agent, "shown", 1)  # type: ignore[arg-type]
+
+
+def test_an_action_of_several_parts_is_refused() -> None:
+    env, known = shown("Box", 1)
+    env.action_space = gym.spaces.Dict(a=gym.spaces.Discrete(2), b=gym.spaces.Box(-1.0, 1.0, (2,)))
+    with pytest.raises(ValueError, match="cannot be learned from"):
+        clone(rejeu.PPO("MlpPolicy", env, **SMALL), dataclasses.replace(known, action_space=env.action_space), 1)
+
+
+def test_a_clone_that_diverges_leaves_the_agent_as_it_was() -> None:
+    env, known = shown("Box", 1)
+    agent = rejeu.PPO("MlpPolicy", env, **SMALL)
+    before = agent.run.state
+    with pytest.raises(ValueError, match="try a learning_rate below"):
+        clone(agent, known, 100, learning_rate=1e38)
+    assert agent.run.state is before
+
+
+def test_an_algorithm_without_a_replay_buffer_does_not_learn_offline() -> None:
+    env, known = shown("Box", 1)
+    with pytest.raises(ValueError, match="has no replay buffer"):
+        learn_offline(rejeu.PPO("MlpPolicy", env, **SMALL), known, 1)
+
+
+def test_an_agent_with_a_memory_remembers_while_it_is_recorded() -> None:
+    class Counts:
+        def predict(self, obs: Any, state: Any = None, deterministic: bool = True) -> tuple[np.ndarray, int]:
+            n = 0 if state is None else state
+            return np.full(2, n, np.float32), n + 1
+
+    recorded = record(Counts(), Target(), 2, seed=0)
+    for episode in recorded.episodes:
+        np.testing.assert_array_equal(episode.actions[:, 0], np.arange(5))
+
+
+def test_the_statistics_of_a_run_begin_with_its_demonstrations(tmp_path: Path) -> None:
+    pytest.importorskip("minari")
+    known = record(Anywhere(env := Target()), env, 2, tmp_path / "shown", seed=0)
+    agent = rejeu.SAC("MlpPolicy", Target(), demonstrations=tmp_path / "shown", normalize=True, **SMALL).learn(5)
+    statistics = agent.learner.state(agent.run.state).statistics
+    assert statistics.returns.n_seen == known.n_steps + 5
+    assert statistics.obs[0].n_seen == known.n_steps + 5
+
+
+def test_demonstrations_have_no_infos_of_the_training_environment() -> None:
+    env = Reach()
+    known = record(Anywhere(env), env, 1, seed=0)
+    settings = {"copy_info_dict": True}
+    agent = rejeu.SAC(
+        "MultiInputPolicy", env, replay_buffer_class="HerReplayBuffer", replay_buffer_kwargs=settings, **SMALL
+    )
+    agent.learn(3)
+    infos = agent.replay_of(known, agent.run.env).infos
+    assert [info for info in infos if info] == []
+
+
+def test_an_agent_with_a_memory_does_not_learn_offline() -> None:
+    env, known = shown("Box", 1)
+    agent = rejeu.SAC("MlpPolicy", env, seed=0, policy_kwargs={"lstm_hidden_size": 8, "net_arch": [8]})
+    with pytest.raises(ValueError, match="has a memory"):
+        learn_offline(agent, known, 1)
+
+
+def test_an_agent_without_an_environment_does_not_learn_offline(tmp_path: Path) -> None:
+    env, known = shown("Box", 1)
+    path = rejeu.IQL("MlpPolicy", env, **SMALL).save(tmp_path / "model")
+    with pytest.raises(ValueError, match="has no environment"):
+        learn_offline(rejeu.load(path), known, 1)
+    with pytest.raises(ValueError, match="steps=0"):
+        dagger(rejeu.IQL("MlpPolicy", env, **SMALL), Expert(env).predict, env, known, steps=0)

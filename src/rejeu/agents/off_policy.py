@@ -109,11 +109,11 @@ class OffPolicyAgent(Agent):
     def loop(self, n_steps: int | None, progress: Callable[[int], float]) -> Iterator[Progress]:
         if self.stops is not None:
             return train_one(self.run, self.learner, self.config, n_steps, progress, self.stops)
-        if self.config.offline:
-            if not self.run.n_updates and self.learner.observe is not None:
-                from rejeu import demonstrations
+        if self.config.demonstrations is not None and self.learner.observe is not None and not self.run.step:
+            from rejeu import demonstrations
 
-                demonstrations.observe(self, demonstrations.read(str(self.config.demonstrations)))
+            demonstrations.observe(self, demonstrations.read(self.config.demonstrations))
+        if self.config.offline:
             return offline(self.run, self.learner, self.config, n_steps, progress)
         return off_policy(self.run, self.learner, self.config, n_steps, progress)
 
@@ -142,6 +142,8 @@ class OffPolicyAgent(Agent):
         demonstrations.check(self, recorded)
         n_rows = recorded.n_steps + len(recorded.episodes) + 1
         buffer = self.empty_buffer(env, 1, n_rows, None)
+        if isinstance(buffer, HerReplayBuffer):
+            buffer.last_infos = tuple  # a dataset has none
         demonstrations.fill(buffer, self, recorded)
         return buffer
 

@@ -28,6 +28,7 @@ import optax
 from gymnasium.envs.registration import EnvSpec
 
 from rejeu import interrupt, spaces
+from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.core import Algorithm, Clock, Metrics, PyTree, averaged_fields, names
 from rejeu.envs.registry import make_env
 from rejeu.errors import MissingExtra
@@ -94,7 +95,7 @@ def read(path: str | Path) -> Demonstrations:
 
     Raises:
         FileNotFoundError: if there is no dataset.
-        ValueError: if there are several, or the dataset has no step or numbers that are not finite.
+        ValueError: if there are several, or the dataset has no step.
         MissingExtra: if Minari is not installed.
     """
     try:
@@ -104,7 +105,10 @@ def read(path: str | Path) -> Demonstrations:
     path = Path(path)
     found = sorted({file.parent for file in path.rglob("metadata.json") if file.parent.name == "data"})
     if not found:
-        raise FileNotFoundError(f"{path} holds no Minari dataset; record one: rejeu play ENV --record {path}")
+        raise FileNotFoundError(
+            f"{path} holds no Minari dataset; give another folder (rejeu resume: --set demonstrations=FOLDER), or record one: "
+            f"rejeu play ENV --record {path}"
+        )
     if len(found) > 1:
         names = ", ".join(str(one.parent.relative_to(path)) for one in found[:5])
         raise ValueError(f"{path} holds {len(found)} datasets ({names}); give the folder of one of them")
@@ -116,8 +120,6 @@ def read(path: str | Path) -> Demonstrations:
     )
     if not episodes:
         raise ValueError(f"{path} holds no step; play at least one episode")
-    if not all(np.isfinite(a).all() for e in episodes for a in jax.tree.leaves((e.actions, e.rewards))):
-        raise ValueError(f"{path} holds actions or rewards that are NaN or infinite; record it again")
     return Demonstrations(episodes, data.observation_space, data.action_space, data.env_spec)
 
 
@@ -127,7 +129,7 @@ def record(
     """Plays whole episodes with an agent, and returns them.
 
     Args:
-        agent: anything with ``predict(obs, deterministic=True)``.
+        agent: anything with ``predict(obs, deterministic=True)``; a state that it returns is given back after ``obs``.
         env: an id, or an environment.
         episodes: number of episodes.
         path: new or empty folder for a Minari dataset of them; None writes none.
@@ -169,11 +171,13 @@ def play(
     parts: list[list[tuple[Any, ...]]] = [[]]
     if recording is not None:
         recording.begin(obs, seed)
+    memory: tuple[Any, ...] = ()
     n_steps, done = 0, False
     while not done:
         if (signal := interrupt.requested()) is not None:
             raise interrupt.Stopped(signal)
-        action, _ = agent.predict(obs, deterministic=True)
+        action, state = agent.predict(obs, *memory, deterministic=True)
+        memory = () if state is None else (state,)
         labeled = label(obs, action)
         action = labeled if takes_over and labeled is not None else action
         before, labeled = jax.tree.map(np.copy, (obs, labeled))  # which may be written to again
@@ -220,14 +224,10 @@ def clone(
         seed: of the batches.
 
     Raises:
-        ValueError: if the spaces differ, or the agent has a memory.
+        ValueError: if the spaces differ, the agent has a memory, or numbers are not finite.
     """
     check(agent, demonstrations)
     algorithm = agent.learner.algorithm
-    if algorithm.recall is not None:
-        raise ValueError(
-            f"{agent.name} has a memory, and clone imitates single steps; use PPO or an algorithm without one"
-        )
     updates, batch_size = whole("updates", updates, least=1), whole("batch_size", batch_size, least=1)
     optimizer = optax.adam(number("learning_rate", learning_rate, above=0))
     pairs = [arrays_of(agent, episode) for episode in demonstrations.episodes]
@@ -255,6 +255,10 @@ def clone(
         weights, moments, value = steps(weights, moments, jax.tree.map(lambda leaf: leaf[index], (obs, action)))  # noqa: B023
         if interrupt.requested() is not None:
             break
+    if not np.isfinite(value):
+        raise ValueError(
+            f"the loss is {value}, and the agent was not changed; try a learning_rate below {learning_rate}"
+        )
     agent.run.state = agent.learner.pack(with_targets(eqx.combine(weights, rest)))
     return float(value)
 
@@ -303,6 +307,7 @@ def dagger(
     Raises:
         ValueError: if the spaces differ, or the agent has a memory.
     """
+    steps = whole("steps", steps, least=1)
     made, say = make_env(env) if isinstance(env, str) else env, after_round or (lambda i, known: None)
     known = demonstrations
     try:
@@ -345,11 +350,16 @@ def learn_offline(
             temperature of SAC and its relatives learns as well.
 
     Raises:
-        ValueError: if the spaces differ, or the policy is to be kept and the agent has no critics apart from it.
+        ValueError: if the spaces differ, the agent has no replay buffer, or the policy is to be kept and the agent has no
+            critics apart from it.
     """
     check(agent, demonstrations)
     learner = keeping_policy(agent) if keep_policy else agent.learner
+    if not isinstance(agent.config, OffPolicyConfig):
+        raise ValueError(f"{agent.name} has no replay buffer to learn from; use IQL, TD3BC or ReBRAC, or clone it")
     run, updates = agent.run, whole("updates", updates, least=1)
+    if run.env is None:
+        raise ValueError("this agent has no environment, and so no replay buffer; give one to load(path, env=...)")
     replay, done = agent.replay_of(demonstrations, run.env), 0
     if not keep_policy:
         observe(agent, demonstrations)
@@ -388,17 +398,38 @@ def chunks(updates: int) -> Iterable[int]:
 
 
 def check(agent: Any, demonstrations: Demonstrations) -> None:
-    """Raises ``ValueError`` unless demonstrations have the spaces of an agent, the bounds of observations aside."""
+    """Raises ``ValueError`` unless an agent can learn from demonstrations: these spaces, the bounds of observations aside."""
+    if not isinstance(demonstrations, Demonstrations):
+        raise TypeError(f"demonstrations={demonstrations!r} must be what read(FOLDER) or record(...) returns")
     for kind, own, theirs in (
         ("observation", agent.observation_space, demonstrations.observation_space),
         ("action", agent.action_space, demonstrations.action_space),
     ):
-        if [(leaf.path, leaf.shape) for leaf in spaces.leaves(own)] != [
-            (leaf.path, leaf.shape) for leaf in spaces.leaves(theirs)
-        ] or type(own) is not type(theirs):
+        if not spaces.same(own, theirs, bounds=kind == "action"):
             raise ValueError(
                 f"the demonstrations have the {kind} space {theirs}, and the agent {own}; record them in its environment"
             )
+    if isinstance(space := agent.action_space, gym.spaces.Dict | gym.spaces.Tuple):
+        raise ValueError(f"demonstrations of the action space {space} cannot be learned from; flatten it in a wrapper")
+    if agent.learner.algorithm.recall is not None:
+        raise ValueError(
+            f"{agent.name} has a memory, and demonstrations are single steps; use an algorithm without one"
+        )
+    if not demonstrations.n_steps:
+        raise ValueError("the demonstrations hold no step; play at least one episode")
+    for episode in demonstrations.episodes:
+        if not all(
+            np.isfinite(a).all() for a in jax.tree.leaves((episode.observations, episode.actions, episode.rewards))
+        ):
+            raise ValueError("the demonstrations hold numbers that are NaN or infinite; record them again")
+        n, n_obs = len(episode), {len(leaf) for leaf in jax.tree.leaves(episode.observations)}
+        if len(episode.actions) != n or n_obs != {n + 1}:
+            raise ValueError(
+                f"an episode has {n} rewards, {len(episode.actions)} actions and {n_obs} observations; it must have as many "
+                "actions as rewards, and one observation more"
+            )
+        if not isinstance(space, gym.spaces.Box):  # actions beyond the bounds of a Box are what an expert wanted
+            spaces.check_env_actions(space, np.asarray(episode.actions), "a demonstration")
 
 
 def arrays_of(agent: Any, episode: Episode) -> tuple[PyTree, np.ndarray]:
