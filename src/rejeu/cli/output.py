@@ -124,12 +124,12 @@ def summary(
     if evaluate.best is not None:
         lines.append(f"best model    step {evaluate.best.step:,}: {evaluate.best.evaluation}")
     backend = " --backend gymnasium" if environment.is_registered() else ""
+    steps = f"; {agent.num_timesteps:,} steps at {agent.steps_per_second:,.0f} steps/s" if agent.num_timesteps else ""
     return "\n".join(
         [
             *lines,
             f"files         {folder.path}: {', '.join(facts['files'])}",
-            f"time          {facts['seconds']:.1f} s in all, {facts['compile_seconds']:.1f} s of them compiling; "
-            f"{agent.num_timesteps:,} steps at {agent.steps_per_second:,.0f} steps/s",
+            f"time          {facts['seconds']:.1f} s in all, {facts['compile_seconds']:.1f} s of them compiling{steps}",
             f"try it        rejeu evaluate {quoted(folder.path)}{options}{backend}",
         ]
     )
