@@ -106,6 +106,18 @@ def test_first_result_is_of_the_preset_as_it_is():
     assert presets.find_result("Blackjack-v1", "DQN") is None
 
 
+def test_a_result_is_that_of_the_named_preset_it_was_measured_with():
+    assert presets.find_result("HalfCheetah-v5", "FlashSAC", "small").seeds == 1
+    assert "1 seed" in str(presets.find_result("HalfCheetah-v5", "FlashSAC", "small")).split(", ")
+    assert presets.find_result("HalfCheetah-v5", "FlashSAC", "full") is None
+
+
+def test_names_of_presets_have_no_case_and_are_listed_for_a_wrong_one():
+    assert presets.named("rainbow", "CartPole-v1") == presets.named("Rainbow", "CartPole-v1")
+    with pytest.raises(FileNotFoundError, match="with a name are Rainbow, BTR, small, full"):
+        find_preset("CartPole-v1", None, "Rainbw")
+
+
 def test_environments_in_jax_have_the_presets_of_their_twins():
     preset, twin = presets.find("jax/Parking-v0"), presets.find("parking-v0")
     assert dict(preset.hyperparameters) == dict(twin.hyperparameters)

@@ -29,10 +29,13 @@ def show(algorithms: Mapping[str, str]) -> None:
     print("\nenvironments with tuned hyperparameters, the preset of rejeu train first; in brackets, names for --preset")
     rows: dict[str, list[tuple[str, ...]]] = {}
     for one in presets.every():
-        result = presets.find_result(one.env_id, one.algorithm) or one.source
+        steps, result = f"{one.total_steps:,} steps", presets.find_result(one.env_id, one.algorithm, one.name)
+        shown = one.source if result is None else str(result)
+        if result is not None and result.budget.endswith(" steps") and result.budget != steps:
+            shown += f", after {result.budget}"
         of_env = rows.setdefault(one.env_id, [])
         algorithm = f"{one.algorithm} ({one.name})" if one.name else one.algorithm
-        of_env.append(("" if of_env else one.env_id, algorithm, f"{one.total_steps:,} steps", str(result)))
+        of_env.append(("" if of_env else one.env_id, algorithm, steps, shown))
     print(columns([row for of_env in rows.values() for row in of_env]))
     print("\nIn brackets: 95 % confidence interval of a mean return, lowest and highest success rate of a seed.")
     print("Any other Gymnasium or EnvPool id is trained with the algorithm's defaults.")
@@ -67,7 +70,7 @@ def as_dict(preset: Preset) -> dict[str, Any]:
         "hyperparameters",
     )
     known = {name: getattr(preset, name) for name in (*names, "source")}
-    return {**known, "result": presets.find_result(preset.env_id, preset.algorithm)}
+    return {**known, "result": presets.find_result(preset.env_id, preset.algorithm, preset.name)}
 
 
 def columns(rows: Sequence[tuple[str, ...]]) -> str:

@@ -94,7 +94,10 @@ def read(path: str | Path) -> Preset:
     """
     path = Path(path)
     if not path.is_file():
-        raise FileNotFoundError(f"there is no preset file {path}; rejeu tune writes one as preset.json")
+        names = ", ".join(dict.fromkeys(one.name for one in every() if one.name))
+        raise FileNotFoundError(
+            f"there is no preset file {path}; rejeu tune writes one as preset.json, and presets with a name are {names}"
+        )
     try:
         return convert(read_json(path, MAX_BYTES), Preset)
     except (Malformed, CheckpointError) as error:
@@ -132,7 +135,7 @@ class Result:
 
     def __str__(self) -> str:
         """The result in a few words."""
-        return ", ".join(filter(None, (f"{self.measure} {self.figures}", f"{self.seeds} seeds", self.setting)))
+        return ", ".join(filter(None, (f"{self.measure} {self.figures}", f"{self.seeds} seed{'s' * (self.seeds > 1)}", self.setting)))
 
     @property
     def figures(self) -> str:
@@ -163,9 +166,11 @@ def results() -> tuple[Result, ...]:
     return msgspec.json.decode(content, type=tuple[Result, ...])
 
 
-def find_result(env_id: str, algorithm: str) -> Result | None:
-    """Returns the first result of an algorithm in an environment, None if there is none."""
-    return next((result for result in results() if (result.env_id, result.algorithm) == (env_id, algorithm)), None)
+def find_result(env_id: str, algorithm: str, name: str = "") -> Result | None:
+    """Returns the first result of an algorithm in an environment, with the preset of this name; None if there is none."""
+    wanted = env_id, algorithm, name
+    preset_of = lambda command: command.partition("--preset ")[2].partition(" ")[0]  # noqa: E731
+    return next((one for one in results() if (one.env_id, one.algorithm, preset_of(one.command)) == wanted), None)
 
 
 ALL: tuple[Preset, ...] = built_in()
@@ -211,7 +216,7 @@ def named(name: str, env_id: str, algorithm: str | None = None) -> Preset | None
     >>> named("Rainbow", "Acrobot-v1").algorithm
     'DQN'
     """
-    known = [preset for preset in every() if preset.name == name != ""]
+    known = [preset for preset in every() if preset.name.lower() == name.lower() != ""]
     return max(known, key=lambda one: (one.algorithm == algorithm, one.env_id == env_id), default=None)
 
 
