@@ -135,7 +135,8 @@ class Result:
 
     def __str__(self) -> str:
         """The result in a few words."""
-        return ", ".join(filter(None, (f"{self.measure} {self.figures}", f"{self.seeds} seed{'s' * (self.seeds > 1)}", self.setting)))
+        seeds = f"{self.seeds} seed{'s' * (self.seeds > 1)}"
+        return ", ".join(filter(None, (f"{self.measure} {self.figures}", seeds, self.setting)))
 
     @property
     def figures(self) -> str:
