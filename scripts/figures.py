@@ -289,7 +289,7 @@ def training_times() -> str:
     for preset in presets.ALL:
         result = found.get((preset.env_id, preset.algorithm))
         if result and result.seconds[1] < rows.get(preset.env_id, (float("inf"),))[0]:
-            row = (preset.env_id, preset.algorithm, f"{preset.total_steps:,}", time_of(result))
+            row = (preset.env_id, preset.algorithm, result.budget.removesuffix(" steps"), time_of(result))
             rows[preset.env_id] = result.seconds[1], row
     return table(("environment", "algorithm", "steps", "time for each seed"), [row for _, row in rows.values()])
 
