@@ -48,8 +48,10 @@ def test_every_result_has_a_preset_and_every_preset_a_result_or_says_that_it_is_
     found = {(result.env_id, result.algorithm) for result in presets.results()}
     untuned = {(preset.env_id, preset.algorithm) for preset in presets.ALL if preset.source.endswith("not tuned")}
     known = {(preset.env_id, preset.algorithm) for preset in presets.ALL}
-    as_it_is = {(result.env_id, result.algorithm) for result in presets.results() if not result.setting}
-    assert as_it_is <= known <= found | untuned
+    as_it_is = [result for result in presets.results() if not result.setting]
+    by_name = {one: one.command.partition("--preset ")[2].partition(" ")[0] for one in as_it_is}
+    assert all(presets.named(name, one.env_id).name == name for one, name in by_name.items() if name)
+    assert {(one.env_id, one.algorithm) for one, name in by_name.items() if not name} <= known <= found | untuned
 
 
 def test_a_preset_with_a_name_is_for_any_environment():
