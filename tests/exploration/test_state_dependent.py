@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 import rejeu
+from rejeu.algorithms import ppo
 from rejeu.algorithms.actor_critic.config import ActorCriticConfig
-from rejeu.algorithms.actor_critic.network import ActorCritic, action_kind, sde_explorer
+from rejeu.algorithms.actor_critic.network import ActorCritic, action_kind, explorer_of, sde_explorer
 from rejeu.core import Clock
 from rejeu.envs.make import InProcess
 from rejeu.spaces import leaves
@@ -86,9 +87,9 @@ def test_the_noise_is_a_matrix_times_the_hidden_layer(squash):
     assert len({np.asarray(one).tobytes() for one in carry[0]}) == N  # each environment has its own
 
 
-def matrices(freq, ends):
+def matrices(explorer, ends):
     """The matrices ``(steps, N, ...)`` where episodes begin at these (step, environment)."""
-    net, explorer = network(), sde_explorer(freq)
+    net = network()
     carry, result = explorer.init(net, N), []
     for t in range(12):
         begun = np.array([t == 0 or (t, e) in ends for e in range(N)])
@@ -98,15 +99,17 @@ def matrices(freq, ends):
 
 
 @pytest.mark.parametrize(
-    ("freq", "expected"),
+    ("settings", "expected"),
     [
-        (-1, ([0], [0, 5], [0])),
-        (4, ([0, 4, 8], [0, 4, 5, 9], [0, 4, 8])),
-        (1, ([*range(12)],) * 3),
+        ({"sde_sample_freq": -1, "n_steps": 4}, ([0, 4, 8], [0, 4, 5, 8], [0, 4, 8])),
+        ({"sde_sample_freq": -1, "n_episodes": 2}, ([0], [0, 5], [0])),
+        ({"sde_sample_freq": 4}, ([0, 4, 8], [0, 4, 5, 9], [0, 4, 8])),
+        ({"sde_sample_freq": 1}, ([*range(12)],) * 3),
     ],
 )
-def test_the_noise_stays_for_so_many_steps_and_is_drawn_anew_with_each_episode(freq, expected):
-    drawn = matrices(freq, {(5, 1)})
+def test_the_noise_stays_for_a_rollout_or_so_many_steps_and_is_drawn_anew_with_each_episode(settings, expected):
+    explorer = explorer_of(ppo.Config(use_sde=True, **settings), action_kind(ACTION_SPACE))
+    drawn = matrices(explorer, {(5, 1)})
     for e in range(N):
         fresh = [t for t in range(12) if t == 0 or not np.array_equal(drawn[t, e], drawn[t - 1, e])]
         assert fresh == expected[e]

@@ -101,7 +101,7 @@ class OnPolicyConfig(RolloutConfig):
     use_sde: bool = False
     """Explore by state-dependent noise (gSDE), which is kept for many steps and gives smooth motion. Box actions only."""
     sde_sample_freq: int = -1
-    """Steps after which that noise is resampled; -1: in every episode."""
+    """Steps after which that noise is resampled; -1: in every rollout. A new episode has new noise as well."""
     normalize_advantage: bool = True
     """Normalize the advantages of every batch to mean 0 and standard deviation 1."""
     policy_kwargs: ActorCriticConfig = dataclasses.field(default_factory=ActorCriticConfig)

@@ -238,11 +238,10 @@ def sde_log_std(log_std: Array, hidden: Array, use_expln: bool = False) -> Array
     return 0.5 * jnp.log(variance + SDE_EPSILON)
 
 
-def sde_explorer(n_steps: int) -> Explorer:
+def sde_explorer(n_steps: int, restarts: bool = True) -> Explorer:
     """Returns exploration by state-dependent noise (gSDE), whose matrix is sampled every ``n_steps``, or -1: in every episode.
 
-    An episode that continues after an update keeps its matrix with -1, which was drawn with the standard deviation from
-    before the update, while the update's log-probabilities use the new one.
+    The steps are counted from the beginning of an episode, or without ``restarts`` of the run, as its rollouts are.
 
     The actor is an :class:`ActorCritic` or another module with ``log_std (width, action_dim)``, ``hidden``,
     ``distribution`` and ``use_expln``.
@@ -263,7 +262,7 @@ def sde_explorer(n_steps: int) -> Explorer:
         hidden = actor.hidden(obs)
         distribution = actor.distribution(hidden, None)
         action = distribution.mean + jnp.einsum("nh,nhd->nd", hidden, matrix)
-        age = jnp.where(ended, 0, age) + 1
+        age = (jnp.where(ended, 0, age) if restarts else age) + 1
         return jnp.tanh(action) if isinstance(distribution, TanhNormal) else action, (matrix, age)
 
     return Explorer(init, act)
@@ -279,7 +278,8 @@ def explorer_of(config: OnPolicyConfig, kind: ActionKind) -> Explorer | None:
         return None
     if kind.kind != "box":
         raise ValueError("use_sde=True needs Box actions: noise cannot be added to discrete actions; leave it out")
-    return sde_explorer(config.sde_sample_freq)
+    by_rollout = config.sde_sample_freq == -1 and config.n_episodes is None
+    return sde_explorer(config.n_steps if by_rollout else config.sde_sample_freq, restarts=not by_rollout)
 
 
 def algorithm_of(
