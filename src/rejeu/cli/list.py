@@ -38,7 +38,7 @@ def show(algorithms: Mapping[str, str]) -> None:
         of_env.append(("" if of_env else one.env_id, algorithm, steps, shown))
     print(columns([row for of_env in rows.values() for row in of_env]))
     print("\nIn brackets: 95 % confidence interval of a mean return, lowest and highest success rate of a seed.")
-    print("Any other Gymnasium or EnvPool id is trained with the algorithm's defaults.")
+    print("Any other Gymnasium or EnvPool id is trained without a preset.")
 
 
 def described(is_extended: bool) -> dict[str, str]:
