@@ -66,9 +66,9 @@ def train_one(preset: presets.Preset, seed: int, arguments: argparse.Namespace) 
         "MultiInputPolicy" if nested else "MlpPolicy", env, seed=seed, **settings_of(preset, arguments)
     )
     callback = None
-    if arguments.best:
+    if arguments.best or arguments.curve:
         test_env = environments(10, 2_000_000 + 100 * seed)
-        callback = Evaluate(test_env, preset.evaluate_every, preset.evaluate_episodes)
+        callback = Evaluate(test_env, arguments.curve or preset.evaluate_every, preset.evaluate_episodes)
     if arguments.minutes:
         agent.learn(minutes=arguments.minutes - (time.perf_counter() - began) / 60, callback=callback)
     else:
@@ -97,6 +97,7 @@ def train_one(preset: presets.Preset, seed: int, arguments: argparse.Namespace) 
         "mean_length": evaluation.mean_length,
         "success_rate": None if math.isnan(evaluation.success_rate) else evaluation.success_rate,
         "episodes": arguments.episodes,
+        **({"curve": [[one.step, one.evaluation.mean_return] for one in callback.results]} if callback else {}),
     }
 
 
@@ -129,6 +130,7 @@ def main() -> None:
     parser.add_argument("--env", type=json.loads, default={}, help="arguments of the environment, as JSON")
     parser.add_argument("--set", type=json.loads, default={}, help="hyperparameters other than the preset's, as JSON")
     parser.add_argument("--best", action="store_true", help="evaluate the best weights by evaluations on the way")
+    parser.add_argument("--curve", type=int, metavar="STEPS", help="evaluate and record also every so many steps")
     parser.add_argument(
         "--shown", type=int, nargs="+", help="components of the observation that are shown; default: all"
     )
