@@ -277,6 +277,17 @@ def test_the_saved_batch_breaks_a_loaded_model_again(tmp_path):
         finite.load_batch(agent, tmp_path / "model")
 
 
+def test_next_actions_that_were_not_taken_are_not_blamed(tmp_path):
+    agent = rejeu.ReBRAC("MlpPolicy", box(), **OFF)
+    agent.report_folder = tmp_path
+    poison(agent, 3, 1e25)
+    with pytest.raises(NonFiniteError, match=r"^critic_loss \(inf\)") as caught:
+        agent.learn(TOTAL)
+    batch, _ = finite.load_batch(agent, caught.value.batch)
+    assert np.isnan(batch.next_action).any()
+    assert not finite.examine(agent, caught.value.batch).batch
+
+
 def test_a_batch_never_replaces_another_and_goes_where_logs_or_the_process_are(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     paths = []

@@ -221,7 +221,7 @@ def reported(agent: Any, update: NonFiniteUpdate, of: str = "") -> NonFiniteErro
     path, saved = _save(agent, batch, clock, names, n_updates + 1)
     what, more = ", ".join(found[:3]) or "an update", len(found) - 3
     what += f" and {more} more" * (more > 0) + " became NaN or infinite"
-    if spoiled := bad_leaves(batch._asdict()):
+    if spoiled := bad_parts(batch):
         what = f"the batch held {', '.join(spoiled[:3])}"
     if update.in_a_row >= MAX_SKIPPED:
         what = f"{update.in_a_row} updates in a row were skipped, so nothing is learned any more; in the last of them {what}"
@@ -301,7 +301,12 @@ def examine(agent: Any, path: str | Path) -> Found:
     """
     batch, clock = load_batch(agent, path)
     after, metrics = jax.jit(agent.learner.algorithm.update)(agent.state, batch, clock)
-    return Found(bad_leaves(batch._asdict()), bad_leaves(checked(metrics)), bad_leaves(after))
+    return Found(bad_parts(batch), bad_leaves(checked(metrics)), bad_leaves(after))
+
+
+def bad_parts(batch: Transition | Rollout) -> list[str]:
+    """Returns what of a batch is not finite, as :func:`bad_leaves`; a next action of NaN is one that was not taken."""
+    return bad_leaves({name: part for name, part in batch._asdict().items() if name != "next_action"})
 
 
 def load_batch(agent: Any, path: str | Path) -> tuple[Transition | Rollout, Clock]:
@@ -334,6 +339,7 @@ def batch_like(agent: Any, names: set[str]) -> Transition | Rollout:
         obs = Sequences(obs, zero, zero, zero, zero)
     obs = Masked(obs, zero) if agent.takes_masks else obs
     if "ended" not in names:
-        return Transition(obs, zero, zero, obs, zero, **{name: zero for name in ("weight", "rewards") if name in names})
+        optional = names & {"weight", "rewards", "next_action"}
+        return Transition(obs, zero, zero, obs, zero, **dict.fromkeys(optional, zero))
     carry = jax.tree.map(lambda leaf: zero, agent.learner.initial_carry(1))
     return Rollout(obs, zero, zero, obs, zero, zero, zero, zero, zero, carry)
