@@ -15,7 +15,7 @@ import rejeu
 from rejeu.callbacks import Checkpoint
 from rejeu.demonstrations import Demonstrations, learn_offline, read, record
 from tests.sharing import shared_learners
-from tests.test_demonstrations import SMALL, Anywhere, Target, by_hand
+from tests.test_demonstrations import SMALL, Anywhere, Target, by_hand, shown
 
 
 @pytest.mark.parametrize("name", ["TD3BC", "ReBRAC"])
@@ -44,6 +44,18 @@ def test_next_actions_are_those_of_the_next_observation_in_the_same_episode(n_st
     np.testing.assert_array_equal(after, np.minimum(x + n_steps, x // 10 * 10 + 3))
     expected = np.where(after % 10 == 3, np.nan, after / 10)
     np.testing.assert_allclose(batch.next_action[..., 0], expected, atol=1e-6)
+
+
+def test_the_target_network_of_q_learning_follows_the_updates() -> None:
+    env, known = shown("Discrete", 2)
+    networks = {}
+    for updates in (100, 200):
+        agent = rejeu.DQN("MlpPolicy", env, target_update_interval=100, batch_size=8, **SMALL)
+        learn_offline(agent, known, updates)
+        state = agent.learner.state(agent.run.state)
+        networks[updates] = state.network, state.target_network
+    assert eqx.tree_equal(networks[200][1], networks[100][0])
+    assert not eqx.tree_equal(*networks[200])
 
 
 class Untouched(Target):

@@ -343,7 +343,7 @@ def learn_offline(
     Hindsight replay and n-step returns work as in training. Ctrl-C ends it, and keeps what was learned.
 
     Args:
-        agent: learns with its own settings; schedules follow the updates.
+        agent: learns with its own settings; schedules and target networks follow the updates.
         demonstrations: with its spaces.
         updates: number of gradient steps.
         keep_policy: learn the values of the present policy, such as that of :func:`clone`, and leave it as it is. The
@@ -364,7 +364,7 @@ def learn_offline(
     if not keep_policy:
         observe(agent, demonstrations)
     for n in chunks(updates):
-        learn_from(run, learner, agent.config, replay, n, done / updates)
+        learn_from(run, learner, agent.config, replay, n, done / updates, done)
         done += n
         if interrupt.requested() is not None:
             break

@@ -109,10 +109,16 @@ def offline(
         yield Progress(run.step, [], run.metrics)
 
 
-def learn_from(run: Run, learner: Learner, config: OffPolicyConfig, replay: Any, n: int, progress: float) -> None:
-    """Starts ``n`` gradient steps on batches of a replay buffer, in one call."""
+def learn_from(
+    run: Run, learner: Learner, config: OffPolicyConfig, replay: Any, n: int, progress: float, before: int = 0
+) -> None:
+    """Starts ``n`` gradient steps on batches of a replay buffer, in one call.
+
+    For target networks that move after environment steps, those ``before`` count as such beside the run's.
+    """
     batch, drawn = replay.draw(run.rng, (n, config.batch_size), progress)
-    update(run, learner, [(batch, drawn)], clock_of(run, progress))
+    clock = clock_of(run, progress)
+    update(run, learner, [(batch, drawn)], clock._replace(step=np.uint32(run.step + before)))
     run.td_errors = []
 
 
