@@ -90,6 +90,19 @@ def test_every_agent_imitates(name: str, kind: str) -> None:
     assert after > 0.35 * before, (before, after)  # both are negative
 
 
+@pytest.mark.parametrize("name", ["CrossQ", "XQC", "FlashSAC"])
+def test_a_clone_with_batch_normalization_stays_one_in_training(name: str) -> None:
+    """Its statistics and norms are those of training, so that updates that learn nothing leave it as it is."""
+    env, shown_to_it = shown("Box")
+    agent = getattr(rejeu, name)("MlpPolicy", env, learning_rate=1e-9, policy_delay=1, learning_starts=0, **SMALL)
+    clone(agent, shown_to_it, 500, learning_rate=1e-2)
+    before = agent.evaluate(20, env=Target(), seed=0).mean_return
+    learn_offline(agent, shown_to_it, 200)
+    after = agent.evaluate(20, env=Target(), seed=0).mean_return
+    assert before > -3.0
+    assert after > before - 1.0
+
+
 def test_normalized_agents_imitate_by_their_own_statistics() -> None:
     env, shown_to_it = shown("Box")
     agent = rejeu.PPO("MlpPolicy", env, normalize=True, **SMALL)

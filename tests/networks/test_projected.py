@@ -82,11 +82,11 @@ def test_training_and_use_equal_numpy_and_training_moves_the_statistics_by_a_hun
     assert torso.n_outputs == torso(batch(9)).shape[1] == 4
 
 
-@pytest.mark.parametrize("gains", [False, True])
-def test_projection_scales_units_to_norm_1_and_gains_to_the_root_of_their_number(gains):
-    network = (torso_of(InvertedResidual), head(jax.random.PRNGKey(1), 4, 6))
+@pytest.mark.parametrize(("kind", "gains"), [(NormalizedMLP, False), (InvertedResidual, True)])
+def test_projection_scales_units_to_norm_1_and_gains_of_flashsac_to_the_root_of_their_number(kind, gains):
+    network = (torso_of(kind), head(jax.random.PRNGKey(1), 4, 6))
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), moved(network, 1), moved(network, 2))
-    after = projected(stacked, gains)
+    after = projected(stacked)
     is_layer = lambda node: isinstance(node, UnitLinear | RMSNorm | BatchRenorm)  # noqa: E731
     pairs = zip(jax.tree.leaves(stacked, is_leaf=is_layer), jax.tree.leaves(after, is_leaf=is_layer), strict=True)
     for old, new in pairs:

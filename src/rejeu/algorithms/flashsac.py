@@ -101,7 +101,7 @@ class Config(EntropyConfig):
     entropy_per_action: ClassVar[float] = -1.0
     """Share of a target entropy of ``"auto"`` that each action dimension has, in nats."""
     reads_both: ClassVar[bool] = True
-    """Whether the actor normalizes by the observations of both halves, and gains are projected; not so in XQC."""
+    """Whether the actor normalizes by the observations of both halves; not so in XQC."""
     search_space: ClassVar[SearchSpace] = {
         **search.OFF_POLICY,
         "policy_kwargs.net_arch": Choice(([32, 32], [64, 64], [128, 128])),
@@ -167,7 +167,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         critics, critics_optimizer, critic_loss, (logits, trained) = minimize(
             critics_loss, state.critics, state.critics_optimizer, optimizer, rate, *pairs, target, batch.weight
         )
-        critics = projected(with_statistics(critics, trained), config.reads_both)
+        critics = projected(with_statistics(critics, trained))
         state = after_critics(state, critics, critics_optimizer, config)
 
         def improve(state: State) -> tuple[State, Array, Array]:
@@ -176,7 +176,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
             actor, actor_optimizer, loss, (log_prob, trained) = minimize(
                 actor_loss, state.actor, state.actor_optimizer, optimizer, rate, *judged
             )
-            actor = projected(with_statistics(actor, trained), config.reads_both)
+            actor = projected(with_statistics(actor, trained))
             state = after_actor(state, actor, actor_optimizer, log_prob, target_entropy, config, rate)
             return state, loss, -jnp.mean(log_prob)
 

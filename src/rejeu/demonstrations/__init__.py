@@ -34,6 +34,8 @@ from rejeu.envs.registry import make_env
 from rejeu.errors import MissingExtra
 from rejeu.loops.learner import Learner
 from rejeu.loops.off_policy import STEPS_OFFLINE, learn_from
+from rejeu.networks.batch_renorm import in_training, is_normalized, with_statistics
+from rejeu.networks.projected import projected
 from rejeu.reporting.formatting import counted
 from rejeu.validation import number, whole
 
@@ -213,7 +215,8 @@ def clone(
     The loss of continuous actions is the squared error of the deterministic action in [-1, 1], of other actions minus their
     log-probability. For DQN, QR-DQN and PQN, whose policy follows from values, it is ``max_a (Q(s, a) + m(a)) - Q(s, a*)`` for
     the demonstrated ``a*``, where the margin ``m`` is 0.8 except at ``a*`` (Hester et al. 2018, arXiv 1704.03732, equation 2).
-    Critics learn nothing. Adam begins anew; the optimizers of the agent are not touched.
+    Critics learn nothing. Adam begins anew; the optimizers of the agent are not touched. Batch normalization and projection
+    are as in training.
 
     Args:
         agent: any agent without a memory.
@@ -235,16 +238,23 @@ def clone(
     state = seen(agent, obs, demonstrations.episodes)
     weights, rest = eqx.partition(state, eqx.is_inexact_array)
 
-    def loss(weights: PyTree, batch: tuple[PyTree, Any]) -> Any:
+    def loss(weights: PyTree, batch: tuple[PyTree, Any]) -> tuple[Any, PyTree]:
         actor = algorithm.actor(eqx.combine(weights, rest))
-        return jnp.mean(imitation_loss(algorithm, actor, *batch))
+        losses, seen = in_training(actor, lambda actor: imitation_loss(algorithm, actor, *batch))
+        return jnp.mean(losses), eqx.filter(seen, eqx.is_inexact_array)
+
+    def settled(weights: PyTree, seen: PyTree) -> PyTree:
+        actor = algorithm.actor(weights)
+        if not is_normalized(actor):
+            return weights
+        return eqx.tree_at(algorithm.actor, weights, projected(with_statistics(actor, seen)))
 
     @jax.jit
     def steps(weights: PyTree, moments: PyTree, batches: tuple[PyTree, Any]) -> tuple[PyTree, PyTree, Any]:
         def step(carry: tuple[PyTree, PyTree], batch: tuple[PyTree, Any]) -> tuple[tuple[PyTree, PyTree], Any]:
-            value, gradients = jax.value_and_grad(loss)(carry[0], batch)
+            (value, seen), gradients = jax.value_and_grad(loss, has_aux=True)(carry[0], batch)
             direction, moments = optimizer.update(gradients, carry[1])
-            return (optax.apply_updates(carry[0], direction), moments), value
+            return (settled(optax.apply_updates(carry[0], direction), seen), moments), value
 
         carry, losses = jax.lax.scan(step, (weights, moments), batches)
         return *carry, jnp.mean(losses)

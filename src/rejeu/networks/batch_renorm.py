@@ -203,5 +203,30 @@ def with_statistics(network: Network, trained: Network) -> Network:
     return jax.tree.map(take, network, trained, is_leaf=lambda node: isinstance(node, BatchRenorm))
 
 
+def in_training(network: Network, use: Callable[[Network], Array]) -> tuple[Array, Network]:
+    """Returns ``use(network)`` by the batch's statistics, and the network with updated statistics.
+
+    ``use`` must call each normalization once, and be traced with the call.
+    """
+    parts, structure = jax.tree.flatten(network, is_leaf=lambda node: isinstance(node, BatchRenorm))
+    seen = [*parts]
+
+    def recorded(i: int, norm: BatchRenorm) -> Callable[[Array], Array]:
+        def normalized(x: Array) -> Array:
+            y, seen[i] = norm.train(x)
+            return y
+
+        return normalized
+
+    given = [recorded(i, part) if isinstance(part, BatchRenorm) else part for i, part in enumerate(parts)]
+    return use(jax.tree.unflatten(structure, given)), jax.tree.unflatten(structure, seen)
+
+
+def is_normalized(network: Any) -> bool:
+    """Returns whether a network has a :class:`BatchRenorm`."""
+    is_norm = lambda node: isinstance(node, BatchRenorm)  # noqa: E731
+    return any(map(is_norm, jax.tree.leaves(network, is_leaf=is_norm)))
+
+
 def _statistics(norm: BatchRenorm) -> tuple[Array, Array, Array]:
     return norm.mean, norm.variance, norm.n_batches

@@ -1,7 +1,7 @@
 """Hidden layers whose weights are scaled to a fixed norm after each gradient step, with batch normalization between them.
 
 Batch normalization makes the scale of the weights before it irrelevant, but as they grow the steps of the optimizer count for
-less. :func:`projected` scales them back: each unit's weights to the norm 1, and on request the ``d`` gains of each
+less. :func:`projected` scales them back: each unit's weights to the norm 1, and in FlashSAC the ``d`` gains of each
 normalization to ``sqrt(d)``. So the effective learning rate stays the same (Palenicek et al. 2025, arXiv 2502.07523).
 
 The normalization is :class:`rejeu.networks.batch_renorm.BatchRenorm` without renormalization. ``train`` returns what these
@@ -156,24 +156,29 @@ class InvertedResidual(eqx.Module):
         return self.last(x), eqx.tree_at(lambda torso: (torso.norm, torso.blocks), self, (norm, tuple(blocks)))
 
 
-def projected(network: Network, gains: bool = False) -> Network:
+def projected(network: Network) -> Network:
     """Returns a network, or several stacked, with the weights of each unit of its :class:`UnitLinear` scaled to norm 1.
 
-    With ``gains`` the ``d`` gains of each normalization, with its offsets if it has any, are scaled to the norm ``sqrt(d)``.
+    In an :class:`InvertedResidual` the ``d`` gains of each normalization, with its offsets if it has any, are scaled to the
+    norm ``sqrt(d)``.
     """
+    is_part = lambda node: isinstance(node, UnitLinear | RMSNorm | BatchRenorm)  # noqa: E731
 
     def scaled(node: Any) -> Any:
         if isinstance(node, UnitLinear):
             return eqx.tree_at(lambda layer: layer.weight, node, unit(node.weight, axis=-2))
-        if gains and isinstance(node, RMSNorm):
+        return jax.tree.map(with_gains, node, is_leaf=is_part) if isinstance(node, InvertedResidual) else node
+
+    def with_gains(node: Any) -> Any:
+        if isinstance(node, RMSNorm):
             return eqx.tree_at(lambda norm: norm.scale, node, unit(node.scale) * math.sqrt(node.scale.shape[-1]))
-        if gains and isinstance(node, BatchRenorm):
+        if isinstance(node, BatchRenorm):
             n = node.scale.shape[-1]
             both = unit(jnp.concatenate([node.scale, node.offset], axis=-1)) * math.sqrt(n)
             return eqx.tree_at(lambda norm: (norm.scale, norm.offset), node, (both[..., :n], both[..., n:]))
-        return node
+        return scaled(node)
 
-    return jax.tree.map(scaled, network, is_leaf=lambda node: isinstance(node, UnitLinear | RMSNorm | BatchRenorm))
+    return jax.tree.map(scaled, network, is_leaf=lambda node: isinstance(node, UnitLinear | InvertedResidual))
 
 
 def unit(x: Array, axis: int = -1) -> Array:
