@@ -456,6 +456,20 @@ def test_the_statistics_of_a_run_begin_with_its_demonstrations(tmp_path: Path) -
     agent = rejeu.SAC("MlpPolicy", Target(), demonstrations=tmp_path / "shown", normalize=True, **SMALL).learn(5)
     statistics = agent.learner.state(agent.run.state).statistics
     assert statistics.returns.n_seen == known.n_steps + 5
+class OneAllowed(Target):
+    """Allows the actions in turn."""
+
+    def action_masks(self) -> np.ndarray:
+        return np.arange(3) == self.steps % 3
+
+
+def test_an_agent_with_masks_is_recorded_with_them() -> None:
+    env = OneAllowed("Discrete")
+    (episode,) = record(rejeu.PPO("MlpPolicy", env, action_masks=True, **SMALL), env, 1).episodes
+    assert episode.actions.tolist() == [-1, 0, 1, -1, 0]
+    assert episode.observations.shape == (6, 2)
+
+
     assert statistics.obs[0].n_seen == known.n_steps + 5
 
 

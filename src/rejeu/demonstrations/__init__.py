@@ -30,6 +30,7 @@ from gymnasium.envs.registration import EnvSpec
 from rejeu import interrupt, spaces
 from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.core import Algorithm, Clock, Metrics, PyTree, averaged_fields, names
+from rejeu.envs.masks import for_agent, split
 from rejeu.envs.registry import make_env
 from rejeu.errors import MissingExtra
 from rejeu.loops.learner import Learner
@@ -169,7 +170,10 @@ def play(
     ``label(obs, action)`` are the actions of the result, and with ``takes_over`` also those that are taken. Steps for which it
     is None are left out; each stretch between them is an episode.
     """
-    obs, _ = env.reset(seed=seed)
+    masked = for_agent(agent, env)
+    plain = (lambda seen: seen) if masked is env else (lambda seen: split(seen, None)[0])
+    seen, _ = masked.reset(seed=seed)
+    obs = plain(seen)
     parts: list[list[tuple[Any, ...]]] = [[]]
     if recording is not None:
         recording.begin(obs, seed)
@@ -178,12 +182,13 @@ def play(
     while not done:
         if (signal := interrupt.requested()) is not None:
             raise interrupt.Stopped(signal)
-        action, state = agent.predict(obs, *memory, deterministic=True)
+        action, state = agent.predict(seen, *memory, deterministic=True)
         memory = () if state is None else (state,)
         labeled = label(obs, action)
         action = labeled if takes_over and labeled is not None else action
         before, labeled = jax.tree.map(np.copy, (obs, labeled))  # which may be written to again
-        obs, reward, terminated, truncated, _ = env.step(action)
+        seen, reward, terminated, truncated, _ = masked.step(action)
+        obs = plain(seen)
         if labeled is not None:
             parts[-1].append((before, labeled, float(reward), jax.tree.map(np.copy, obs), bool(terminated)))
         elif parts[-1]:
