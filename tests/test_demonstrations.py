@@ -74,7 +74,7 @@ def shown(kind: str, episodes: int = 40) -> tuple[Target, Demonstrations]:
 
 IMITATORS = [
     *((name, "Box") for name in ("PPO", "A2C", "TRPO", "SAC", "TD3", "DDPG", "TQC", "IQL", "TD3BC", "ReBRAC")),
-    *((name, "Discrete") for name in ("PPO", "A2C", "TRPO", "SAC", "DDPG", "DQN", "QRDQN", "PQN")),
+    *((name, "Discrete") for name in ("PPO", "A2C", "TRPO", "SAC", "DDPG", "DQN", "QRDQN", "IQN", "PQN")),
     *((name, kind) for name in ("PPO",) for kind in ("MultiDiscrete", "MultiBinary")),
 ]
 
@@ -235,8 +235,14 @@ def test_a_dataset_is_read_as_it_was_recorded(tmp_path: Path) -> None:
         assert one.terminated == other.terminated
     with pytest.raises(FileExistsError):
         record(Expert(env), env, 1, tmp_path / "shown")
+    with pytest.raises(TypeError, match="one Gymnasium environment, got InProcess"):
+        record(Expert(env), rejeu.make_vector(Target, 2), 1)
     with pytest.raises(FileNotFoundError, match="holds no Minari dataset"):
         read(tmp_path / "nothing")
+    for name, content in (("main_data.hdf5", "cut"), ("metadata.json", "{}"), ("metadata.json", "")):
+        next((tmp_path / "shown").rglob(f"data/{name}")).write_text(content)
+        with pytest.raises(ValueError, match="data is damaged"):
+            read(tmp_path / "shown")
 
 
 def by_hand(n: int, terminated: bool, first: float = 0.0) -> Episode:
@@ -450,12 +456,6 @@ def test_an_agent_with_a_memory_remembers_while_it_is_recorded() -> None:
         np.testing.assert_array_equal(episode.actions[:, 0], np.arange(5))
 
 
-def test_the_statistics_of_a_run_begin_with_its_demonstrations(tmp_path: Path) -> None:
-    pytest.importorskip("minari")
-    known = record(Anywhere(env := Target()), env, 2, tmp_path / "shown", seed=0)
-    agent = rejeu.SAC("MlpPolicy", Target(), demonstrations=tmp_path / "shown", normalize=True, **SMALL).learn(5)
-    statistics = agent.learner.state(agent.run.state).statistics
-    assert statistics.returns.n_seen == known.n_steps + 5
 class OneAllowed(Target):
     """Allows the actions in turn."""
 
@@ -470,6 +470,18 @@ def test_an_agent_with_masks_is_recorded_with_them() -> None:
     assert episode.observations.shape == (6, 2)
 
 
+def test_demonstrations_are_found_from_another_folder() -> None:
+    assert rejeu.SAC.algorithm.Config(demonstrations="shown").demonstrations == str(Path.cwd() / "shown")
+    with pytest.raises(TypeError, match="must be the folder"):
+        rejeu.SAC.algorithm.Config(demonstrations=shown("Box", 1)[1])
+
+
+def test_the_statistics_of_a_run_begin_with_its_demonstrations(tmp_path: Path) -> None:
+    pytest.importorskip("minari")
+    known = record(Anywhere(env := Target()), env, 2, tmp_path / "shown", seed=0)
+    agent = rejeu.SAC("MlpPolicy", Target(), demonstrations=tmp_path / "shown", normalize=True, **SMALL).learn(5)
+    statistics = agent.learner.state(agent.run.state).statistics
+    assert statistics.returns.n_seen == known.n_steps + 5
     assert statistics.obs[0].n_seen == known.n_steps + 5
 
 

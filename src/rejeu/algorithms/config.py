@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import optax
@@ -217,7 +218,12 @@ class OffPolicyConfig(AlgorithmConfig):
         coerce(self, "priorities", nested, kind=PriorityConfig, optional=True)
         coerce(self, "demonstration_share", number, least=0, most=1)
         coerce(self, "offline", flag)
-        assign(self, demonstrations=None if self.demonstrations is None else str(self.demonstrations))
+        if not isinstance(self.demonstrations, str | Path | None):
+            raise TypeError(
+                f"demonstrations={self.demonstrations!r} must be the folder of a dataset: record(..., path=FOLDER)"
+            )
+        if self.demonstrations is not None:  # a run may be resumed from another folder
+            assign(self, demonstrations=str(Path(self.demonstrations).absolute()))
         if self.demonstrations is not None and self.priorities is not None:
             raise ValueError(
                 "demonstrations and priorities cannot be combined: the share is drawn uniformly; leave one out"

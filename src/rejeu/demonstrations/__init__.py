@@ -33,6 +33,7 @@ from rejeu.core import Algorithm, Clock, Metrics, PyTree, averaged_fields, names
 from rejeu.envs.masks import for_agent, split
 from rejeu.envs.registry import make_env
 from rejeu.errors import MissingExtra
+from rejeu.io.records import brief
 from rejeu.loops.learner import Learner
 from rejeu.loops.off_policy import STEPS_OFFLINE, learn_from
 from rejeu.networks.batch_renorm import in_training, is_normalized, with_statistics
@@ -98,7 +99,7 @@ def read(path: str | Path) -> Demonstrations:
 
     Raises:
         FileNotFoundError: if there is no dataset.
-        ValueError: if there are several, or the dataset has no step.
+        ValueError: if there are several, or the dataset has no step or is damaged.
         MissingExtra: if Minari is not installed.
     """
     try:
@@ -115,12 +116,15 @@ def read(path: str | Path) -> Demonstrations:
     if len(found) > 1:
         names = ", ".join(str(one.parent.relative_to(path)) for one in found[:5])
         raise ValueError(f"{path} holds {len(found)} datasets ({names}); give the folder of one of them")
-    data = minari.MinariDataset(found[0])
-    episodes = tuple(
-        Episode(e.observations, e.actions, np.asarray(e.rewards, np.float32), bool(e.terminations[-1]))
-        for e in data.iterate_episodes()
-        if len(e.rewards)
-    )
+    try:
+        data = minari.MinariDataset(found[0])
+        episodes = tuple(
+            Episode(e.observations, e.actions, np.asarray(e.rewards, np.float32), bool(e.terminations[-1]))
+            for e in data.iterate_episodes()
+            if len(e.rewards)
+        )
+    except (AssertionError, KeyError, OSError, ValueError) as error:
+        raise ValueError(f"{found[0]} is damaged ({brief(error)}); copy or record it again") from error
     if not episodes:
         raise ValueError(f"{path} holds no step; play at least one episode")
     return Demonstrations(episodes, data.observation_space, data.action_space, data.env_spec)
@@ -140,11 +144,12 @@ def record(
 
     Raises:
         FileExistsError: if the folder is not empty.
+        TypeError: for several environments, or a function that makes one.
         MissingExtra: if Minari is needed and not installed.
     """
     from rejeu.demonstrations.recording import Recording
 
-    made = make_env(env) if isinstance(env, str) else env
+    made = one_of(env)
     recording = None if path is None else Recording(path, made, None, "expert")
     try:
         seeds = [None if seed is None else seed + i for i in range(whole("episodes", episodes, least=1))]
@@ -155,6 +160,13 @@ def record(
         if made is not env:
             made.close()
     return Demonstrations(tuple(played), made.observation_space, made.action_space)
+
+
+def one_of(env: Any) -> gym.Env:
+    """Returns the environment of an id, or the environment that was given; raises ``TypeError`` for anything else."""
+    if not isinstance(env, str | gym.Env):
+        raise TypeError(f"env must be an id or one Gymnasium environment, got {type(env).__name__}")
+    return make_env(env) if isinstance(env, str) else env
 
 
 def play(
@@ -323,7 +335,7 @@ def dagger(
         ValueError: if the spaces differ, or the agent has a memory.
     """
     steps = whole("steps", steps, least=1)
-    made, say = make_env(env) if isinstance(env, str) else env, after_round or (lambda i, known: None)
+    made, say = one_of(env), after_round or (lambda i, known: None)
     known = demonstrations
     try:
         if known is not None:
