@@ -238,6 +238,15 @@ def test_runs_without_episodes_are_left_out(runs):
         compare(folder)
 
 
+@pytest.mark.parametrize("score", ["training", "evaluation"])
+def test_offline_runs_are_compared_by_their_evaluations(tmp_path, score):
+    for seed in range(2):
+        folder = write_run(tmp_path / str(seed), "IQL", seed=seed, level=seed, hyperparameters={"offline": True})
+        (folder / "episodes.csv").unlink()
+    (group,) = compare(tmp_path, score=score, samples=10).groups
+    assert group.scores[0].tolist() == [1.0, 2.0]
+
+
 def test_run_in_progress_is_compared_by_its_means(tmp_path):
     folder = write_run(tmp_path / "run")
     (folder / "episodes.csv").unlink()

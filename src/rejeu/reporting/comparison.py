@@ -366,7 +366,7 @@ def warnings_of(curves: Sequence[Curve]) -> list[str]:
         f"{shown(label, 100)}: runs of this group have the same seed; they count as several, but are not independent"
         for label in dict.fromkeys(repeated)
     ]
-    means = sum(not len(one.run.episodes) for one in curves)
+    means = sum(not (len(one.run.episodes) or one.run.hyperparameters.get("offline")) for one in curves)
     if means:
         notes.append(
             f"{means} of {len(curves)} runs have no episodes on disk; the logged means of their latest episodes are used"

@@ -112,9 +112,13 @@ class Curve:
     @classmethod
     def of(cls, run: Run, axis: Axis, score: Score) -> Curve:
         """Returns the curve of a run, or one with a ``problem``."""
-        name = run.name
+        name, table = run.name, run.evaluations
+        when, value = table.column("step" if axis == "steps" else "seconds"), table.column("mean_return")
+        good = np.isfinite(when) & (np.abs(value) < HUGE)
         if len(run.episodes):
             x, y = (run.episodes.step if axis == "steps" else run.episodes.seconds), run.episodes.returns
+        elif run.hyperparameters.get("offline"):
+            x, y = when[good], value[good]
         else:  # of a run that is in progress or crashed only the means are known
             x = run.metrics.column("step" if axis == "steps" else "time/time_elapsed")
             y = run.metrics.column("rollout/ep_rew_mean")
@@ -129,9 +133,6 @@ class Curve:
         whole = run.steps if axis == "steps" else run.seconds
         curve.end = max(curve.end, whole if math.isfinite(whole) else 0.0)  # the last episode ends before the run does
         if score == "evaluation":
-            table = run.evaluations
-            when, value = table.column("step" if axis == "steps" else "seconds"), table.column("mean_return")
-            good = np.isfinite(when) & (np.abs(value) < HUGE)
             if not good.any():
                 return cls(run, x[:0], y[:0], f"{name} has no evaluation and is left out")
             curve.evaluation = when[good], value[good]
