@@ -141,3 +141,14 @@ def test_what_cannot_be_assisted_is_one_line(tmp_path, capsys):
     with pytest.raises(ValueError, match="needs one environment"):
         agent.learn(10, Assist())
     assert Pull().predict(None, deterministic=True)[0] == 2
+
+
+def test_without_a_screen_nothing_is_trained_first(monkeypatch, tmp_path, capsys):
+    pygame.quit()
+    monkeypatch.setenv("SDL_VIDEODRIVER", "x11")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    out = tmp_path / "run"
+    assert "cannot open a window" in error_of(capsys, "train", "Pendulum-v1", "--assist", "--out", str(out))
+    assert not out.exists()
+    with pytest.raises(OSError, match="cannot open a window"):
+        Expert(gym.make(SLIDE, render_mode="rgb_array"))

@@ -101,6 +101,7 @@ class Expert:
     def __init__(self, env: gym.Env, keys: Mapping[str, Any] | None = None, fps: float | None = None) -> None:
         self.env, self.keys, self.fps = env, keys, fps
         keys_for(id_of(env), env.action_space, keys)
+        Window("").close()  # raises before anything is learned
         self.seat: Seat | None = None
 
     def __call__(self, obs: Any) -> Any:
@@ -181,7 +182,7 @@ class Assist(TrainingCallback):
 
 
 def check(agent: Agent) -> None:
-    """Raises ``ValueError`` if a person cannot act in place of an agent."""
+    """Raises ``ValueError`` if a person cannot act in place of an agent, ``OSError`` if there is no display."""
     if not isinstance(agent, OffPolicyAgent) or agent.config.offline:
         why = "it steps no environment" if isinstance(agent, OffPolicyAgent) else "it learns from its own actions alone"
         raise ValueError(
@@ -192,6 +193,7 @@ def check(agent: Agent) -> None:
             f"taking over needs one environment of the backend gymnasium, got {agent.n_envs} of {agent.env.backend}"  # type: ignore
         )
     keys_for(agent.env.env_id, agent.action_space)
+    Window("").close()
 
 
 def single(batch: Any) -> Any:
