@@ -51,6 +51,7 @@ KINDS = {
     "CrossQ": Kind("CrossQ", False, {**TEMPERATURE, **CALMING, "policy_delay": 2}, delay=2),
     "FlashSAC": Kind("FlashSAC", False, {**TEMPERATURE, **CALMING, **SCALED}, delay=2),
     "XQC": Kind("XQC", False, {**TEMPERATURE, **CALMING, **SCALED}, delay=3),
+    "IQL": Kind("IQL", False, {"action_noise": NOISE, "expectile": 0.9, "inverse_temperature": 10.0}),
     "TD3BC": Kind("TD3BC", False, {"action_noise": NOISE, "normalize": None, "alpha": 100.0}, delay=2),
     "ReBRAC": Kind("ReBRAC", False, {"action_noise": NOISE}, delay=2),
     "SAC, Discrete": Kind("SAC", True, TEMPERATURE),

@@ -172,7 +172,7 @@ def test_networks_and_targets_encode_images_each_by_themselves(kind):
 def test_optimizers_hold_the_networks_that_learn_and_no_targets(kind):
     names = parameter_names(kind, Probe.observation_space)
     optimizers = {part for part in names if part.endswith("optimizer")}
-    learning = {part for part in ("actor", "critic", "critics", "network", "log_alpha") if part in names}
+    learning = {part for part in ("actor", "critic", "critics", "value", "network", "log_alpha") if part in names}
     assert len(optimizers) == len(learning)
     for part in learning:
         optimizer = {"log_alpha": "alpha_optimizer", "network": "optimizer"}.get(part, f"{part}_optimizer")
