@@ -5,7 +5,7 @@ import math
 import pytest
 
 from rejeu import AGENTS, validation
-from rejeu.algorithms.search import HINDSIGHT, Choice, Integers, LogUniform, NearOne, Uniform
+from rejeu.algorithms.search import HINDSIGHT, OFF_POLICY, Choice, Integers, LogUniform, NearOne, Uniform
 
 
 def built(name, values):
@@ -26,6 +26,16 @@ def test_every_algorithm_understands_the_ends_of_its_ranges(name):
         for value in dimension.ends():
             assert dimension.contains(value)
             built(name, {key: value})
+
+
+@pytest.mark.parametrize(
+    ("name", "weights"),
+    [("IQL", {"expectile", "inverse_temperature"}), ("TD3BC", {"alpha"}), ("ReBRAC", {"actor_bc", "critic_bc"})],
+)
+def test_how_far_offline_algorithms_go_from_recorded_actions_is_searched_and_what_only_acts_online_is_not(
+    name, weights
+):
+    assert {*AGENTS[name].algorithm.Config.search_space} == weights | {*OFF_POLICY} - {"learning_starts"}
 
 
 def test_the_settings_of_hindsight_are_understood():

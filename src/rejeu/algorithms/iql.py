@@ -25,7 +25,7 @@ import jax.numpy as jnp
 from gymnasium import spaces
 from jax import Array
 
-from rejeu.algorithms import optimizers
+from rejeu.algorithms import optimizers, search
 from rejeu.algorithms.config import OffPolicyConfig, network_inputs
 from rejeu.core import (
     AVERAGED,
@@ -68,6 +68,11 @@ class Config(OffPolicyConfig):
     """Number of critics; the least of their targets counts."""
 
     name: ClassVar[str] = "IQL"
+    search_space: ClassVar[search.SearchSpace] = {
+        **search.OFFLINE,
+        "expectile": search.Uniform(0.5, 0.95),
+        "inverse_temperature": search.LogUniform(0.3, 30.0),
+    }
 
     def __post_init__(self) -> None:
         OffPolicyConfig.__post_init__(self)

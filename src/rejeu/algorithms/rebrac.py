@@ -23,7 +23,7 @@ import jax.numpy as jnp
 from gymnasium import spaces
 from jax import Array
 
-from rejeu.algorithms import td3
+from rejeu.algorithms import search, td3
 from rejeu.algorithms.ddpg.continuous import policy
 from rejeu.core import Algorithm, Transition
 from rejeu.networks import Network, QNetwork, Widths, action_values
@@ -47,6 +47,12 @@ class Config(td3.Config):
     needs_next_action: ClassVar[bool] = True
     hidden_layers: ClassVar[Widths] = Widths((256, 256, 256), (256, 256, 256))
     name: ClassVar[str] = "ReBRAC"
+    search_space: ClassVar[search.SearchSpace] = {
+        **search.OFFLINE,
+        "batch_size": search.Choice((256, 512, 1024)),
+        "actor_bc": search.LogUniform(0.001, 0.3),
+        "critic_bc": search.LogUniform(0.001, 0.5),
+    }
 
     def __post_init__(self) -> None:
         td3.Config.__post_init__(self)

@@ -143,6 +143,8 @@ OFF_POLICY: SearchSpace = {
     "policy_kwargs.net_arch": Choice(([64, 64], [256, 256], [400, 300])),
 }
 """Of every algorithm with a replay buffer."""
+OFFLINE: SearchSpace = {name: one for name, one in OFF_POLICY.items() if name != "learning_starts"}
+"""Of algorithms for recorded episodes; each adds how far it may go from the recorded actions."""
 HINDSIGHT: SearchSpace = {
     "replay_buffer_kwargs.n_sampled_goal": Integers(1, 5),
     "replay_buffer_kwargs.goal_selection_strategy": Choice(("final", "episode", "future")),

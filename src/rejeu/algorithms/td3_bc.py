@@ -22,7 +22,7 @@ import jax.numpy as jnp
 from gymnasium import spaces
 from jax import Array
 
-from rejeu.algorithms import td3
+from rejeu.algorithms import search, td3
 from rejeu.algorithms.ddpg.continuous import action_value, policy
 from rejeu.core import Algorithm, Transition
 from rejeu.networks import Network, QNetwork, Widths, first
@@ -43,6 +43,7 @@ class Config(td3.Config):
     can_remember: ClassVar[bool] = False
     hidden_layers: ClassVar[Widths] = Widths((256, 256), (256, 256))
     name: ClassVar[str] = "TD3BC"
+    search_space: ClassVar[search.SearchSpace] = {**search.OFFLINE, "alpha": search.LogUniform(0.3, 30.0)}
 
     def __post_init__(self) -> None:
         td3.Config.__post_init__(self)
