@@ -221,6 +221,11 @@ def test_what_is_played_keeps_arrays_that_environment_and_agent_write_to_again()
     assert [part.observations[:, 0].tolist() for part in parts] == [[0, 1, 2, 3], [4, 5, 6]]
 
 
+def test_an_expert_that_never_answers_labels_nothing() -> None:
+    agent = rejeu.PPO("MlpPolicy", Target(), **SMALL)
+    assert str(dagger(agent, lambda obs: None, Target(), rounds=1, steps=5)) == "0 episodes, 0 steps, mean return nan"
+
+
 def test_a_dataset_is_read_as_it_was_recorded(tmp_path: Path) -> None:
     pytest.importorskip("minari")
     env = Target()
@@ -468,6 +473,11 @@ def test_an_agent_with_masks_is_recorded_with_them() -> None:
     (episode,) = record(rejeu.PPO("MlpPolicy", env, action_masks=True, **SMALL), env, 1).episodes
     assert episode.actions.tolist() == [-1, 0, 1, -1, 0]
     assert episode.observations.shape == (6, 2)
+    dqn = rejeu.DQN("MlpPolicy", env, action_masks=True, **SMALL)
+    shown_to_it = Demonstrations((episode,), env.observation_space, env.action_space)
+    assert np.isfinite(clone(dqn, shown_to_it, 3))
+    with pytest.raises(ValueError, match="has no masks"):
+        learn_offline(dqn, shown_to_it, 3)
 
 
 def test_demonstrations_are_found_from_another_folder() -> None:

@@ -135,11 +135,16 @@ class OffPolicyAgent(Agent):
         """Returns a replay buffer that holds demonstrations, from which batches are drawn as from the agent's own.
 
         Raises:
-            ValueError: if the spaces differ.
+            ValueError: if the spaces differ, or the agent uses action masks.
         """
         from rejeu import demonstrations
 
         demonstrations.check(self, recorded)
+        if self.takes_masks:
+            raise ValueError(
+                f"{self.name} has action_masks=True, and a dataset has no masks, so that its targets would value forbidden "
+                "actions; leave out one of them, or clone the dataset"
+            )
         n_rows = recorded.n_steps + len(recorded.episodes) + 1
         buffer = self.empty_buffer(env, 1, n_rows, None)
         if isinstance(buffer, HerReplayBuffer):

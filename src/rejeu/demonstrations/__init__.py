@@ -76,8 +76,8 @@ class Demonstrations:
 
     @property
     def mean_return(self) -> float:
-        """Mean sum of rewards of an episode."""
-        return float(np.mean([episode.rewards.sum() for episode in self.episodes]))
+        """Mean sum of rewards of an episode, NaN without episodes."""
+        return float(np.mean([episode.rewards.sum() for episode in self.episodes])) if self.episodes else np.nan
 
     def __str__(self) -> str:
         n = counted(len(self.episodes), "episode")
@@ -110,8 +110,8 @@ def read(path: str | Path) -> Demonstrations:
     found = sorted({file.parent for file in path.rglob("metadata.json") if file.parent.name == "data"})
     if not found:
         raise FileNotFoundError(
-            f"{path} holds no Minari dataset; give another folder (rejeu resume: --set demonstrations=FOLDER), or record one: "
-            f"rejeu play ENV --record {path}"
+            f"{path} holds no Minari dataset; give another folder (rejeu resume: --set demonstrations=FOLDER) or None, or "
+            f"record one: rejeu play ENV --record {path}"
         )
     if len(found) > 1:
         names = ", ".join(str(one.parent.relative_to(path)) for one in found[:5])
