@@ -39,7 +39,7 @@ from rejeu.errors import CheckpointError
 from rejeu.exploration.noise import ActionNoise
 from rejeu.io import checkpoint
 from rejeu.reporting import logging
-from rejeu.sb3 import policy as policies
+from rejeu.sb3 import arguments, policy as policies
 from rejeu.sb3.common import base_callback, buffers, logger as loggers, utils
 from rejeu.sb3.common.env_util import make_vec_env
 from rejeu.sb3.common.noise import VectorizedActionNoise
@@ -66,51 +66,17 @@ __all__ = [
     "RecurrentPPO",
 ]
 
-SCHEDULED = ("learning_rate", "clip_range", "clip_range_vf", "ent_coef", "critic_learning_rate", "beta")
-"""The hyperparameters that can be schedules."""
-WITHOUT_EFFECT = (
-    "_init_setup_model",
-    "optimize_memory_usage",
-    "use_sde_at_warmup",
-    "rollout_buffer_class",
-    "rollout_buffer_kwargs",
-    "monitor_wrapper",
-    "support_multi_env",
-)
-"""Arguments that mean nothing here and are accepted with any value."""
-NEUTRAL: dict[str, tuple[Any, ...]] = {
-    "use_sde": (False,),
-    "sde_sample_freq": (-1,),
-    "squash_output": (False, True),
-    "use_expln": (False,),
-    "full_std": (True,),
-    "clip_mean": (2.0,),
-    "log_std_init": (0.0, -3, -2),
-    "share_features_extractor": (False,),
-    "n_critics": (1,),
-    "ortho_init": (True, False),
-    "n_lstm_layers": (1,),
-    "lstm_kwargs": (None, {}),
-    "enable_critic_lstm": (True,),
-}
-"""Settings that some algorithms do not have, with the values that they would have there."""
 RUN = {"_last_obs": "obs", "_last_episode_starts": "ended", "_n_updates": "n_updates", "_episode_num": "episode"}
 """Attributes of a run by the names that scripts read of an agent."""
-OPTIMIZERS: dict[str, dict[str, Any]] = {
-    "Adam": {"name": "adam"},
-    "AdamW": {"name": "adamw", "weight_decay": 1e-2},
-    "NAdam": {"name": "nadam"},
-    "RAdam": {"name": "radam"},
-    "RMSprop": {"name": "rmsprop", "decay": 0.99, "eps": 1e-8, "eps_in_sqrt": False},
-    "RMSpropTFLike": {"name": "rmsprop", "decay": 0.99, "eps": 1e-8, "initial_scale": 1.0},
-    "SGD": {"name": "sgd"},
+PARTS = {
+    "optimizer": "policy.optimizer",
+    "actor_optimizer": "actor.optimizer",
+    "critic_optimizer": "critic.optimizer",
+    "critics_optimizer": "critic.optimizer",
+    "alpha_optimizer": "ent_coef_optimizer",
+    "log_alpha": "ent_coef_optimizer",
 }
-"""Optimizers by the names of PyTorch's classes, with the settings by which they differ from Optax's."""
-PARTS = {"optimizer": "policy", "actor_optimizer": "actor", "critic_optimizer": "critic", "critics_optimizer": "critic"}
-PARTS = {field: f"{part}.optimizer" for field, part in PARTS.items()}
-PARTS |= dict.fromkeys(("alpha_optimizer", "log_alpha"), "ent_coef_optimizer")
 """Where :meth:`Original.get_parameters` has the fields of the algorithms' states that are no networks."""
-OFF_POLICY = ("learning_rate", "buffer_size", "learning_starts", "batch_size", "tau", "gamma", "train_freq")
 SHAPING = {
     "action_masks",
     "dueling",
@@ -121,46 +87,10 @@ SHAPING = {
     "optimizer",
     "policy_kwargs",
     "rnd",
+    "use_rms_prop",
+    "use_sde",
 }
-SHAPING |= {"use_rms_prop", "use_sde"}
 """Hyperparameters that the arrays of a file depend on."""
-POSITIONAL = {
-    "PPO": ("learning_rate", "n_steps", "batch_size", "n_epochs", "gamma", "gae_lambda", "clip_range"),
-    "A2C": ("learning_rate", "n_steps", "gamma", "gae_lambda", "ent_coef", "vf_coef", "max_grad_norm"),
-}
-"""Arguments after ``policy`` and ``env`` by position."""
-
-
-def unsupported(name: str, value: Any, what: str = "has no effect") -> None:
-    """Warns that a setting of Stable-Baselines3 is not followed."""
-    warnings.warn(f"{name}={value!r} {what} in rejeu; see docs/coming-from-sb3.md", UserWarning, stacklevel=5)
-
-
-def optimizer_of(kind: Any, settings: Mapping[str, Any]) -> Any:
-    """Returns the setting ``optimizer`` for a class of PyTorch's, its name, or one of Optax, and its arguments."""
-    known = OPTIMIZERS.get(kind if isinstance(kind, str) else getattr(kind, "__name__", ""))
-    if known is None:
-        return kind if kind is not None else {"name": "adam", **settings} if settings else None
-    renamed = {"alpha": "decay"}
-    given = {renamed.get(key, key): value for key, value in settings.items() if key not in ("lr", "betas", "centered")}
-    if "betas" in settings:
-        given["b1"], given["b2"] = settings["betas"]
-    if given.pop("amsgrad", False):
-        given["name"] = "amsgrad"
-    return {**known, **given} if len(known | given) > 1 else known["name"]
-
-
-def layers_of(net_arch: Any) -> Any:
-    """Returns ``net_arch`` as rejeu takes it."""
-    if isinstance(net_arch, list | tuple) and net_arch and isinstance(net_arch[-1], Mapping):
-        warnings.warn(
-            "net_arch=[dict(...)] is net_arch=dict(...) since Stable-Baselines3 1.8", UserWarning, stacklevel=6
-        )
-        net_arch = net_arch[-1]
-    if isinstance(net_arch, Mapping):
-        others = ("qf",) if "qf" in net_arch else ("vf",)
-        return {key: list(net_arch.get(key, ())) for key in ("pi", *others)}
-    return list(net_arch)
 
 
 class Refused(ValueError, AssertionError):
@@ -197,7 +127,7 @@ class Original(Agent):
             args: the first hyperparameters by position.
             settings: hyperparameters.
         """
-        settings |= zip(POSITIONAL.get(self.name, OFF_POLICY), args, strict=False)
+        settings |= zip(arguments.POSITIONAL.get(self.name, arguments.OFF_POLICY), args, strict=False)
         made = None
         if isinstance(policy, type):
             env, policy, made = self._prepared(policy, env, settings)
@@ -226,7 +156,9 @@ class Original(Agent):
         mine = [base for base in kind.__mro__ if base.__module__ != policies.__name__]
         for name in ("forward", "_predict", "evaluate_actions", "predict_values", "get_distribution"):
             if any(name in vars(base) for base in mine):
-                unsupported(f"{kind.__name__}.{name}", "your own", "is called neither in training nor by model.predict")
+                arguments.unsupported(
+                    f"{kind.__name__}.{name}", "your own", "is called neither in training nor by model.predict"
+                )
         made = None
         env = make_vec_env(env) if isinstance(env, str) else env
         space = getattr(env, "single_observation_space", env.observation_space)
@@ -240,86 +172,7 @@ class Original(Agent):
         by_space = "MultiInputPolicy" if isinstance(space, gym.spaces.Dict | gym.spaces.Tuple) else "MlpPolicy"
         return env, kind.policy_name or by_space, made
 
-    @classmethod
-    def converted(cls, settings: Mapping[str, Any]) -> dict[str, Any]:
-        """Returns keyword arguments of the constructor or of ``load`` as rejeu's agent takes them."""
-        known = {*validation.field_names(cls.algorithm.Config), *AGENT_ARGUMENTS}
-        result: dict[str, Any] = {}
-        for key, value in settings.items():
-            if key in WITHOUT_EFFECT or (key not in known and value in NEUTRAL.get(key, ())):
-                continue
-            result[key] = utils.of_progress(value) if key in SCHEDULED else value
-        if isinstance(result.get("priorities"), Mapping):
-            result["priorities"] = {key: utils.of_progress(value) for key, value in result["priorities"].items()}
-        if isinstance(noise := result.get("action_noise"), VectorizedActionNoise):
-            result["action_noise"] = noise.base_noise
-        if result.get("use_sde") and result.get("action_noise") is not None:
-            unsupported("action_noise", result.pop("action_noise"), "is not used: use_sde=True explores by itself")
-        if isinstance(frequency := result.get("train_freq"), tuple):
-            result["train_freq"] = tuple(getattr(part, "value", part) for part in frequency)
-        if "device" in result:
-            result["device"] = "auto" if result["device"] is None else str(result["device"])
-        cls._convert_buffer(result)
-        if isinstance(result.get("policy_kwargs"), Mapping):
-            shape, others = cls._shape_of(result["policy_kwargs"])
-            result = others | result | {"policy_kwargs": shape}
-        return result
-
-    @staticmethod
-    def _convert_buffer(settings: dict[str, Any]) -> None:
-        """Replaces the settings of a replay buffer by rejeu's."""
-        kind, given = settings.get("replay_buffer_class"), dict(settings.get("replay_buffer_kwargs") or {})
-        if isinstance(kind, type) and issubclass(kind, buffers.ReplayBuffer):
-            if kind.__name__ not in REPLAY_BUFFERS and kind.__module__ != buffers.__name__:
-                raise TypeError(
-                    f"replay_buffer_class={kind.__name__}: a class of your own derives from rejeu.buffers.ReplayBuffer, "
-                    "which stores every observation once; the classes of rejeu.sb3.common.buffers are for use by hand"
-                )
-            if kind is buffers.NStepReplayBuffer:
-                settings["n_steps"] = given.pop("n_steps", settings.get("n_steps", 3))
-                settings["gamma"] = given.pop("gamma", settings.get("gamma", 0.99))
-            settings["replay_buffer_class"] = "HerReplayBuffer" if kind is buffers.HerReplayBuffer else "ReplayBuffer"
-        if given.pop("handle_timeout_termination", True) is False:
-            unsupported(
-                "handle_timeout_termination",
-                False,
-                "is not followed for vector environments: wrap theirs in TimeLimitTerminates",
-            )
-        given.pop("optimize_memory_usage", None)
-        if "replay_buffer_kwargs" in settings:
-            settings["replay_buffer_kwargs"] = given or None
-
-    @classmethod
-    def _shape_of(cls, given: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Returns ``policy_kwargs`` as rejeu takes them, and the hyperparameters that they contain."""
-        config = cls.algorithm.Config
-        fields, known = (validation.field_names(kind) for kind in (config.policy_kwargs_class, config))
-        shape: dict[str, Any] = {}
-        others: dict[str, Any] = {}
-        for key, value in given.items():
-            if key in ("features_extractor_class", "optimizer_class", "features_extractor_kwargs", "optimizer_kwargs"):
-                continue
-            if key == "net_arch" and value is not None:
-                shape[key] = layers_of(value)
-            elif key == "activation_fn" and value is not None:
-                shape[key] = {"LeakyReLU": "leaky_relu"}.get(getattr(value, "__name__", ""), value)
-            elif key == "log_std_init" and "sde_log_std_init" in known:
-                others["sde_log_std_init"] = value
-            elif key in fields:
-                shape[key] = value
-            elif key in known:
-                others[key] = value
-            elif key not in NEUTRAL:
-                shape[key] = value  # an error that suggests a name
-            elif value not in NEUTRAL[key]:
-                unsupported(key, value)
-        normalizes = given.get("normalize_images", True)
-        settings = given.get("features_extractor_kwargs") or {}
-        shape |= encoder_of(given.get("features_extractor_class"), settings, normalizes)
-        optimizer = optimizer_of(given.get("optimizer_class"), given.get("optimizer_kwargs") or {})
-        return {key: value for key, value in shape.items() if value is not None}, others | (
-            {} if optimizer is None else {"optimizer": optimizer}
-        )
+    converted = classmethod(arguments.converted)
 
     @property
     def policy(self) -> BasePolicy:
@@ -343,7 +196,7 @@ class Original(Agent):
             return None if value is None else utils.FloatSchedule(utils.of_remaining(value))
         if name in validation.field_names(type(config)):
             value = getattr(config, name)
-            return utils.of_remaining(value) if name in SCHEDULED and callable(value) else value
+            return utils.of_remaining(value) if name in arguments.SCHEDULED and callable(value) else value
         if name in policies.NETWORKS:
             return getattr(self.policy, name)
         if name in RUN:
