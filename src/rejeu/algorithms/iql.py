@@ -9,8 +9,9 @@ Source: Kostrikov et al. 2022, "Offline Reinforcement Learning with Implicit Q-L
     J_pi   = -mean min(exp(inverse_temperature A), 100) log pi(a|s)                            equation 7
     Q'    <- Q' + tau (Q - Q')
 
-``V`` takes its step first, then the policy and the critics with the new ``V``, as in the authors' code. The policy is a normal
-distribution with the mean ``tanh`` of the network and a standard deviation that does not depend on the state. It is meant for
+``V`` takes its step first, then the policy and the critics with the new ``V``, as in the authors' code. The policy is a
+normal distribution with the mean ``tanh`` of the network and a standard deviation that does not depend on the state. All
+networks have the same learning rate; that of the authors' policy falls to 0 along a cosine. It is meant for
 :func:`rejeu.demonstrations.learn_offline`; training in an environment continues from there.
 """
 

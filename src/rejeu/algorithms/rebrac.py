@@ -8,8 +8,9 @@ smoothed action ``a'`` of the target actor::
     scale  = 1 / mean |min_i Q_i(s, mu(s))|,    of which no gradient is taken
     J_mu   = mean (actor_bc |mu(s) - a|^2 - scale min_i Q_i(s, mu(s)))                         equation 3
 
-Without a recorded next action, after the last step of an episode, there is no penalty. The critics have layer norm, and
-batches are large. It is meant for :func:`rejeu.demonstrations.learn_offline` and ``offline=True``.
+Without a recorded next action, after the last step of an episode, there is no penalty. The critics have layer norm, here
+before each ReLU and in the authors' code after it, and batches are large. It is meant for
+:func:`rejeu.demonstrations.learn_offline` and ``offline=True``.
 """
 
 from __future__ import annotations
