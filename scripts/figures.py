@@ -57,8 +57,28 @@ SHARED = (
     (RolloutConfig, "all on-policy algorithms", "../hyperparameters.md#on-policy-algorithms"),
 )
 """Configurations from which others are derived, and where their hyperparameters are explained: by whom, and the page."""
-JUDGED_BY_SUCCESS = ("FetchPush-v4", "FetchReach-v4", "parking-v0", "rejeu/Ball-v0")
+JUDGED_BY_SUCCESS = (
+    "AntMaze_UMaze-v5",
+    "FetchPickAndPlace-v4",
+    "FetchPush-v4",
+    "FetchReach-v4",
+    "FetchSlide-v4",
+    "PointMaze_Large-v3",
+    "PointMaze_Medium-v3",
+    "PointMaze_UMaze-v3",
+    "parking-v0",
+    "rejeu/Ball-v0",
+    "rejeu/ParkingHard-v0",
+)
 """Environments whose result is the success rate."""
+TD3_RETURNS = {
+    "HalfCheetah-v5": (-289.415, 10574.0),
+    "Hopper-v5": (18.791, 3226.0),
+    "Walker2d-v5": (2.791, 3946.0),
+    "Ant-v5": (-70.288, 3942.0),
+    "Humanoid-v5": (120.423, 5165.0),
+}
+"""Returns of random actions and of TD3 after a million steps, by MR.Q (Fujimoto et al. 2025, arXiv 2501.16142)."""
 HIDDEN = "velocities hidden"
 """How results are named of environments of whose observations ``--shown`` leaves only some components."""
 
@@ -104,7 +124,7 @@ def result_of(data: dict[str, Any], judged_by_success: tuple[str, ...] = JUDGED_
         high=round(high, 4),
         seeds=len(runs),
         episodes=runs[0]["episodes"],
-        budget=f"{minutes} minute" if minutes else f"{runs[0]['steps']:,} steps",
+        budget=f"{minutes} minute{'s' * (minutes != '1')}" if minutes else f"{runs[0]['steps']:,} steps",
         seconds=(min(seconds), max(seconds)),
         command=data["command"],
     )
@@ -342,6 +362,23 @@ def speed(length: str = "") -> str:
     return table(("training steps per second", "vs. Stable-Baselines3", "vs. SBX"), rows)
 
 
+def equal_time() -> str:
+    """Returns of FlashSAC and SAC after equal time, and as shares of the return of TD3 after a million steps."""
+    rows: list[tuple[str, ...]] = []
+    shares: list[list[float]] = []
+    for env_id, (least, td3) in TD3_RETURNS.items():
+        runs = [load(f"learning/minutes/{env_id}-{name}.json")["runs"] for name in ("FlashSAC", "SAC")]
+        means = [np.mean([run["mean_return"] for run in one]) for one in runs]
+        steps = [f"{np.mean([run['steps'] for run in one]):,.0f}" for one in runs]
+        shares.append([(mean - least) / (td3 - least) for mean in means])
+        cells = [(n, f"{mean:,.0f}", f"{share:.2f}") for n, mean, share in zip(steps, means, shares[-1], strict=True)]
+        rows.append((env_id, *cells[0], *cells[1]))
+    flash, plain = np.mean(shares, axis=0)
+    rows.append(("mean", "", "", f"{flash:.2f}", "", "", f"{plain:.2f}"))
+    columns = [f"{name}, {what}" for name in ("FlashSAC", "SAC") for what in ("steps", "return", "of TD3")]
+    return table(("environment", *columns), rows)
+
+
 def data(path: str, key: str, *columns: str) -> str:
     """A part of a file of results as it is, with its commit, date and command: a table of rows, or of names and values.
 
@@ -405,6 +442,7 @@ def cell(value: Any) -> str:
 BLOCKS: dict[str, Callable[..., str]] = {
     "data": data,
     "curve": curve,
+    "equal-time": equal_time,
     "learned": learned,
     "hyperparameters": hyperparameters,
     "shared-hyperparameters": shared_hyperparameters,
