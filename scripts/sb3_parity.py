@@ -67,12 +67,12 @@ def accepted(one: Any) -> set[str]:
     """Returns the arguments that a class or function of rejeu takes by name."""
     from rejeu import validation
     from rejeu.agents.base import AGENT_ARGUMENTS
-    from rejeu.sb3 import algorithms
+    from rejeu.sb3 import algorithms, arguments
 
     names = set(arguments_of(one))
     if inspect.isclass(one) and issubclass(one, algorithms.Original):
         names |= {*validation.field_names(one.algorithm.Config), *AGENT_ARGUMENTS}
-        names |= {*algorithms.WITHOUT_EFFECT, *algorithms.NEUTRAL}
+        names |= {*arguments.WITHOUT_EFFECT, *arguments.NEUTRAL}
     return names
 
 
