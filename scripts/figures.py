@@ -363,20 +363,25 @@ def speed(length: str = "") -> str:
 
 
 def equal_time() -> str:
-    """Returns of FlashSAC and SAC after equal time, and as shares of the return of TD3 after a million steps."""
+    """Returns of FlashSAC, XQC and SAC after equal time, and as shares of the return of TD3 after a million steps."""
+    names = ("FlashSAC", "XQC", "SAC")
+    shares: dict[str, list[float]] = {name: [] for name in names}
     rows: list[tuple[str, ...]] = []
-    shares: list[list[float]] = []
     for env_id, (least, td3) in TD3_RETURNS.items():
-        runs = [load(f"learning/minutes/{env_id}-{name}.json")["runs"] for name in ("FlashSAC", "SAC")]
-        means = [np.mean([run["mean_return"] for run in one]) for one in runs]
-        steps = [f"{np.mean([run['steps'] for run in one]):,.0f}" for one in runs]
-        shares.append([(mean - least) / (td3 - least) for mean in means])
-        cells = [(n, f"{mean:,.0f}", f"{share:.2f}") for n, mean, share in zip(steps, means, shares[-1], strict=True)]
-        rows.append((env_id, *cells[0], *cells[1]))
-    flash, plain = np.mean(shares, axis=0)
-    rows.append(("mean", "", "", f"{flash:.2f}", "", "", f"{plain:.2f}"))
-    columns = [f"{name}, {what}" for name in ("FlashSAC", "SAC") for what in ("steps", "return", "of TD3")]
-    return table(("environment", *columns), rows)
+        cells = [env_id]
+        for name, found in shares.items():
+            path = DATA / "learning" / "minutes" / f"{env_id}-{name}.json"
+            if not path.exists():
+                cells.append("")
+                continue
+            runs = load(path.name, path.parent)["runs"]
+            mean, steps = (np.mean([run[key] for run in runs]) for key in ("mean_return", "steps"))
+            found.append(float((mean - least) / (td3 - least)))
+            cells.append(f"{mean:,.0f} ({found[-1]:.2f}), {steps:,.0f} steps")
+        rows.append(tuple(cells))
+    means = (f"({np.mean(found):.2f})" if len(found) == len(TD3_RETURNS) else "" for found in shares.values())
+    rows.append(("mean", *means))
+    return table(("environment", *names), rows)
 
 
 def data(path: str, key: str, *columns: str) -> str:
