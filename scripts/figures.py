@@ -304,7 +304,8 @@ def can_make(agent: Any, config: Any, observation_space: spaces.Space, action_sp
 
 def training_times() -> str:
     """The preset of each environment that takes the least time, in the order of ``rejeu list``."""
-    found = {(result.env_id, result.algorithm): result for result in reversed(measured())}
+    trained = (result for result in reversed(measured()) if "--curve" not in result.command)  # which evaluates as well
+    found = {(result.env_id, result.algorithm): result for result in trained}
     rows: dict[str, tuple[float, tuple[str, ...]]] = {}
     for preset in presets.ALL:
         result = found.get((preset.env_id, preset.algorithm))
