@@ -57,19 +57,7 @@ SHARED = (
     (RolloutConfig, "all on-policy algorithms", "../hyperparameters.md#on-policy-algorithms"),
 )
 """Configurations from which others are derived, and where their hyperparameters are explained: by whom, and the page."""
-JUDGED_BY_SUCCESS = (
-    "AntMaze_UMaze-v5",
-    "FetchPickAndPlace-v4",
-    "FetchPush-v4",
-    "FetchReach-v4",
-    "FetchSlide-v4",
-    "PointMaze_Large-v3",
-    "PointMaze_Medium-v3",
-    "PointMaze_UMaze-v3",
-    "parking-v0",
-    "rejeu/Ball-v0",
-    "rejeu/ParkingHard-v0",
-)
+JUDGED_BY_SUCCESS = ("FetchPush-v4", "FetchReach-v4", "PointMaze_Medium-v3", "parking-v0", "rejeu/Ball-v0")
 """Environments whose result is the success rate."""
 TD3_RETURNS = {
     "HalfCheetah-v5": (-289.415, 10574.0),
