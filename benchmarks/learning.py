@@ -32,6 +32,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import jax
 import numpy as np
 from gymnasium.wrappers import TransformObservation
 from scipy import stats
@@ -69,17 +70,11 @@ def train_one(preset: presets.Preset, seed: int, arguments: argparse.Namespace) 
     if arguments.best or arguments.curve:
         test_env = environments(10, 2_000_000 + 100 * seed)
         callback = Evaluate(test_env, arguments.curve or preset.evaluate_every, preset.evaluate_episodes)
-    if arguments.minutes:
-        agent.learn(minutes=arguments.minutes - (time.perf_counter() - began) / 60, callback=callback)
-    else:
-        agent.learn(arguments.steps or preset.total_steps, callback=callback)
+    steps, minutes = arguments.steps or (None if arguments.minutes else preset.total_steps), arguments.minutes
+    left = minutes and minutes - (time.perf_counter() - began) / 60
+    agent.learn(steps, callback=callback, minutes=left)
     seconds = time.perf_counter() - began
-    done = (
-        seconds / (60 * arguments.minutes)
-        if arguments.minutes
-        else agent.num_timesteps / (arguments.steps or preset.total_steps)
-    )
-    if done < 0.99:
+    if max(agent.num_timesteps / (steps or math.inf), seconds / (60 * (minutes or math.inf))) < 0.99:
         raise SystemExit(
             f"seed {seed} was cut short after {seconds:.0f} s and {agent.num_timesteps:,} steps; nothing is recorded"
         )
@@ -123,7 +118,7 @@ def main() -> None:
     )
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
     parser.add_argument("--steps", type=int)
-    parser.add_argument("--minutes", type=float, help="train so long instead, everything from making the agent counted")
+    parser.add_argument("--minutes", type=float, help="train at most so long, everything from making the agent counted")
     parser.add_argument("--episodes", type=int, default=100)
     parser.add_argument("--backend")
     parser.add_argument("--evaluation-backend", help="of the last evaluation; default: as in training")
@@ -171,10 +166,11 @@ def zoo(env_id: str, algorithm: str) -> presets.Preset | None:
 def described(preset: presets.Preset, arguments: argparse.Namespace, runs: list[dict]) -> dict[str, Any]:
     """Returns the runs with their origin and their summary."""
     config = validation.build(rejeu.AGENTS[arguments.algorithm].algorithm.Config, settings_of(preset, arguments))
-    versions = {name: importlib.metadata.version(name) for name in ("jax", "gymnasium", "envpool")}
+    installed = {dist.name for dist in importlib.metadata.distributions()}
+    versions = {name: importlib.metadata.version(name) for name in ("jax", "gymnasium", "envpool") if name in installed}
     return {
         **provenance({str(arguments.out): "FOLDER"}),
-        "machine": machine(),
+        "machine": {**machine(), "device": jax.devices()[0].device_kind},
         "versions": {"rejeu": rejeu.__version__, **versions},
         "hyperparameters": configs.to_json(config),
         "n_envs": preset.n_envs,
