@@ -57,7 +57,15 @@ SHARED = (
     (RolloutConfig, "all on-policy algorithms", "../hyperparameters.md#on-policy-algorithms"),
 )
 """Configurations from which others are derived, and where their hyperparameters are explained: by whom, and the page."""
-JUDGED_BY_SUCCESS = ("FetchPush-v4", "FetchReach-v4", "PointMaze_Medium-v3", "parking-v0", "rejeu/Ball-v0")
+JUDGED_BY_SUCCESS = (
+    "FetchPickAndPlace-v4",
+    "FetchPush-v4",
+    "FetchReach-v4",
+    "PointMaze_Large-v3",
+    "PointMaze_Medium-v3",
+    "parking-v0",
+    "rejeu/Ball-v0",
+)
 """Environments whose result is the success rate."""
 TD3_RETURNS = {
     "HalfCheetah-v5": (-289.415, 10574.0),
@@ -100,7 +108,7 @@ def result_of(data: dict[str, Any], judged_by_success: tuple[str, ...] = JUDGED_
     values = [run["success_rate" if is_success else "mean_return"] for run in runs]
     interval = data["summary"]["mean_return"]["interval"] if not is_success else None
     low, high = interval or (min(values), max(values))
-    minutes = options.get("--minutes")
+    minutes = None if "--steps" in options else options.get("--minutes")
     seconds = [run["seconds"] for run in runs]
     return Result(
         env_id=env_id,
@@ -352,14 +360,15 @@ def speed(length: str = "") -> str:
 
 
 def equal_time() -> str:
-    """Returns of FlashSAC, XQC and SAC after equal time, and as shares of the return of TD3 after a million steps."""
-    names = ("FlashSAC", "XQC", "SAC")
+    """Returns on MuJoCo after equal time and at full size on a GPU, and as shares of TD3's return after a million steps."""
+    names = ("FlashSAC", "XQC", "SAC", "FlashSAC `full`, GPU")
     shares: dict[str, list[float]] = {name: [] for name in names}
     rows: list[tuple[str, ...]] = []
     for env_id, (least, td3) in TD3_RETURNS.items():
         cells = [env_id]
         for name, found in shares.items():
-            path = DATA / "learning" / "minutes" / f"{env_id}-{name}.json"
+            folder = "h200" if name.endswith("GPU") else "minutes"
+            path = DATA / "learning" / folder / f"{env_id}-{name.split()[0]}.json"
             if not path.exists():
                 cells.append("")
                 continue
