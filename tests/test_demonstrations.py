@@ -486,6 +486,17 @@ def test_demonstrations_are_found_from_another_folder() -> None:
         rejeu.SAC.algorithm.Config(demonstrations=shown("Box", 1)[1])
 
 
+def test_dagger_counts_each_step_once_in_the_statistics() -> None:
+    env, recorded = shown("Box", 2)
+    agent = rejeu.PPO("MlpPolicy", env, normalize=True, **SMALL)
+    known = dagger(agent, env.best, env, recorded, rounds=3, steps=10, updates=2)
+    statistics = agent.learner.state(agent.run.state).statistics
+    assert known.n_steps == 40
+    assert statistics.obs[0].n_seen == statistics.returns.n_seen == 40
+    obs = np.concatenate([episode.observations[:-1] for episode in known.episodes])
+    np.testing.assert_allclose(statistics.obs[0].mean, obs.mean(0), atol=1e-5)
+
+
 def test_the_statistics_of_a_run_begin_with_its_demonstrations(tmp_path: Path) -> None:
     pytest.importorskip("minari")
     known = record(Anywhere(env := Target()), env, 2, tmp_path / "shown", seed=0)

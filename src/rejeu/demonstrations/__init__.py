@@ -226,6 +226,7 @@ def clone(
     batch_size: int = 128,
     learning_rate: float = 1e-3,
     seed: int = 0,
+    counted: int = 0,
 ) -> float:
     """Trains the policy of an agent to act as demonstrated (behavior cloning), and returns the loss of the last updates.
 
@@ -242,6 +243,7 @@ def clone(
         batch_size: steps in each batch, drawn with replacement.
         learning_rate: step size of Adam.
         seed: of the batches.
+        counted: of how many episodes, the first ones, the agent's running statistics know already.
 
     Raises:
         ValueError: if the spaces differ, the agent has a memory, or numbers are not finite.
@@ -252,7 +254,7 @@ def clone(
     optimizer = optax.adam(number("learning_rate", learning_rate, above=0))
     pairs = [arrays_of(agent, episode) for episode in demonstrations.episodes]
     obs, action = jax.tree.map(lambda *parts: np.concatenate(parts), *pairs)
-    state = seen(agent, obs, demonstrations.episodes)
+    state = seen(agent, demonstrations.episodes[whole("counted", counted, least=0) :])
     weights, rest = eqx.partition(state, eqx.is_inexact_array)
 
     def loss(weights: PyTree, batch: tuple[PyTree, Any]) -> tuple[Any, PyTree]:
@@ -349,10 +351,11 @@ def dagger(
                 labeled, length = play(made, agent, lambda obs, own: expert(obs), start, takes_over=takes_over)
                 played, n_steps, n_episodes = played + labeled, n_steps + length, n_episodes + 1
             new = Demonstrations(tuple(played), made.observation_space, made.action_space)
+            counted = 0 if known is None else len(known.episodes)
             known = new if known is None else known + new
             if not played:
                 continue  # nobody took over
-            clone(agent, known, updates, learning_rate=learning_rate, seed=seed + i + 1)
+            clone(agent, known, updates, learning_rate=learning_rate, seed=seed + i + 1, counted=counted)
             say(i + 1, known)
     finally:
         if made is not env:
@@ -475,16 +478,15 @@ def batch_of(agent: Any, observations: Any, rows: slice) -> PyTree:
 def observe(agent: Any, demonstrations: Demonstrations) -> None:
     """Adds demonstrations to the running statistics of an agent, if it has some."""
     if agent.learner.observe is not None:
-        pairs = [arrays_of(agent, episode)[0] for episode in demonstrations.episodes]
-        obs = jax.tree.map(lambda *parts: np.concatenate(parts), *pairs)
-        agent.run.state = agent.learner.pack(seen(agent, obs, demonstrations.episodes))
+        agent.run.state = agent.learner.pack(seen(agent, demonstrations.episodes))
 
 
-def seen(agent: Any, obs: PyTree, episodes: Sequence[Episode]) -> PyTree:
-    """Returns the state of an agent after its statistics, if it has some, have seen demonstrations."""
+def seen(agent: Any, episodes: Sequence[Episode]) -> PyTree:
+    """Returns the state of an agent after its statistics, if it has some, have seen episodes."""
     state = agent.learner.state(agent.run.state)
-    if agent.learner.observe is None:
+    if agent.learner.observe is None or not episodes:
         return state
+    obs = jax.tree.map(lambda *parts: np.concatenate(parts), *(arrays_of(agent, episode)[0] for episode in episodes))
     returns = np.concatenate([running_return(episode.rewards, agent.config.gamma) for episode in episodes])
     return agent.learner.algorithm.observe(state, obs, returns)
 
