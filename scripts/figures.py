@@ -58,7 +58,6 @@ SHARED = (
 )
 """Configurations from which others are derived, and where their hyperparameters are explained: by whom, and the page."""
 JUDGED_BY_SUCCESS = (
-    "FetchPickAndPlace-v4",
     "FetchPush-v4",
     "FetchReach-v4",
     "PointMaze_Large-v3",
