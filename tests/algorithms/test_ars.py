@@ -63,9 +63,72 @@ def test_the_step_goes_along_the_best_directions_by_their_returns():
     assert not np.allclose(again, parameters(ars.direction(state.actor, jnp.int32(0))))
 
 
-def test_returns_leave_out_padding_and_the_bonus_of_every_step():
+def test_returns_leave_out_padding_and_add_the_offset_of_every_step():
+    """As in sb3-contrib: the return plus offset times length, so that -1 cancels an alive bonus of 1."""
     rollout = rollout_of([[[1.0, 2.0, 3.0], [4.0]], [[5.0], [6.0, 7.0]]])
-    np.testing.assert_allclose(ars.episode_returns(rollout, 2, 0.5), [6.0 - 1.5, 4.0 - 0.5, 5.0 - 0.5, 13.0 - 1.0])
+    np.testing.assert_allclose(ars.episode_returns(rollout, 2, 0.5), [6.0 + 1.5, 4.0 + 0.5, 5.0 + 0.5, 13.0 + 1.0])
+    np.testing.assert_allclose(ars.episode_returns(rollout_of([[[1.0] * 5]]), 1, -1.0), [0.0])
+
+
+class Lasting(gym.Env):
+    """Rewards -1 at every step; no time limit is declared. Truncates itself after ``length`` steps, None for never."""
+
+    observation_space, action_space = OBS, BOX
+
+    def __init__(self, length):
+        self.length, self.n_taken = length, 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.n_taken = 0
+        return np.zeros(3, np.float32), {}
+
+    def step(self, action):
+        self.n_taken += 1
+        return np.zeros(3, np.float32), -1.0, False, self.n_taken == self.length, {}
+
+
+@pytest.fixture
+def found(monkeypatch):
+    """The returns that each update would go by; nothing is learned."""
+    found = []
+
+    def noted(run, learner, config, clock):
+        n_episodes = config.episodes(run.env.n_envs)
+        found.append(np.asarray(ars.episode_returns(run.replay.rollout(), n_episodes, 0.0)).tolist())
+
+    monkeypatch.setattr("rejeu.loops.on_policy.update", noted)
+    return found
+
+
+@pytest.mark.parametrize(("length", "counted"), [(None, 50), (80, 50), (30, 30)])
+def test_without_a_time_limit_every_episode_counts_as_many_steps(length, counted, found):
+    """``n_steps`` at most, whatever the other episodes of the iteration took."""
+    agent = rejeu.ARS("MlpPolicy", Lasting(length), n_delta=2, n_steps=50, seed=0)
+    agent.learn(4 * counted)
+    assert found == [[-counted] * 4]
+    assert len(agent.history.episodes) == (4 if length == counted else 0)  # what was cut is no episode
+
+
+def test_a_learn_that_ends_in_a_part_of_a_step_cuts_no_episode(found):
+    """Two environments with episodes of 10 steps; the first ``learn`` ends with a step of one of them."""
+    env = rejeu.make_vector(lambda: Lasting(10), 2, "gymnasium")
+    agent = rejeu.ARS("MlpPolicy", env, n_delta=2, n_steps=50, seed=0)
+    agent.learn(15)
+    agent.learn(25, reset_num_timesteps=False)
+    assert found == [[-10.0] * 4]
+    assert agent.num_timesteps == 40
+
+
+def test_an_iteration_that_begins_again_begins_with_the_first_direction():
+    """After an evaluation in the environments of training the numbers of episodes start again with the rollout."""
+    env = Lasting(10)
+    agent = rejeu.ARS("MlpPolicy", env, n_delta=2, n_steps=50, seed=0)
+    agent.learn(25)
+    assert agent.run.carry.episode.tolist() == [3]
+    agent.evaluate(episodes=1, env=env)
+    agent.learn(5, reset_num_timesteps=False)
+    assert agent.run.carry.episode.tolist() == [1]
 
 
 def test_forward_and_backward_are_opposite_and_directions_are_standard_normals():

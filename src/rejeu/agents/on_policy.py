@@ -91,7 +91,7 @@ class OnPolicyAgent(Agent):
         return on_policy(self.run, self.learner, self.config, n_steps, progress)
 
     def start_episodes(self) -> None:
-        begin_episodes(self.run, self.config)
+        begin_episodes(self.run, self.config, self.learner)
 
     def make_buffer(self, env: VectorEnv) -> RolloutBuffer:
         config = self.config

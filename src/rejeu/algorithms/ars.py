@@ -58,7 +58,7 @@ class Config(RolloutConfig):
     zero_policy: bool = True
     """Start with all parameters at 0, as the paper does. Without effect where there are hidden layers."""
     alive_bonus_offset: float = 0.0
-    """Subtracted from each reward for the search, where an environment rewards every step that it goes on."""
+    """Added to each reward for the search: -1 cancels a reward of 1 for every step that an episode goes on."""
     n_eval_episodes: int = 1
     """Episodes for each perturbation."""
     # Class variables in place of inherited fields take the fields away: they have no meaning here.
@@ -66,6 +66,7 @@ class Config(RolloutConfig):
     optimizer: ClassVar[str] = "sgd"  # type: ignore[misc]
     max_grad_norm: ClassVar[None] = None  # type: ignore[misc]
 
+    needs_whole_episodes: ClassVar[bool] = True
     name: ClassVar[str] = "ARS"
     hidden_layers: ClassVar[Widths] = Widths((), ())
     search_space: ClassVar[SearchSpace] = {
@@ -225,9 +226,9 @@ def perturbed(actor: Actor, candidate: Array, std: Any, n_delta: int) -> Network
 
 
 def episode_returns(rollout: Rollout, n_episodes: int, offset: float) -> Array:
-    """Returns the sums of rewards minus ``offset``, in the order in which :func:`perturbed` numbers episodes."""
+    """Returns the sums of rewards plus ``offset``, in the order in which :func:`perturbed` numbers episodes."""
     before = jnp.cumsum(rollout.ended, axis=0) - rollout.ended
-    counted = jnp.where(rollout.valid, rollout.reward - offset, 0.0)
+    counted = jnp.where(rollout.valid, rollout.reward + offset, 0.0)
     of_episode = lambda number: jnp.sum(jnp.where(before == number, counted, 0.0), axis=0)  # noqa: E731
     return jax.vmap(of_episode)(jnp.arange(n_episodes)).ravel()
 

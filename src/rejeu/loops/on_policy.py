@@ -51,19 +51,21 @@ def on_policy(
     start_clock(run)
     while last is None or run.step < last:
         if run.obs is None or (env.must_reset and not rollout.length):
-            begin_episodes(run, config)
+            begin_episodes(run, config, learner)
         run.action = act(run, learner, clock_of(run, progress(run.step - first)))
-        stepped = None if config.n_episodes is None or run.playing.all() else run.playing > 0
+        stepped = None if config.n_episodes is None else still_playing(run, config, last)
         action = scale(run.action)
         step = checked_step(run, action, stepped)
         episodes = store(run, config, step, stepped, last)
-        is_complete = rollout.full or (config.n_episodes is not None and not run.playing.any())
+        is_complete = rollout.full if config.n_episodes is None else not run.playing.any()
         is_done = is_complete or (run.step == last and config.learns_from_part(rollout.size(), n_envs))
         last_obs = jax.tree.map(np.copy, step.obs) if run.ended.any() else None
         run.obs = next_obs(run, step, config, is_done)
         if is_done:
             update(run, learner, config, clock_of(run, progress(run.step - first)))
             begin(run, config)
+        elif rollout.full:  # by turns that not all environments took: its episodes are played again
+            rollout.length, run.obs = 0, None
         yield Progress(run.step, episodes, run.metrics, action, step, last_obs, is_done)
 
 
@@ -86,9 +88,10 @@ def store(run: Run, config: RolloutConfig, step: Step, stepped: np.ndarray | Non
     run.replay.add(run.action, step.reward, step.terminated, step.truncated, step.obs, run.running_return, valid)
     run.step += run.env.n_envs if counts is None else int(counts.sum())
     episodes = record_step(run, step, counts, stepped)
-    run.replay.cut(run.ended)
     if config.n_episodes is not None:
+        end_long_episodes(run, config)
         run.playing -= run.ended
+    run.replay.cut(run.ended)
     return episodes
 
 
@@ -103,12 +106,15 @@ def update(run: Run, learner: Learner, config: RolloutConfig, clock: Clock) -> N
     run.n_updates += int(n_updates)
 
 
-def begin_episodes(run: Run, config: RolloutConfig) -> None:
+def begin_episodes(run: Run, config: RolloutConfig, learner: Learner | None = None) -> None:
     """Starts an episode in every environment, which ends the running ones.
 
-    The current rollout keeps its steps, unless rollouts hold whole episodes: then it starts again too.
+    The current rollout keeps its steps, unless rollouts hold whole episodes: then it starts again too, and with it what
+    ``learner`` carries from step to step, such as the number of the episode.
     """
     check_obs(run, restart(run), run.step, "reset returned")
+    if config.n_episodes is not None and learner is not None:
+        run.carry = learner.initial_carry(run.env.n_envs)
     if run.replay.length and config.n_episodes is None:
         run.replay.cut()
     else:
@@ -119,6 +125,22 @@ def begin(run: Run, config: RolloutConfig) -> None:
     """Starts a rollout at the current observations."""
     run.replay.begin(run.carry, run.ended)
     run.playing = np.full(run.env.n_envs, 0 if config.n_episodes is None else config.episodes(run.env.n_envs))
+
+
+def still_playing(run: Run, config: RolloutConfig, last: int | None) -> np.ndarray | None:
+    """Returns which environments have episodes of the rollout left to play, ``bool (n_envs,)``; None for all.
+
+    At the end of a run in which episodes must not be cut, only those take a step whose step counts.
+    """
+    stepped = None if run.playing.all() else run.playing > 0
+    return which_count(run, stepped, last) if config.needs_whole_episodes else stepped
+
+
+def end_long_episodes(run: Run, config: RolloutConfig) -> None:
+    """Ends episodes that have taken all the steps that a rollout has room for in each; the history leaves them out."""
+    is_long = run.episode_length >= run.replay.n_steps // config.episodes(run.env.n_envs)
+    run.ended |= is_long
+    run.episode_return[is_long], run.episode_length[is_long] = 0.0, 0
 
 
 def which_count(run: Run, stepped: np.ndarray | None, last: int | None) -> np.ndarray | None:
