@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import random
 import signal
 import sys
 import threading
@@ -237,6 +238,25 @@ class Gated(Losable):
     def wait(self, gate):
         while self.is_first and gate.exists():
             time.sleep(0.01)
+
+
+class DrawsGlobally(gym.Env):
+    """Draws from the global generators of NumPy and Python, when it is made, reset and stepped."""
+
+    observation_space = spaces.Box(0.0, 1.0, (3,), np.float64)
+    action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+    def __init__(self):
+        self.made = np.random.random()  # noqa: NPY002
+
+    def reset(self, *, seed=None, options=None):
+        return self.see(), {}
+
+    def step(self, action):
+        return self.see(), 0.0, False, False, {}
+
+    def see(self):
+        return np.array([self.made, np.random.random(), random.random()])  # noqa: NPY002
 
 
 def process_id(env):

@@ -27,7 +27,7 @@ from rejeu.sb3.common.vec_env import SubprocVecEnv
 from tests.environments import Counter
 from tests.helpers import small_sac
 from tests.tiers import exhaustive
-from tests.worker_environments import Faulty, Losable, Rare
+from tests.worker_environments import DrawsGlobally, Faulty, Losable, Rare
 
 
 def make(fault, n_envs=2):
@@ -52,6 +52,29 @@ def test_workers_walk_as_the_environments_in_this_process_do():
     for one, two in zip(*walks, strict=True):
         for left, right in zip(one, two, strict=True):
             np.testing.assert_array_equal(left, right)
+
+
+def drawn_globally(vector, seed):
+    """What two environments draw at a reset and at a step, ``(draws, n_envs)``; what they draw when made must differ too."""
+    if isinstance(vector, SubprocVecEnv):
+        vector.seed(seed)
+        seen = vector.reset(), vector.step(np.zeros((2, 1)))[0]
+    else:
+        seen = np.array(vector.reset(seed)), np.array(vector.step(np.zeros((2, 1))).obs)
+    made, *rest = np.concatenate([one.T for one in seen])
+    assert made[0] != made[1]
+    return np.delete(rest, 2, axis=0)
+
+
+@pytest.mark.parametrize("make_two", [SubprocVecEnv, lambda fns: make_vector(fns[0], 2, "gymnasium-async", seed=0)])
+def test_global_generators_of_workers_differ_and_repeat_with_the_seed(make_two):
+    vector = make_two([DrawsGlobally] * 2)
+    try:
+        first, other, again = (drawn_globally(vector, seed) for seed in (3, 50, 3))
+    finally:
+        vector.close()
+    assert len({*first.ravel()} | {*other.ravel()}) == first.size + other.size == 16
+    np.testing.assert_array_equal(first, again)
 
 
 def test_workers_are_never_forked_from_this_process():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 import signal
 import socket
 import threading
@@ -118,6 +119,9 @@ class Copied(Encoder):
 def serve(pipe: Connection, make: CloudpickleWrapper, encoder: Encoder) -> None:
     """Answers requests for one environment, until it is closed or the main process exits.
 
+    The global generators of NumPy and Python, of which an environment may draw, are its own: seeded at random here, and from
+    the seed of each reset that has one.
+
     Args:
         pipe: connection to the main process.
         make: makes the environment.
@@ -126,6 +130,7 @@ def serve(pipe: Connection, make: CloudpickleWrapper, encoder: Encoder) -> None:
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # the main process handles Ctrl-C, and may take another step
     env: gym.Env | None = None
+    seed_globals(None)  # the fork server has imported NumPy, so that all its children would draw the same
     try:
         env = make.fn()
         encode = encoder(env.observation_space)
@@ -211,6 +216,8 @@ def _answer(env: gym.Env, encode: Callable[[Any], Any], keep: Callable[[Any], An
     if name == "step_and_reset":
         return step_and_reset(env, encode, keep, *arguments)
     if name == "reset":
+        if arguments and arguments[0] is not None:
+            seed_globals(arguments[0])
         obs, info = validation.reset_env(env, *arguments)
         return encode(obs), info
     if name == "snapshot":
@@ -221,6 +228,12 @@ def _answer(env: gym.Env, encode: Callable[[Any], Any], keep: Callable[[Any], An
     assert name == "call", name
     function, *rest = arguments
     return function(env, *rest)
+
+
+def seed_globals(seed: int | None) -> None:
+    """Seeds the global generators of NumPy and Python; None: at random."""
+    random.seed(seed)
+    np.random.seed(None if seed is None else seed % 2**32)  # noqa: NPY002 - the one that environments draw from
 
 
 def step_and_reset(
