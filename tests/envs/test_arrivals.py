@@ -41,6 +41,18 @@ def test_the_others_do_not_wait_for_a_slow_step(tmp_path):
         np.testing.assert_array_equal(vector.arrivals[:2], [[1, 2]] * 2)
 
 
+def test_infos_are_those_of_the_results_that_were_taken():
+    with opened(Paced) as vector:
+        vector.reset()
+        said = []
+        while len(said) < 3:
+            vector.send(ZERO)
+            step = vector.receive()
+            (i,) = step.which
+            assert vector.infos()[i] is step.info[i]
+            said += [vector.infos()[i]["is_success"]] if (step.terminated | step.truncated)[i] else []
+
+
 def test_rows_of_environments_that_still_step_keep_their_observation():
     with opened(functools.partial(Paced, 0.01)) as vector:
         first = vector.reset().copy()

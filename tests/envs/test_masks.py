@@ -9,6 +9,7 @@ import jax
 import numpy as np
 import pytest
 from gymnasium import spaces
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
 import rejeu
 from rejeu.algorithms import ppo
@@ -17,6 +18,7 @@ from rejeu.core import Clock, Masked
 from rejeu.envs.make import InProcess, make_vector
 from rejeu.envs.masks import make_masked
 from rejeu.errors import BadEnvironmentError, WorkerError
+from rejeu.sb3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor
 from tests.environments import Counter
 from tests.helpers import assert_same_parameters
 from tests.tiers import crossed
@@ -59,13 +61,60 @@ def test_a_rollout_of_whole_episodes_keeps_to_the_masks():
     assert sum(one.taken for one in env.envs) >= 300
 
 
-def test_masks_come_out_of_worker_processes():
-    env = make_masked(functools.partial(Rules, "discrete"), 2, "gymnasium-async", seed=0)
+def with_spawn(mode):
+    return lambda fns: AsyncVectorEnv(fns, autoreset_mode=mode, context="forkserver")
+
+
+ELSEWHERE = {
+    "workers": lambda fns: make_vector(fns[0], 2, "gymnasium-async"),
+    "subproc": SubprocVecEnv,
+    "wrapped": lambda fns: VecMonitor(DummyVecEnv(fns)),
+    "async same step": with_spawn(AutoresetMode.SAME_STEP),
+    "async next step": with_spawn(AutoresetMode.NEXT_STEP),
+    "async disabled": with_spawn(AutoresetMode.DISABLED),
+    "sync": SyncVectorEnv,
+}
+
+
+@pytest.mark.parametrize(("where", "by"), crossed(list(ELSEWHERE), ["info", "method"]))
+def test_masks_of_environments_elsewhere_are_those_of_environments_in_this_process(where, by):
+    fns = [functools.partial(Rules, "multi", by)] * 2
+    here, there = make_masked(fns[0], 2), make_masked(ELSEWHERE[where](fns))
+    try:
+        shown, seen = here.reset(5), there.reset(5)
+        for _ in range(20):
+            np.testing.assert_array_equal(seen.obs, shown.obs)
+            np.testing.assert_array_equal(seen.mask, shown.mask)
+            action = np.stack([part.argmax(axis=1) for part in np.split(seen.mask, [2, 5], axis=1)], axis=1)
+            step, other = here.step(action), there.step(action)
+            done = step.terminated | step.truncated
+            np.testing.assert_array_equal(other.obs.obs, step.obs.obs)
+            np.testing.assert_array_equal(other.obs.mask[~done], step.obs.mask[~done])
+            expected = step.obs.mask if by == "info" or where == "sync" else np.ones((2, 9), bool)
+            np.testing.assert_array_equal(other.obs.mask[done], expected[done])
+            shown, seen = step.obs, other.obs
+            if done.any():
+                shown, seen = here.reset_done(done), there.reset_done(done)
+    finally:
+        there.close()
+
+
+def test_an_agent_learns_with_the_masks_of_worker_processes():
+    env = SubprocVecEnv([functools.partial(Rules, "discrete", "method")] * 2)
     try:
         agent = small(env, n_steps=16).learn(64)
-        assert agent.env.backend == "gymnasium-async"
+        assert agent.env.inner.venv is env
     finally:
         env.close()
+
+
+def test_masks_that_workers_do_not_have_are_asked_for():
+    vector = SubprocVecEnv([Silent])
+    try:
+        with pytest.raises(BadEnvironmentError, match=r'put info\["action_mask"\] into what reset and step return'):
+            make_masked(vector).reset()
+    finally:
+        vector.close()
 
 
 def test_a_lost_worker_with_masks_is_started_anew_where_that_is_asked_for():
@@ -306,7 +355,6 @@ class Mute(Fixed):
             TypeError,
             "masks of EnvPool cannot be accessed; give the i",
         ),
-        (lambda: gym.vector.SyncVectorEnv([Rules]), TypeError, "the masks of SyncVectorEnv cannot be accessed"),
         (lambda: 3, TypeError, "must be an id, an environment or a function that makes one, got int"),
     ],
 )

@@ -176,7 +176,7 @@ class OffPolicyAgent(Agent):
         kind = BUFFERS[kind] if isinstance(kind, str) else kind
         if config.hindsight is not None:
             buffer = kind(ring, config.gamma, config.hindsight, self._goals(env), config.n_steps, tree, each_reward)
-            buffer.last_infos = lambda: env.info
+            buffer.last_infos = env.infos
         else:
             settings: Any = config.replay_buffer_kwargs or ()
             if config.has_memory:
@@ -194,7 +194,7 @@ class OffPolicyAgent(Agent):
         replay = self.run.replay
         for buffer in (getattr(replay, "own", replay), getattr(replay, "demonstrations", None)):
             if isinstance(buffer, HerReplayBuffer):
-                buffer.goals, buffer.last_infos = self._goals(env), lambda: env.info
+                buffer.goals, buffer.last_infos = self._goals(env), env.infos
 
     @staticmethod
     def _goals(env: VectorEnv) -> GoalFunctions:

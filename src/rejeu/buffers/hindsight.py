@@ -278,7 +278,7 @@ class HerReplayBuffer(BaseReplayBuffer):
         if self.infos is not None:
             which, last = self.ring.all_envs if envs is None else envs, self.last_infos()
             for position, env in zip(self.ring.index(which, self.ring.head[which]), which, strict=True):
-                self.infos[position] = dict(last[env]) if isinstance(last, list) else {}
+                self.infos[position] = dict(last[env]) if last else {}
         super().add(action, reward, terminated, next_obs, envs)
 
     def draw(

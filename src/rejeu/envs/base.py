@@ -217,6 +217,18 @@ class VectorEnv(ABC):
         """In which order results were taken, where environments do not wait for each other; None elsewhere."""
         return None
 
+    def infos(self, begun: bool = False) -> list[dict[str, Any]]:
+        """Returns the info of each environment: that of its last step, or with ``begun`` of its last reset."""
+        return each_info(self.info, self.n_envs, begun)
+
+    def call(self, name: str) -> list[Any]:
+        """Returns what a method without arguments returns in each environment, also in worker processes.
+
+        Raises:
+            AttributeError: if there is no such method, or the environments cannot be accessed.
+        """
+        raise AttributeError(f"single environments of the {self.backend} backend cannot be accessed")
+
     def identities(self) -> set[int]:
         """Returns the ids of the vector and, where they are known, of the environments in it.
 
@@ -271,6 +283,25 @@ def describe_spec(env: gym.Env | gym.vector.VectorEnv) -> Description:
     elif limit is None and isinstance(own := getattr(env.unwrapped, "max_episode_steps", None), int):
         limit = own
     return Description(env.spec.id, limit, env.spec.reward_threshold)
+
+
+def each_info(info: Any, n_envs: int, begun: bool = False) -> list[dict[str, Any]]:
+    """Returns the info of each environment, of a list or of Gymnasium's dict of arrays; empty ones of anything else.
+
+    With ``begun`` it is that of the reset, where an environment was reset in the same step.
+
+    >>> each_info({"x": np.array([1, 0]), "_x": np.array([True, False])}, 2)
+    [{'x': np.int64(1)}, {}]
+    """
+    if isinstance(info, list):
+        return info
+    found: list[dict[str, Any]] = [{} for _ in range(n_envs)]
+    for key, values in info.items() if isinstance(info, dict) else ():
+        each = each_info(values, n_envs) if isinstance(values, dict) else values
+        if not key.startswith("_") and np.shape(each)[:1] == (n_envs,):
+            for i in np.flatnonzero(info.get(f"_{key}", np.ones(n_envs))).tolist():
+                found[i][key] = each[i]
+    return found if begun else [one.get("final_info", one) for one in found]
 
 
 def success_by(own: float, episode_return: float, threshold: float | None) -> float:

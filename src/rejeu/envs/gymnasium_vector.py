@@ -12,7 +12,7 @@ import numpy as np
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 
 from rejeu.envs import goals as goals_module, validation
-from rejeu.envs.base import SUCCESS_KEYS, Seed, Step, VectorEnv, describe_spec, each_seed, step_whole
+from rejeu.envs.base import SUCCESS_KEYS, Seed, Step, VectorEnv, describe_spec, each_info, each_seed, step_whole
 from rejeu.envs.goals import GoalFunctions
 from rejeu.errors import BadEnvironmentError, WorkerError
 from rejeu.spaces import leaves, plain
@@ -45,6 +45,8 @@ class GymnasiumVector(VectorEnv):
         self._seed = seed
         self._leaves = leaves(self.observation_space)
         self._after_reset: Any = None
+        self._reset_info: Any = None
+        """What the last reset said besides, or the last step that contained one."""
         self._flags = (np.zeros(self.n_envs, bool),) * 2
         """Flags of terminated and of truncated environments that await a reset. All False with automatic resets."""
         self._desynced = np.zeros(self.n_envs, bool)
@@ -78,7 +80,7 @@ class GymnasiumVector(VectorEnv):
         except BadEnvironmentError as error:
             raise self._bad(None, f"step returned {error}") from error.__cause__
         if self._same_step:
-            self._after_reset = obs
+            self._after_reset, self._reset_info = obs, info
             done = np.flatnonzero(terminated | truncated)
             if len(done):
                 obs = jax.tree.map(np.copy, obs)
@@ -125,6 +127,7 @@ class GymnasiumVector(VectorEnv):
         answer = self._called(self.env.reset, **arguments)
         if not isinstance(answer, tuple) or len(answer) != 2:
             raise self._bad(None, f"reset returned {validation.describe_value(answer)}, expected (obs, info)")
+        self._reset_info = answer[1]
         try:
             return validation.to_batch(self.observation_space, self._leaves, self.n_envs, answer[0])
         except BadEnvironmentError as error:
@@ -151,6 +154,12 @@ class GymnasiumVector(VectorEnv):
 
     def _bad(self, env: int | None, fault: str) -> BadEnvironmentError:
         return BadEnvironmentError(validation.with_location(self.env_id, env, self.n_steps, fault))
+
+    def infos(self, begun: bool = False) -> list[dict[str, Any]]:
+        return each_info(self._reset_info if begun else self.info, self.n_envs, begun)
+
+    def call(self, name: str) -> list[Any]:
+        return [*self._called(self.env.call, name)]  # type: ignore[attr-defined]
 
     def success(self, step: Step, env: int) -> float:
         info = step.info.get("final_info", step.info) if self._same_step else step.info

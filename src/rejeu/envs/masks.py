@@ -24,7 +24,17 @@ from rejeu.envs.base import Seed
 from rejeu.envs.functional.protocol import FunctionalEnv
 from rejeu.envs.functional.vector import JaxVector, goal_functions
 from rejeu.envs.goals import GoalFunctions
-from rejeu.envs.make import Backend, InProcess, Step, VectorEnv, WorkerOptions, adapter_of, check_workers, make_vector
+from rejeu.envs.make import (
+    Backend,
+    EnvPool,
+    InProcess,
+    Step,
+    VectorEnv,
+    WorkerOptions,
+    adapter_of,
+    check_workers,
+    make_vector,
+)
 from rejeu.envs.registry import maker
 from rejeu.envs.validation import id_of
 from rejeu.envs.workers.pool import TIMEOUT
@@ -33,6 +43,8 @@ from rejeu.spaces import Leaf
 
 OBSERVATION, MASK = "observation", "action_mask"
 """Keys of the observations of :class:`MaskInObservation`."""
+METHOD = "action_masks"
+NO_MASKS = 'does not return action masks; put info["action_mask"] into what reset and step return, or define action_masks()'
 
 
 def n_choices(space: spaces.Space, env_id: str) -> int:
@@ -72,35 +84,29 @@ class MaskInObservation(gym.Wrapper[Any, Any, Any, Any]):
     def _mask(self, info: dict[str, Any], over: bool) -> np.ndarray:
         if not isinstance(info, dict):  # reported by the vector, with the number of the environment
             return np.zeros(self._n, np.int8)
-        if MASK in info:
-            given = info[MASK]
-        else:
-            try:
-                given = self.env.get_wrapper_attr("action_masks")()
-            except AttributeError:
-                raise BadEnvironmentError(
-                    f'{id_of(self.env)} does not return action masks; put info["action_mask"] into what '
-                    "reset and step return, or add a method action_masks()"
-                ) from None
-        mask = (
-            np.concatenate([np.asarray(part).ravel() for part in given]) if isinstance(given, list | tuple) else given
-        )
-        mask = np.asarray(mask).ravel().astype(np.int8)
-        if mask.shape != (self._n,):
-            raise BadEnvironmentError(
-                f"{id_of(self.env)} gave a mask of {mask.size} entries, expected {self._n} for {self.action_space}"
-            )
-        if not over:  # after the end of an episode there may be no allowed action
-            self._check_some_allowed(mask)
-        return mask
+        try:
+            given = info[MASK] if MASK in info else self.env.get_wrapper_attr(METHOD)()
+        except AttributeError:
+            raise BadEnvironmentError(f"{id_of(self.env)} {NO_MASKS}") from None
+        return flat_mask(given, self.action_space, id_of(self.env), over)
 
-    def _check_some_allowed(self, mask: np.ndarray) -> None:
-        space = self.action_space
-        if isinstance(space, spaces.MultiBinary):
-            return
-        sizes = space.nvec.ravel() if isinstance(space, spaces.MultiDiscrete) else [self._n]
-        if not all(part.any() for part in np.split(mask, np.cumsum(sizes)[:-1])):
-            raise BadEnvironmentError(f"{id_of(self.env)} allows no action: its mask is {mask.tolist()}")
+
+def flat_mask(given: Any, space: spaces.Space, env_id: str, over: bool) -> np.ndarray:
+    """Returns the mask that an environment gave, an array or a list of arrays, as ``int8 (n_choices,)``.
+
+    Raises:
+        BadEnvironmentError: if it has another length or, unless the episode is ``over``, allows no action.
+    """
+    n = n_choices(space, env_id)
+    mask = np.concatenate([np.asarray(part).ravel() for part in given]) if isinstance(given, list | tuple) else given
+    mask = np.asarray(mask).ravel().astype(np.int8)
+    if mask.shape != (n,):
+        raise BadEnvironmentError(f"{env_id} gave a mask of {mask.size} entries, expected {n} for {space}")
+    sizes = space.nvec.ravel() if isinstance(space, spaces.MultiDiscrete) else [n]
+    is_some_allowed = all(part.any() for part in np.split(mask, np.cumsum(sizes)[:-1]))
+    if not (over or is_some_allowed or isinstance(space, spaces.MultiBinary)):
+        raise BadEnvironmentError(f"{env_id} allows no action: its mask is {mask.tolist()}")
+    return mask
 
 
 snapshot.REMEMBERED[MaskInObservation] = {}
@@ -112,32 +118,56 @@ def with_mask(make: Callable[[], gym.Env]) -> gym.Env:
 
 
 class MaskedVector(VectorEnv):
-    """A vector environment whose observations are :class:`rejeu.core.Masked`."""
+    """A vector environment whose observations are :class:`rejeu.core.Masked`.
 
-    def __init__(self, inner: VectorEnv) -> None:
-        """Wraps a vector of :class:`MaskInObservation` environments."""
-        space = inner.observation_space
-        assert isinstance(space, spaces.Dict)
+    Args:
+        inner: a vector of :class:`MaskInObservation` environments; with ``asks``, of any environments.
+        asks: whether masks come from the infos, or from the method ``action_masks`` of environments that may run in worker
+            processes. Where an episode ended, every action counts as allowed if the info has no mask, because the environment
+            may have begun the next one.
+    """
+
+    def __init__(self, inner: VectorEnv, asks: bool = False) -> None:
         self.inner = inner
         self.n_envs, self.backend, self.env_id = inner.n_envs, inner.backend, inner.env_id
         self.seeds = inner.seeds
-        self.observation_space, self.action_space = space[OBSERVATION], inner.action_space
+        self.venv, self.wrapped_by, self.vec_normalize = inner.venv, inner.wrapped_by, inner.vec_normalize
+        self.observation_space, self.action_space = inner.observation_space, inner.action_space
         self.max_episode_steps, self.reward_threshold = inner.max_episode_steps, inner.reward_threshold
+        self._mask = np.ones((self.n_envs, n_choices(self.action_space, self.env_id)), bool) if asks else None
+        if not asks:
+            assert isinstance(inner.observation_space, spaces.Dict)
+            self.observation_space = inner.observation_space[OBSERVATION]
 
     def reset(self, seed: Seed = None) -> Masked:
-        return masked(self.inner.reset(seed))
+        return self._masked(self.inner.reset(seed), np.arange(self.n_envs))
 
     def _step_all(self, action: np.ndarray) -> Step:
-        return self._masked(self.inner.step(action))
+        return self._after(self.inner.step(action), np.arange(self.n_envs))
 
     def _step_some(self, action: np.ndarray, active: np.ndarray) -> Step:
-        return self._masked(self.inner.step(action, active))
+        return self._after(self.inner.step(action, active), np.flatnonzero(active))
 
-    def _masked(self, step: Step) -> Step:
-        return step._replace(obs=masked(step.obs))
+    def _after(self, step: Step, which: np.ndarray) -> Step:
+        return step._replace(obs=self._masked(step.obs, which, step.terminated | step.truncated))
 
     def reset_done(self, done: np.ndarray) -> Masked:
-        return masked(self.inner.reset_done(done))
+        return self._masked(self.inner.reset_done(done), np.flatnonzero(done))
+
+    def _masked(self, obs: Any, which: np.ndarray, over: np.ndarray | None = None) -> Masked:
+        """Returns observations with their masks, of which those of ``which`` are new; ``over`` is None after a reset."""
+        if self._mask is None:
+            return masked(obs)
+        infos, ended = self.inner.infos(begun=over is None), np.zeros(self.n_envs, bool) if over is None else over
+        asked = [i for i in which.tolist() if MASK not in infos[i] and not ended[i]]
+        try:
+            called = self.inner.call(METHOD) if asked else []
+        except AttributeError:
+            raise BadEnvironmentError(f"{self.env_id} {NO_MASKS}") from None
+        for i in which.tolist():
+            given = called[i] if i in asked else infos[i].get(MASK)
+            self._mask[i] = True if given is None else flat_mask(given, self.action_space, self.env_id, ended[i])
+        return Masked(obs, self._mask.copy())
 
     def success(self, step: Step, env: int) -> float:
         return self.inner.success(step, env)
@@ -151,7 +181,10 @@ class MaskedVector(VectorEnv):
         return self.inner.snapshot()
 
     def restore(self, saved: Any, obs: Masked) -> list[int]:
-        return self.inner.restore(saved, {OBSERVATION: obs.obs, MASK: obs.mask.astype(np.int8)})
+        if self._mask is None:
+            return self.inner.restore(saved, {OBSERVATION: obs.obs, MASK: obs.mask.astype(np.int8)})
+        self._mask[:] = obs.mask
+        return self.inner.restore(saved, obs.obs)
 
     def identities(self) -> set[int]:
         return {id(self)} | self.inner.identities()
@@ -202,12 +235,12 @@ def make_masked(
     """Returns ``n_envs`` environments with their masks as one; arguments as for :func:`make_vector`.
 
     Raises:
-        TypeError: for a vector environment whose single environments cannot be accessed.
-        ValueError: for worker options out of range, or ``restart_workers`` where there are no worker processes.
+        TypeError: for EnvPool, whose single environments cannot be accessed.
+        ValueError: for worker options out of range, ``restart_workers`` where there are no worker processes, or ``wait_for``.
     """
     check_workers(env, n_envs, backend, WorkerOptions(worker_timeout, restart_workers))
-    if adapter_of(env) is not None:
-        env = make_vector(env, seed=seed)
+    if adapter_of(env) is not None or isinstance(env, gym.Env | gym.vector.VectorEnv):
+        env = make_vector(env, n_envs, seed=seed)
     if isinstance(env, MaskedVector):
         return env
     if isinstance(env, FunctionalEnv) or backend == "jax" or (backend == "auto" and functional.is_functional(env)):
@@ -219,16 +252,20 @@ def make_masked(
         return masked
     if isinstance(env, InProcess):
         return MaskedVector(env.with_wrapper(MaskInObservation, seed))
-    if isinstance(env, VectorEnv | gym.vector.VectorEnv):
+    if isinstance(env, EnvPool):
         raise TypeError(
-            f"the masks of {type(env).__name__} cannot be accessed; give the id, the environment, or a function that makes "
-            "one, or rejeu.make_vector(function, n_envs, 'gymnasium')"
+            "the masks of EnvPool cannot be accessed; give the id, the environment, or a function that makes one, or "
+            "rejeu.make_vector(function, n_envs, 'gymnasium')"
         )
+    if isinstance(env, VectorEnv):
+        if env.wait_for is not None:
+            raise ValueError(
+                f"wait_for={env.wait_for} is not available with action masks; make the environments without it"
+            )
+        return MaskedVector(env, asks=True)
     made_from: tuple[str, dict[str, Any]] | None = (env, {}) if isinstance(env, str) else None
     if isinstance(env, str):
         env = maker(env)
-    if isinstance(env, gym.Env):
-        return MaskedVector(make_vector(MaskInObservation(env), n_envs, seed=seed))
     if not callable(env):
         raise TypeError(f"env must be an id, an environment or a function that makes one, got {type(env).__name__}")
     chosen: Backend = "gymnasium" if backend in ("auto", "envpool") else backend

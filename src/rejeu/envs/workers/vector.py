@@ -146,6 +146,7 @@ class InWorkers(VectorEnv):
         """Environments whose process was replaced between two steps. The next step reports it."""
         self._restarted: set[int] = set()
         """Environments in new processes that have not been reset yet."""
+        self._reset_infos: dict[int, dict[str, Any]] = {}
         self._make_one = make_one
         self._seed = seed
         self._seeds: list[int | None] = [None] * n_envs
@@ -205,6 +206,7 @@ class InWorkers(VectorEnv):
             said = self._heard(self.workers.ask(waiting), "reset")
             done = [i for i, answer in said.items() if not isinstance(answer, Restarted)]
             self._take({i: said[i] for i in done})
+            self._reset_infos |= {i: said[i][1] for i in done}
             waiting = {i: ("reset", self._next_seed(i)) for i in said if i not in done}
         return self._obs
 
@@ -302,6 +304,7 @@ class InWorkers(VectorEnv):
         reward = np.zeros(self.n_envs, np.float32)
         terminated, truncated = np.zeros(self.n_envs, bool), np.zeros(self.n_envs, bool)
         info: list[dict[str, Any]] = [{}] * self.n_envs
+        self.info = info
         for i in which.tolist():
             result = self._results.pop(i)
             self._put(i, result.obs)
@@ -366,6 +369,16 @@ class InWorkers(VectorEnv):
             raise BadEnvironmentError(validation.with_location(self.env_id, first, self.n_steps, failure.message))
         which = f"environments {', '.join(map(str, failed))}" if len(failed) > 1 else f"environment {first}"
         raise WorkerError(f"{which} failed in a worker process, at a {what}:\n{failure.trace}")
+
+    def infos(self, begun: bool = False) -> list[dict[str, Any]]:
+        return [self._reset_infos[i] for i in range(self.n_envs)] if begun else super().infos()
+
+    def call(self, name: str) -> list[Any]:
+        said = self.workers.ask(dict.fromkeys(range(self.n_envs), ("call", process.call_method, name, (), {})))
+        if any(isinstance(answer, Failure) and answer.kind == "no attribute" for answer in said.values()):
+            raise AttributeError(name)
+        self._lost |= {i: answer for i, answer in self._heard(said, name).items() if isinstance(answer, Restarted)}
+        return [None if i in self._lost else said[i] for i in range(self.n_envs)]
 
     def success(self, step: Step, env: int) -> float:
         return success_of(step.info[env])

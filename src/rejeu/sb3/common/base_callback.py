@@ -19,6 +19,7 @@ import numpy as np
 
 from rejeu.agents import Agent
 from rejeu.callbacks.base import TrainingCallback
+from rejeu.envs.base import each_info
 from rejeu.loops.run import Progress
 from rejeu.reporting.logging import Logger
 from rejeu.sb3.common.vec_env.base_vec_env import TERMINAL_OBSERVATION, TIME_LIMIT_TRUNCATED, VecEnv
@@ -310,10 +311,9 @@ def env_infos(agent: Agent, progress: Progress) -> list[dict[str, Any]]:
     result, env = progress.result, agent.env
     assert result is not None
     assert env is not None
-    given = result.info if isinstance(result.info, list) else [{} for _ in range(env.n_envs)]
     infos = [
         {**info, TIME_LIMIT_TRUNCATED: bool(result.truncated[i] and not result.terminated[i])}
-        for i, info in enumerate(given)
+        for i, info in enumerate(each_info(result.info, env.n_envs))
     ]
     for i in np.flatnonzero(result.terminated | result.truncated).tolist():
         if progress.last_obs is not None:

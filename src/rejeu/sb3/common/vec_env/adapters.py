@@ -184,6 +184,12 @@ class VecEnvAdapter(VectorEnv):
         self._desynced = self._desynced & ~done
         return self._obs
 
+    def infos(self, begun: bool = False) -> list[dict[str, Any]]:
+        return self.venv.reset_infos if begun else super().infos()
+
+    def call(self, name: str) -> list[Any]:
+        return self.venv.env_method(name)
+
     def success(self, step: Step, env: int) -> float:
         return success_of(step.info[env])
 
@@ -265,8 +271,9 @@ class AutoResetView(SingleEnvs):
         step = self.vector.step(self._actions)
         dones = step.terminated | step.truncated
         infos: list[dict[str, Any]] = []
+        given = self.vector.infos()
         for i in range(self.num_envs):
-            info = dict(step.info[i]) if isinstance(step.info, list) else {}
+            info = dict(given[i])
             info[TIME_LIMIT_TRUNCATED] = bool(step.truncated[i] and not step.terminated[i])
             success = self.vector.success(step, i)
             if not math.isnan(success):
