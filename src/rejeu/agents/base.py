@@ -5,6 +5,7 @@ The functions of this package work on a :class:`BaseAgent`. :class:`rejeu.agents
 
 from __future__ import annotations
 
+import dataclasses
 import inspect
 import math
 import secrets
@@ -12,7 +13,7 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, cast
 
 import gymnasium as gym
 import jax
@@ -22,7 +23,7 @@ from rejeu import devices, hardware, spaces, validation, xla
 from rejeu.algorithms import config as configs, contract
 from rejeu.algorithms.rnd import with_rnd
 from rejeu.callbacks.base import Stateful
-from rejeu.core import Algorithm, Masked
+from rejeu.core import Algorithm, Masked, names
 from rejeu.envs.make import Backend, VectorEnv
 from rejeu.envs.masks import mask_leaf, n_choices
 from rejeu.exploration import explorer as exploration
@@ -241,6 +242,36 @@ class BaseAgent(ABC):
             check_fits(noise, action_space)
         self.learner = Learner(self.algorithm_of(self.config), noise, self.config.nonfinite == "skip")
 
+    def change(self, **settings: Any) -> None:
+        """Sets hyperparameters, which count from the next update on, also within ``learn``; functions are compiled again.
+
+        Raises:
+            ValueError: for an invalid value, or one that does not fit the networks, the optimizers or what the buffer holds;
+                nothing has changed then.
+        """
+        finite.settle(self)
+        config, learner, run, given = self.config, self.learner, self.run, ", ".join(settings)
+        self.config = dataclasses.replace(config, **settings)
+        try:
+            contract.check_config(self.config)
+            self.build(self.observation_space, self.action_space)
+            changed = {key for key in vars(config) if getattr(config, key) != getattr(self.config, key)}
+            if arrays_of(learner) != arrays_of(self.learner) or "action_masks" in changed:
+                raise ValueError(f"{given} cannot be set on a {self.name} whose networks were made without it")
+            if changed & configs.BUFFER and run.replay is not None:
+                if run.replay.size():
+                    raise ValueError(f"{given} cannot be set on a {self.name} whose buffer holds steps")
+                run.replay, run.obs, run.action = self.make_buffer(cast(VectorEnv, run.env)), None, None
+        except ValueError as error:
+            self.config, self.learner = config, learner
+            raise ValueError(f"{error}; give it to the constructor or to load") from None
+        if "gamma" in changed and run.replay is not None:
+            run.replay.set_gamma(self.config.gamma)
+        if "action_noise" in changed:
+            run.carry = self.learner.initial_carry(self.n_envs)
+        if "learning_starts" in changed:
+            run.learn_from += self.config.learning_starts - config.learning_starts
+
     def algorithm_of(self, config: Any) -> Algorithm:
         """Returns the algorithm for the agent's spaces and a configuration, on raw observations and rewards."""
         made = self.algorithm.make(config, self.observation_space, self.action_space)
@@ -429,6 +460,11 @@ class BaseAgent(ABC):
         if "algorithm" in cls.__dict__:
             cls.__doc__ = Documentation(cls.__doc__)  # type: ignore[assignment]
             cls.__signature__ = Signature(inspect.signature(BaseAgent.__init__))  # type: ignore[attr-defined]
+
+
+def arrays_of(learner: Learner) -> dict[str, Any]:
+    """Returns shape and type of each array of a state, by name."""
+    return dict(zip(names(learner.shapes), jax.tree.leaves(learner.shapes), strict=True))
 
 
 class Documentation:

@@ -224,8 +224,16 @@ def train(
     with session(agent, call, callbacks, tb_log_name, sinks) as record:
         try:
             with Interrupt() as interrupt:
-                for turn in agent.loop(*horizon(agent, call)):
-                    if record(turn) or interrupt.requested:
+                is_over = False
+                while (
+                    not is_over
+                ):  # a callback that sets a hyperparameter changes the learner, and the loop begins again
+                    learner = agent.learner
+                    for turn in agent.loop(*horizon(agent, call)):
+                        is_over = record(turn) or interrupt.requested
+                        if is_over or agent.learner is not learner:
+                            break
+                    else:
                         break
             agent.interrupted, agent.interrupted_by = interrupt.requested, interrupt.signal
             finite.settle(agent)

@@ -70,6 +70,10 @@ class RolloutBuffer:
         """Returns the number of valid steps, summed over the environments."""
         return int(self.valid[: self.length].sum())
 
+    def set_gamma(self, gamma: float) -> None:
+        """Sets the discount factor of the steps that are added from now on."""
+        self.gamma = gamma
+
     def begin(self, carry: PyTree, started: np.ndarray) -> None:
         """Starts a new rollout, and discards the previous one.
 

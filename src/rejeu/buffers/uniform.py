@@ -62,6 +62,10 @@ class BaseReplayBuffer(ABC):
         """
         return self.draw(rng, shape, progress)[0]
 
+    def set_gamma(self, gamma: float) -> None:
+        """Sets the discount factor of the transitions that are drawn from now on."""
+        self.gamma, self.discounts = gamma, discounts_of(gamma, self.n_steps)
+
     def size(self) -> int:
         """Returns the number of transitions kept."""
         return len(self.ring)

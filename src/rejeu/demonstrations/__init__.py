@@ -543,6 +543,11 @@ class WithDemonstrations:
         n = self.demonstrations.size()
         return f"<{self.own!r} with {self.share:.0%} of each batch from {n:,} steps of demonstrations>"
 
+    def set_gamma(self, gamma: float) -> None:
+        """Sets the discount factor of both."""
+        self.own.set_gamma(gamma)
+        self.demonstrations.set_gamma(gamma)
+
     def draw(self, rng: np.random.Generator, shape: tuple[int, ...], progress: float = 1.0) -> tuple[Any, Any]:
         """Returns a batch; the demonstrations are its last rows."""
         n = round(self.share * shape[-1])

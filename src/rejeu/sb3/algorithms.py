@@ -6,6 +6,7 @@ They are the agents of :mod:`rejeu` and learn alike. Functions given as schedule
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import inspect
 import os
 import tempfile
@@ -68,6 +69,15 @@ __all__ = [
 
 RUN = {"_last_obs": "obs", "_last_episode_starts": "ended", "_n_updates": "n_updates", "_episode_num": "episode"}
 """Attributes of a run by the names that scripts read of an agent."""
+FIXED = {
+    **dict.fromkeys(RUN, "learn(..., reset_num_timesteps=...)"),
+    "_logger": "set_logger(...)",
+    "_vec_normalize_env": "set_env(...)",
+    "log_ent_coef": "ent_coef",
+    "ent_coef_tensor": "ent_coef",
+    "env": "set_env(...)",
+}
+"""What is computed from something else, and what to use in order to change it."""
 PARTS = {
     "optimizer": "policy.optimizer",
     "actor_optimizer": "actor.optimizer",
@@ -115,7 +125,7 @@ class Original(Agent):
     """Whether :meth:`set_logger` was called."""
     policy_object: BasePolicy | None = None
     """What ``policy`` returns."""
-    STORED: ClassVar[tuple[str, ...]] = ("replay_buffer", "policy", "exploration_rate", "num_timesteps")
+    STORED: ClassVar[tuple[str, ...]] = ("replay_buffer", "policy", "exploration_rate", "num_timesteps", "lr_schedule")
     """Properties that can be set."""
 
     def __init__(self, policy: Any, env: Any, *args: Any, **settings: Any) -> None:
@@ -211,19 +221,39 @@ class Original(Agent):
         raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
 
     def __setattr__(self, name: str, value: Any) -> None:
-        """Sets an attribute; a hyperparameter also in the compiled functions."""
+        """Sets an attribute; a hyperparameter from the next update on, see :meth:`rejeu.agents.base.BaseAgent.change`.
+
+        Attributes of your own can be set too. A name that is nearly that of a hyperparameter warns.
+
+        Raises:
+            AttributeError: for what is computed from something else, such as a network.
+            ValueError: for a hyperparameter that networks or buffer depend on.
+        """
         config = self.__dict__.get("config")
-        if config is None or name in self.STORED or name not in validation.field_names(type(config)):
-            object.__setattr__(self, name, value)
+        known = () if config is None or name in self.STORED else validation.field_names(type(config))
+        if name in known:
+            if "run" in self.__dict__:
+                self.change(**self.converted({name: value}))
             return
-        self.config = dataclasses.replace(config, **self.converted({name: value}))
-        if "learner" in self.__dict__ and "run" in self.__dict__:
-            self.build(self.observation_space, self.action_space)
+        if known and name in (fixed := {**FIXED, **dict.fromkeys(policies.NETWORKS, "set_parameters(...)")}):
+            raise AttributeError(f"{name} of {self.name} cannot be set; use {fixed[name]}")
+        if known and not hasattr(self, name) and (near := difflib.get_close_matches(name, known, 1, 0.85)):
+            warnings.warn(
+                f"{name} is an attribute of your own now; is the hyperparameter {near[0]} meant?", UserWarning, 2
+            )
+        object.__setattr__(self, name, value)
 
     @property
     def lr_schedule(self) -> utils.FloatSchedule:
         """The learning rate as a function of the remaining progress."""
         return utils.FloatSchedule(utils.of_remaining(self.config.learning_rate))
+
+    @lr_schedule.setter
+    def lr_schedule(self, value: Any) -> None:
+        self.learning_rate = value
+
+    def _setup_lr_schedule(self) -> None:
+        """Does nothing: what ``learning_rate`` is set to counts at once."""
 
     @property
     def exploration_rate(self) -> float:
@@ -242,6 +272,10 @@ class Original(Agent):
 
     @exploration_rate.setter
     def exploration_rate(self, value: float) -> None:
+        if self.is_learning:
+            arguments.unsupported(
+                "exploration_rate", value, "follows exploration_initial_eps and ..._final_eps in learn; set these"
+            )
         self.exploration_rate_set = float(value)
 
     @property
