@@ -5,7 +5,6 @@ The functions of this package work on a :class:`BaseAgent`. :class:`rejeu.agents
 
 from __future__ import annotations
 
-import dataclasses
 import inspect
 import math
 import secrets
@@ -13,7 +12,7 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple, cast
+from typing import Any, ClassVar, NamedTuple
 
 import gymnasium as gym
 import jax
@@ -242,35 +241,50 @@ class BaseAgent(ABC):
             check_fits(noise, action_space)
         self.learner = Learner(self.algorithm_of(self.config), noise, self.config.nonfinite == "skip")
 
-    def change(self, **settings: Any) -> None:
-        """Sets hyperparameters, which count from the next update on, also within ``learn``; functions are compiled again.
+    def change(self, new: Any) -> None:
+        """Replaces the hyperparameters; the new ones count from the next update on, also within ``learn``, and are compiled.
+
+        Args:
+            new: its configuration with other values, from ``dataclasses.replace``.
 
         Raises:
-            ValueError: for an invalid value, or one that does not fit the networks, the optimizers or what the buffer holds;
-                nothing has changed then.
+            ValueError: if one does not fit the networks, the optimizers or what the buffer holds; nothing has changed then.
         """
         finite.settle(self)
-        config, learner, run, given = self.config, self.learner, self.run, ", ".join(settings)
-        self.config = dataclasses.replace(config, **settings)
+        old, learner, run = self.config, self.learner, self.run
+        changed = {key for key in validation.field_names(type(old)) if getattr(old, key) != getattr(new, key)}
+        kept_in_buffer = {
+            "buffer_size",
+            "demonstration_share",
+            "demonstrations",
+            "frame_stack",
+            "n_episodes",
+            "n_steps",
+        }
+        kept_in_buffer |= {"offline", "priorities", "replay_buffer_class", "replay_buffer_kwargs"}
         try:
-            contract.check_config(self.config)
+            self.config = new
             self.build(self.observation_space, self.action_space)
-            changed = {key for key in vars(config) if getattr(config, key) != getattr(self.config, key)}
-            if arrays_of(learner) != arrays_of(self.learner) or "action_masks" in changed:
-                raise ValueError(f"{given} cannot be set on a {self.name} whose networks were made without it")
-            if changed & configs.BUFFER and run.replay is not None:
+            arrays, others = (
+                dict(zip(names(x), jax.tree.leaves(x), strict=True)) for x in (learner.shapes, self.learner.shapes)
+            )
+            if arrays != others or "action_masks" in changed:
+                raise ValueError(
+                    f"{', '.join(changed)} cannot be set on a {self.name} whose networks were made without"
+                )
+            if changed & kept_in_buffer and run.replay is not None:
                 if run.replay.size():
-                    raise ValueError(f"{given} cannot be set on a {self.name} whose buffer holds steps")
-                run.replay, run.obs, run.action = self.make_buffer(cast(VectorEnv, run.env)), None, None
+                    raise ValueError(f"{', '.join(changed)} cannot be set on a {self.name} whose buffer holds steps")
+                run.replay, run.obs, run.action = self.make_buffer(run.env), None, None
         except ValueError as error:
-            self.config, self.learner = config, learner
+            self.config, self.learner = old, learner
             raise ValueError(f"{error}; give it to the constructor or to load") from None
         if "gamma" in changed and run.replay is not None:
             run.replay.set_gamma(self.config.gamma)
         if "action_noise" in changed:
             run.carry = self.learner.initial_carry(self.n_envs)
         if "learning_starts" in changed:
-            run.learn_from += self.config.learning_starts - config.learning_starts
+            run.learn_from += self.config.learning_starts - old.learning_starts
 
     def algorithm_of(self, config: Any) -> Algorithm:
         """Returns the algorithm for the agent's spaces and a configuration, on raw observations and rewards."""
@@ -460,11 +474,6 @@ class BaseAgent(ABC):
         if "algorithm" in cls.__dict__:
             cls.__doc__ = Documentation(cls.__doc__)  # type: ignore[assignment]
             cls.__signature__ = Signature(inspect.signature(BaseAgent.__init__))  # type: ignore[attr-defined]
-
-
-def arrays_of(learner: Learner) -> dict[str, Any]:
-    """Returns shape and type of each array of a state, by name."""
-    return dict(zip(names(learner.shapes), jax.tree.leaves(learner.shapes), strict=True))
 
 
 class Documentation:

@@ -58,8 +58,7 @@ def open_outputs(
 
 def run_name(agent: BaseAgent) -> str:
     """Returns a name for the run in a tracker: environment, algorithm, seed and :func:`tracker_id`."""
-    assert agent.env is not None
-    return f"{agent.env.env_id}-{agent.name}-seed{agent.seed}-{tracker_id(agent)}"
+    return f"{agent.run.env.env_id}-{agent.name}-seed{agent.seed}-{tracker_id(agent)}"
 
 
 def tracker_id(agent: BaseAgent) -> str:
@@ -69,12 +68,11 @@ def tracker_id(agent: BaseAgent) -> str:
 
 def run_config(agent: BaseAgent, call: TrainingCall) -> dict[str, Any]:
     """Returns what trackers show as the configuration of a run: environment, algorithm, limits, hyperparameters."""
-    assert agent.env is not None
     return {
         "algorithm": agent.name,
-        "env_id": agent.env.env_id,
+        "env_id": agent.run.env.env_id,
         "n_envs": agent.n_envs,
-        "backend": agent.env.backend,
+        "backend": agent.run.env.backend,
         "policy": agent.policy_name,
         "seed": agent.seed,
         "total_timesteps": call.n_steps,
@@ -214,27 +212,20 @@ def train(
     The other arguments are those of :meth:`Agent.learn`.
     """
     warn_without_noise(agent)
-    callbacks = listed(callback)
-    if progress_bar:
-        callbacks.append(ProgressBar.of(call, taken=agent.run.step - call.first_step))
-    callbacks = in_order(callbacks)
+    bar = [ProgressBar.of(call, taken=agent.run.step - call.first_step)] if progress_bar else []
+    callbacks = in_order([*listed(callback), *bar])
     agent.stops, agent.n_together = device.stops_of(agent, call, callbacks), 1
     if agent.stops is not None:
         device.require_memory(agent)
     with session(agent, call, callbacks, tb_log_name, sinks) as record:
         try:
             with Interrupt() as interrupt:
-                is_over = False
-                while (
-                    not is_over
-                ):  # a callback that sets a hyperparameter changes the learner, and the loop begins again
+                is_over, learner = False, None
+                while not is_over and learner is not agent.learner:  # again if a callback has set a hyperparameter
                     learner = agent.learner
                     for turn in agent.loop(*horizon(agent, call)):
-                        is_over = record(turn) or interrupt.requested
-                        if is_over or agent.learner is not learner:
+                        if (is_over := record(turn) or interrupt.requested) or learner is not agent.learner:
                             break
-                    else:
-                        break
             agent.interrupted, agent.interrupted_by = interrupt.requested, interrupt.signal
             finite.settle(agent)
         except NonFiniteUpdate as broken:
@@ -271,8 +262,8 @@ def session(
             record_turn(agent, call, turn, outputs)
             answers = [called(callback, agent, turn) for callback in callbacks]
             agent.failed_writes.retry_if_due()
-            stopped = any(isinstance(answer, bool | np.bool_) and not answer for answer in answers)
-            return stopped or call.is_over(turn.step, agent.run.episode)
+            over = call.is_over(turn.step, agent.run.episode)
+            return over or any(isinstance(answer, bool | np.bool_) and not answer for answer in answers)
 
         yield record
 

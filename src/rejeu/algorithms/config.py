@@ -32,11 +32,6 @@ from rejeu.validation import C, assign, build, choice, coerce, flag, nested, num
 
 REPLAY_BUFFERS = {"ReplayBuffer": None, "HerReplayBuffer": HindsightConfig}
 """The replay buffers by name, and the configuration of each."""
-BUFFER = {
-    "buffer_size", "demonstration_share", "demonstrations", "frame_stack", "hindsight", "n_episodes", "n_steps", "offline",
-    "priorities", "replay_buffer_class", "replay_buffer_kwargs",
-}  # fmt: skip
-"""The hyperparameters that a buffer is made with, except ``gamma``."""
 MOST_ROWS = 10**12
 """Upper limit on the size of a replay buffer and of its batches, beyond the memory of any machine. What fits is checked when
 a run begins, since it may be another machine than the one on which a plan is read."""

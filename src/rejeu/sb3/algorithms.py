@@ -233,7 +233,7 @@ class Original(Agent):
         known = () if config is None or name in self.STORED else validation.field_names(type(config))
         if name in known:
             if "run" in self.__dict__:
-                self.change(**self.converted({name: value}))
+                self.change(dataclasses.replace(config, **self.converted({name: value})))
             return
         if known and name in (fixed := {**FIXED, **dict.fromkeys(policies.NETWORKS, "set_parameters(...)")}):
             raise AttributeError(f"{name} of {self.name} cannot be set; use {fixed[name]}")
