@@ -86,6 +86,11 @@ class Latest(ReplayMemory):
         return np.arange(batch_size) % len(self)
 
 
+class OwnNumbers(ReplayMemory):
+    def rows(self, batch_size, rng):
+        return np.random.default_rng().integers(len(self), size=batch_size)
+
+
 class Silent(ReplayMemory):
     def sample(self, batch_size, rng): ...
 
@@ -264,6 +269,7 @@ WRONG = [
     ("replay_memory", CountsAll, "len is 6, but 4"),
     ("replay_memory", FromAnywhere, "a row that was never filled"),
     ("replay_memory", Mixed, "belong to different transitions"),
+    ("replay_memory", OwnNumbers, "Batches of two equal generators differ. Draw the rows with rng"),
     ("replay_memory", Latest, "60 batches were all the same"),
     ("replay_memory", Silent, "returns None"),
     ("discounts", lambda te, tr, g: g * (1.0 - (te | tr)), "truncated episode is treated as a terminated one"),

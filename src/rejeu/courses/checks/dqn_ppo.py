@@ -53,6 +53,8 @@ def _sampled(memory: Any) -> set[int]:
         rows = np.stack([obs[:, 0], action, reward / 10, next_obs[:, 0] - 0.5 * (obs[:, 0] > 0), discount * 10])
         mistakes(mixed=not close(rows, np.tile(rows[0], (5, 1))))
         found.append(np.round(rows[0]).astype(int))
+    again = [call(memory.sample, 2, np.random.default_rng(1), copies=False)[0] for _ in range(8)]
+    mistakes(ignores_rng=len(np.unique(numbers(np.stack(again), (8, 2, 2)), axis=0)) > 1)
     mistakes(always_the_same=found[0].any() and all((one == found[0]).all() for one in found))
     return set(np.concatenate(found).tolist())
 
