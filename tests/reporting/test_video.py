@@ -12,6 +12,7 @@ import subprocess
 import sys
 from contextlib import suppress
 from pathlib import Path
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import gymnasium as gym
@@ -59,6 +60,14 @@ class Blank(Lamp):
 
     def render(self):
         return None
+
+
+@pytest.mark.parametrize("frame", [np.full((4, 6), 7), np.full((4, 6, 1), 7.0), np.full((4, 6, 4), 7, np.int64)])
+def test_frames_of_other_types_are_taken_if_their_values_fit(frame):
+    shown = rendering.rgb_frame(SimpleNamespace(render=lambda: frame))
+    assert (shown.dtype, shown.shape, shown.min(), shown.max()) == (np.uint8, (4, 6, 3), 7, 7)
+    with pytest.raises(ValueError, match=r"returned an array of shape .* expected whole numbers from 0 to 255"):
+        rendering.rgb_frame(SimpleNamespace(render=lambda: frame + 0.5))
 
 
 class Still:
@@ -278,7 +287,7 @@ def test_environment_that_cannot_render_is_an_error(tmp_path):
         ({"env": None}, "this agent has no environment"),
         ({"env": 3}, "got int"),
         ({"env": Lamp()}, r"render_mode=None .*render_mode='rgb_array'"),
-        ({"env": Blank("rgb_array")}, r"render\(\) returned NoneType, expected an array"),
+        ({"env": Blank("rgb_array")}, r"render\(\) returned None, expected whole numbers from 0 to 255"),
         ({"episodes": 0}, "episodes=0"),
         ({"max_steps": 0}, "max_steps=0"),
         ({"fps": 0}, "fps=0"),

@@ -15,6 +15,7 @@ import gymnasium as gym
 import numpy as np
 
 from rejeu import hardware
+from rejeu.envs.validation import describe_value, keeps_values
 
 DEFAULT_FPS = 30.0
 """Frames per second of environments that declare none."""
@@ -59,20 +60,20 @@ def natural_fps(env: gym.Env) -> float:
 
 
 def rgb_frame(env: gym.Env) -> np.ndarray:
-    """Returns a rendered frame, ``uint8 (height, width, 3)``; needs no display.
+    """Returns a rendered frame, ``uint8 (height, width, 3)``; needs no display. Gray images get colors, alpha is left out.
 
     Raises:
         ValueError: if it renders anything else, or if MuJoCo has no OpenGL context.
     """
     with display_for_pygame(), explain_mujoco_errors(env):
-        frame = env.render()
-    if not isinstance(frame, np.ndarray) or frame.ndim != 3 or frame.shape[2] != 3:
-        got = f"an array of shape {frame.shape}" if isinstance(frame, np.ndarray) else type(frame).__name__
-        raise ValueError(
-            f"{env} cannot be recorded: render() returned {got}, expected an array (height, width, 3); make it with "
-            "render_mode='rgb_array'"
-        )
-    return frame
+        shown: Any = env.render()
+    frame = shown[..., None] if isinstance(shown, np.ndarray) and shown.ndim == 2 else shown
+    if isinstance(frame, np.ndarray) and frame.shape[2:] in ((1,), (3,), (4,)) and keeps_values(frame, np.uint8):
+        return np.ascontiguousarray(np.broadcast_to(frame[..., :3], (*frame.shape[:2], 3)), np.uint8)
+    raise ValueError(
+        f"{env} cannot be recorded: render() returned {describe_value(shown)}, expected whole numbers from 0 to 255 of shape "
+        "(height, width, 3); a gray image and one with alpha do as well"
+    )
 
 
 @contextmanager
