@@ -128,6 +128,13 @@ class NoSeed(Good):
         return super().reset()
 
 
+class FewSeeds(Good):
+    def reset(self, *, seed=None, options=None):
+        if seed is not None and not 100 <= seed < 110:
+            raise ValueError("there are ten levels")
+        return super().reset(seed=seed)
+
+
 class Unrepeatable(Good):
     def reset(self, *, seed=None, options=None):
         return super().reset(options=options)
@@ -183,8 +190,19 @@ class RewardNeedsInfo(Line):
         return super().compute_reward(achieved, desired, info) + 0.0 * info.get("scale", np.nan)
 
     def step(self, action):
-        obs, reward, terminated, truncated, info = super().step(action)
-        return obs, -1.0 if np.isnan(reward) else reward, terminated, truncated, {**info, "scale": 1.0}
+        obs, _, terminated, truncated, info = super().step(action)
+        info["scale"] = 1.0
+        return obs, self.compute_reward(self.position, self.goal, info), terminated, truncated, info
+
+
+class RewardReadsInfo(Line):
+    def compute_reward(self, achieved, desired, info):
+        return super().compute_reward(achieved, desired, info) * info["scale"]
+
+    def step(self, action):
+        self.position, self.time = self.position + action, self.time + 1
+        info = {"scale": 2.0}
+        return self._observe(), self.compute_reward(self.position, self.goal, info), False, self.time == 10, info
 
 
 class MeanReward(Line):
@@ -281,6 +299,12 @@ EVERY: dict[str, Fault] = {
     ),
     "two keys only": Fault(TwoKeysOnly, "error", "the observation only", "the observation only, expected .obs, info"),
     "no seed": Fault(NoSeed, "error", r"NoSeed.reset\(\) takes no seed", r"NoSeed.reset\(\) takes no seed, expected"),
+    "few seeds": Fault(
+        FewSeeds,
+        "error",
+        r"reset\(seed=2147483646\) raised ValueError: there are ten levels, .* give one seed for each",
+        r"FewSeeds, environment 0, the first reset: reset\(seed=\d+\) raised ValueError: there are ten levels, and .*seed=",
+    ),
     "unrepeatable": Fault(
         Unrepeatable, "warning", r"env_checker: .*does not call `super\(\).reset\(seed=seed\)`", None
     ),
@@ -290,6 +314,9 @@ EVERY: dict[str, Fault] = {
     "same array": Fault(SameArray, "warning", "env_checker: .*share an object", None),
     "odd reward": Fault(OddReward, "error", "step gave the reward .* compute_reward .* they must agree", None),
     "reward needs info": Fault(RewardNeedsInfo, "error", "with an empty info", None),
+    "reward reads info": Fault(
+        RewardReadsInfo, "error", "raised KeyError: 'scale' with an empty info; hindsight replay keeps no infos", None
+    ),
     "mean reward": Fault(MeanReward, "error", "of many goals at once .* of the same goals one by one", None),
     "row reward": Fault(RowReward, "warning", r"compute_reward .*\(.*rejeu then calls it row by row", None),
     "reward with axis": Fault(RewardWithAxis, "error", r"compute_reward .* shape \(1,\) of one goal", None),

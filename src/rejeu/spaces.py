@@ -18,6 +18,8 @@ MAX_NUMBERS = 2**20
 damaged file must not exhaust the memory."""
 MAX_LEAVES = 1024
 """Upper limit on the parts of a Dict or Tuple in a file."""
+UNBOUNDED = 1e10
+"""Actions with a bound of at least this size, such as the largest float32, count as unbounded."""
 INVALID = (ArithmeticError, AssertionError, AttributeError, LookupError, RecursionError, TypeError, ValueError)
 """Exceptions that an invalid description of a space can cause."""
 
@@ -184,7 +186,7 @@ def check_policy(policy: str, space: spaces.Space, normalize_images: bool = True
 
 
 def check_goal_space(space: spaces.Space) -> None:
-    """Raises ``ValueError`` unless ``space`` is a goal environment's: hindsight needs the two goals."""
+    """Raises ``ValueError`` unless ``space`` is a goal environment's: hindsight needs the two goals, each one array."""
     keys = list(space.spaces) if isinstance(space, spaces.Dict) else None
     missing = [key for key in GOAL_KEYS if keys is None or key not in keys]
     if missing:
@@ -194,6 +196,11 @@ def check_goal_space(space: spaces.Space) -> None:
             f"is missing from {has}; use a goal environment or replay_buffer_class=None"
         )
     assert isinstance(space, spaces.Dict)
+    if isinstance(space["achieved_goal"], spaces.Dict | spaces.Tuple):
+        raise ValueError(
+            f"achieved_goal is {space['achieved_goal']}, and hindsight needs goals that are one array; put the parts of a "
+            "goal into one Box, from which compute_reward takes them"
+        )
     if space["achieved_goal"] != space["desired_goal"]:
         raise ValueError(
             f"achieved_goal {space['achieved_goal']} and desired_goal {space['desired_goal']} must be the same space, "
@@ -215,7 +222,7 @@ def check_box_action(space: spaces.Space, algorithm: str) -> spaces.Box:
         )
         raise ValueError(f"{algorithm} needs a Box action space, got {space}; {instead}")
     check_not_empty(space)
-    if not (np.isfinite(space.low).all() and np.isfinite(space.high).all()):
+    if not bounded(space).all():
         raise ValueError(
             f"{algorithm} needs finite action bounds, got low={space.low.tolist()}, high={space.high.tolist()}; "
             "wrap the environment with gymnasium.wrappers.RescaleAction or declare the bounds it really has"
@@ -278,6 +285,15 @@ def check_not_empty(space: spaces.Box) -> None:
         )
 
 
+def bounded(space: spaces.Box) -> np.ndarray:
+    """Returns which components have two bounds that are finite, also for practical purposes; others are not scaled.
+
+    >>> bounded(spaces.Box(np.array([-1.0, -3e38, 0.0]), np.array([1.0, 3e38, np.inf]))).tolist()
+    [True, False, False]
+    """
+    return (np.abs(space.low.astype(np.float64)) < UNBOUNDED) & (np.abs(space.high.astype(np.float64)) < UNBOUNDED)
+
+
 def action_dimension(space: spaces.Box) -> int:
     """Returns the number of components of one action."""
     return int(np.prod(space.shape, dtype=int))
@@ -337,12 +353,11 @@ def action_scaler(space: spaces.Space) -> Callable[[np.ndarray], np.ndarray]:
         shape = (-1, *space.shape)
         if space.dtype == np.float32 and (space.low == -1.0).all() and (space.high == 1.0).all():
             return lambda action: action.reshape(shape).clip(-1.0, 1.0)
-        bounded = np.isfinite(space.low) & np.isfinite(space.high)
         low, high = space.low.astype(np.float64), space.high.astype(np.float64)
         if space.dtype.kind != "f":
             half, whole = 0.5 * (high - low + 1.0), space.dtype
             return lambda action: np.floor(low + (action.reshape(shape) + 1.0) * half).clip(low, high).astype(whole)
-        start, half = np.where(bounded, low, -1.0), np.where(bounded, 0.5 * (high - low), 1.0)
+        start, half = np.where(bounded(space), low, -1.0), np.where(bounded(space), 0.5 * (high - low), 1.0)
         dtype = space.dtype
 
         def scale(action: np.ndarray) -> np.ndarray:
@@ -378,10 +393,9 @@ def unscale_action(space: spaces.Space, action: np.ndarray) -> np.ndarray:
         first = space.start if isinstance(space, spaces.MultiDiscrete) else 0
         return (action - first).astype(np.int32).reshape(len(action), -1)
     assert isinstance(space, spaces.Box)
-    bounded = np.isfinite(space.low) & np.isfinite(space.high)
     low, high = space.low.astype(np.float64), space.high.astype(np.float64)
-    half = np.where(bounded, 0.5 * (high - low), 1.0)
-    middle = np.where(bounded, low + half, 0.0)
+    half = np.where(bounded(space), 0.5 * (high - low), 1.0)
+    middle = np.where(bounded(space), low + half, 0.0)
     scaled = (action - middle) / np.where(half > 0, half, 1.0)
     return scaled.astype(np.float32).reshape(len(action), -1)
 

@@ -190,6 +190,10 @@ def test_the_console_script_finds_modules_in_the_current_folder(here):
         (["drift_env"], "no environment is called 'drift_env'; did you mean the file drift_env.py?"),
         (["drift_env:Drif-v0"], "drift_env registers Drift-v0, not 'Drif-v0'"),
         (["empty_env.py"], "empty_env.py registers no environment; add gymnasium.register("),
+        (
+            ["zoo_env.py"],
+            "zoo_env.py has an environment of several agents, as PettingZoo's, and rejeu trains one agent",
+        ),
         (["two_env.py"], "two_env.py registers A-v0 and B-v0; name one of them: two_env.py:A-v0"),
         (["Pendulum-v1", "--wrapper", "drift_env"], "must be MODULE:CLASS"),
         (["Pendulum-v1", "--wrapper", "drift_env:Triple"], "has no class or function 'Triple'"),
@@ -198,6 +202,7 @@ def test_the_console_script_finds_modules_in_the_current_folder(here):
 )
 def test_what_cannot_be_found_is_one_line(named, message, here, capsys):
     (here / "empty_env.py").write_text("x = 1\n")
+    (here / "zoo_env.py").write_text("class Game:\n    __module__ = 'pettingzoo.utils.env'\n")
     (here / "two_env.py").write_text(
         "import gymnasium\nfor name in 'AB':\n    gymnasium.register(f'{name}-v0', 'two_env:X')\n"
     )

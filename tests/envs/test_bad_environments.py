@@ -22,7 +22,7 @@ from rejeu.errors import BadEnvironmentError
 from rejeu.loops import checks
 from rejeu.loops.checks import check_finite
 from rejeu.sb3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor
-from tests.bad_environments import EVERY, Good, Line, RewardWithAxis
+from tests.bad_environments import EVERY, Good, Line, RewardReadsInfo, RewardWithAxis, SameArray, seeing
 from tests.helpers import small_sac
 from tests.tiers import crossed
 
@@ -262,6 +262,103 @@ def test_a_reward_of_goals_that_is_no_number_is_explained():
     goals = make_vector(TwoRewards, 1, "gymnasium").goals()
     with pytest.raises(BadEnvironmentError, match=r"compute_reward returned an array of shape \(2,\) .* of one goal"):
         goals.reward(places, places)
+
+
+def test_a_reward_that_reads_the_info_is_explained():
+    goals = make_vector(RewardReadsInfo, 1, "gymnasium").goals()
+    places = np.arange(4.0, dtype=np.float32)[:, None]
+    with pytest.raises(
+        BadEnvironmentError, match="compute_reward found no key 'scale': the info is empty in hindsight"
+    ):
+        goals.reward(places, places)
+    np.testing.assert_array_equal(goals.reward(places, places, [{"scale": 3.0}] * 4), np.zeros(4))
+
+
+class OneDict(Good):
+    """Has one info, which it empties at every reset."""
+
+    def __init__(self):
+        self.info = {}
+
+    def reset(self, **kwargs):
+        self.info.clear()
+        return super().reset(**kwargs)[0], self.info
+
+    def step(self, action):
+        self.info["time"] = self.time
+        return (*super().step(action)[:4], self.info)
+
+
+def test_the_last_info_of_an_episode_outlasts_the_reset():
+    vector, venv = make_vector(OneDict), DummyVecEnv([OneDict])
+    vector.reset(), venv.reset()
+    for _ in range(10):
+        step, (_, _, _, infos) = vector.step(np.zeros((1, 1))), venv.step(np.zeros((1, 1)))
+    vector.reset_done(step.truncated)
+    assert step.info[0] == {"time": 9}
+    assert infos[0]["time"] == 9
+
+
+def test_final_observations_that_a_reset_overwrote_are_told_once():
+    def walked(kind):
+        vector = make_vector(AsyncVectorEnv([kind], autoreset_mode=AutoresetMode.SAME_STEP, context="forkserver"))
+        vector.reset(0)
+        for _ in range(50):
+            step = vector.step(np.zeros((1, 1)))
+            vector.reset_done(step.truncated)
+        vector.close()
+
+    with pytest.warns(UserWarning, match="final observations .* are those of the resets") as caught:
+        walked(SameArray)
+    assert len(caught) == 1
+    walked(Good)
+    walked(seeing("Constant", lambda env: np.zeros(3, np.float32)))
+
+
+class SeveralAgents:
+    possible_agents = ("cat", "mouse")
+
+    def reset(self, seed=None, options=None): ...
+    def step(self, actions): ...
+
+
+class Simulator:
+    def action_spec(self): ...
+
+
+class OldEnvironment:
+    def reset(self): ...
+    def step(self, action): ...
+
+
+class Spaceless(gym.Env): ...
+
+
+NO_ENVIRONMENTS = {
+    SeveralAgents: "got SeveralAgents, an environment of several agents as PettingZoo's; rejeu trains one",
+    Simulator: "got Simulator, as dm_control's; wrap it: shimmy",
+    OldEnvironment: "got OldEnvironment; .*of the old package gym: shimmy",
+    Spaceless: "Spaceless has no observation_space and no action_space; set it in __init__",
+    (lambda: None): "got NoneType; derive its class",
+    (lambda: "CartPole-v1"): r"got str; make it: gymnasium.make\('CartPole-v1'\)",
+    (lambda: SyncVectorEnv([Good])): "got SyncVectorEnv, several environments as one; give a single one",
+}
+
+
+@pytest.mark.parametrize(("make", "words"), NO_ENVIRONMENTS.items())
+def test_what_is_no_environment_is_named(make, words):
+    for function in (
+        make_vector,
+        lambda make: make_vector(make, 2, "gymnasium-async"),
+        lambda make: DummyVecEnv([make]),
+    ):
+        with pytest.raises(TypeError, match=words):
+            function(make)
+    with pytest.raises(TypeError, match=words):
+        findings(make())
+    if isinstance(make, type) and make is not Spaceless:
+        with pytest.raises(TypeError, match=f"env must be an id, a Gymnasium environment, .*{words}"):
+            make_vector(make())
 
 
 class Far(Good):

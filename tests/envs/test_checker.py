@@ -6,8 +6,11 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from rejeu import spaces
 from rejeu.envs.checker import advice_on_observations, check_env, findings
 from rejeu.errors import BadEnvironmentError
+from rejeu.export import contract
+from rejeu.loops.device import program
 from tests.environments import Reach, Sampled
 from tests.golden.vec_env_script import Walk
 
@@ -20,11 +23,29 @@ class Tidy(Walk):
 
 def test_environments_are_checked_and_advised_on():
     check_env(Tidy())
-    with pytest.warns(UserWarning, match="symmetric and normalized"):
-        check_env(gym.make("Pendulum-v1").unwrapped)
-    check_env(gym.make("Pendulum-v1").unwrapped, warn=False)
-    with pytest.raises(TypeError, match="got str"):
+    assert findings(gym.make("Pendulum-v1").unwrapped) == []  # whose range of actions rejeu scales
+    with pytest.raises(TypeError, match=r"got str; make it: gymnasium.make\('CartPole-v1'\)"):
         check_env("CartPole-v1")
+    with pytest.raises(TypeError, match="got the class Tidy; call it"):
+        check_env(Tidy)
+
+
+@pytest.mark.parametrize("high", [np.inf, np.finfo(np.float32).max, 1e38])
+def test_actions_without_bounds_are_advised_on_refused_and_not_scaled(high):
+    class Free(Tidy):
+        action_space = gym.spaces.Box(np.float32([-1, 0]), np.float32([1, high]))
+
+        def step(self, action):
+            return super().step(0)
+
+    assert sum("practically none" in one.text for one in findings(Free())) == 1
+    with pytest.raises(ValueError, match="SAC needs finite action bounds"):
+        spaces.check_box_action(Free.action_space, "SAC")
+    action = np.float32([[0.5, 0.25]])
+    np.testing.assert_array_equal(spaces.scale_action(Free.action_space, action), action)
+    np.testing.assert_array_equal(spaces.unscale_action(Free.action_space, action), action)
+    np.testing.assert_array_equal(program.scale(Free.action_space, action), action)
+    np.testing.assert_array_equal(contract.action_scaler(Free.action_space)(action), action)
 
 
 @pytest.mark.parametrize(
@@ -55,6 +76,10 @@ def test_goal_environments_are_checked_for_what_hindsight_needs():
     half = gym.spaces.Dict({"observation": Walk.observation_space, "desired_goal": Walk.observation_space})
     with pytest.raises(BadEnvironmentError, match="achieved_goal is missing from a Dict with the keys"):
         check_env(Sampled(half), warn=False)
+    place = gym.spaces.Dict({"x": Walk.observation_space})
+    parts = gym.spaces.Dict({"observation": Walk.observation_space, "achieved_goal": place, "desired_goal": place})
+    with pytest.raises(BadEnvironmentError, match=r"achieved_goal is Dict\(.* put the parts of a goal into one Box"):
+        check_env(Sampled(parts), warn=False)
 
 
 BOX = gym.spaces.Box

@@ -22,6 +22,7 @@ from __future__ import annotations
 import inspect
 import math
 from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import dataclass
 from enum import Enum
 from functools import cache, partial
@@ -278,7 +279,7 @@ class HerReplayBuffer(BaseReplayBuffer):
         if self.infos is not None:
             which, last = self.ring.all_envs if envs is None else envs, self.last_infos()
             for position, env in zip(self.ring.index(which, self.ring.head[which]), which, strict=True):
-                self.infos[position] = dict(last[env]) if last else {}
+                self.infos[position] = deepcopy(last[env]) if last else {}
         super().add(action, reward, terminated, next_obs, envs)
 
     def draw(

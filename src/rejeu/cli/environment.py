@@ -63,6 +63,8 @@ def find_id(name: str) -> str:
     found = " and ".join(sorted(new))
     if not env_id and len(new) == 1:
         return found
+    if not new and any(str(getattr(one, "__module__", "")).startswith("pettingzoo.") for one in vars(module).values()):
+        raise ValueError(f"{source} has an environment of several agents, as PettingZoo's, and rejeu trains one agent")
     if not new:
         raise ValueError(
             f"{source} registers no environment; add gymnasium.register('Walk-v0', '{module.__name__}:Walk', "

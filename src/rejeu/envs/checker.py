@@ -17,9 +17,10 @@ from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env as check_gymnasium_env
 
 from rejeu.envs import validation
+from rejeu.envs.base import SEEDS_END
 from rejeu.envs.goals import attribute
 from rejeu.errors import BadEnvironmentError
-from rejeu.spaces import GOAL_KEYS, check_goal_space, leaves, plain, random_action
+from rejeu.spaces import GOAL_KEYS, bounded, check_goal_space, leaves, members, plain, random_action
 
 MOST_STEPS = 2_000
 """Random steps after which episodes are assumed never to end, in an environment that declares no time limit."""
@@ -30,10 +31,6 @@ MOST_SECONDS = 5.0
 MOST_GOALS = 32
 """Steps whose goals are checked."""
 SEED = 0
-
-
-SCALED = "; rejeu scales actions itself, so nothing needs to be changed for it"
-"""What is added to Gymnasium's advice on the range of actions."""
 
 
 Level = Literal["error", "warning"]
@@ -115,7 +112,7 @@ def findings(env: gym.Env, skip_render_check: bool = True) -> list[Finding]:
     if all(finding.level == "warning" for finding in found.values()):
         for text in _gymnasium_messages(env, skip_render_check):
             found[text] = Finding("warning", text)
-    for text in advice_on_observations(env.observation_space):
+    for text in (*advice_on_observations(env.observation_space), *advice_on_actions(env.action_space)):
         found[text] = Finding("warning", text)
     return [*found.values()]
 
@@ -128,8 +125,8 @@ def quick_findings(env: gym.Env) -> list[Finding]:
 
 def _played(env: gym.Env, effort: Effort) -> dict[str, Finding]:
     """Returns what random steps show, by kind."""
-    if not isinstance(env, gym.Env):
-        raise TypeError(f"env must be a gymnasium.Env, got {type(env).__name__}; derive its class from gymnasium.Env")
+    if (fault := validation.environment_fault(env)) is not None:
+        raise TypeError(fault)
     try:
         leaves(env.observation_space)
         random_action(env.action_space, 1, np.random.default_rng(SEED))
@@ -146,10 +143,13 @@ def _play(env: gym.Env, found: dict[str, Finding], effort: Effort) -> list[Seen]
     """Takes random steps and records each kind of problem once. Returns the steps, None if they had to stop."""
     space = env.observation_space
     env.action_space.seed(SEED)
-    if (fault := validation.arguments_fault(env)) is not None:
-        found["seed"] = Finding("error", fault)
-        env = env.unwrapped  # wrappers pass a seed on
-    if _reset(env, found, None if fault else SEED) is None:
+    try:
+        for seed in (SEEDS_END - 1, SEED):  # the largest that a run may choose is taken too
+            validation.called_reset(env, seed)
+    except BadEnvironmentError as error:
+        found["seed"] = Finding("error", str(error))
+        env = env.unwrapped if validation.arguments_fault(env) else env  # wrappers pass a seed on
+    if _reset(env, found) is None:
         with suppress(Exception):  # whatever step raises after a wrong reset
             _check_step(env.step(env.action_space.sample()), space, found)
         return None
@@ -192,10 +192,10 @@ def _play(env: gym.Env, found: dict[str, Finding], effort: Effort) -> list[Seen]
     return seen
 
 
-def _reset(env: gym.Env, found: dict[str, Finding], seed: int | None = None) -> Any:
+def _reset(env: gym.Env, found: dict[str, Finding]) -> Any:
     """Resets the environment and checks its observation, which is returned; None if it is unusable."""
     space = env.observation_space
-    answer = env.reset() if seed is None else env.reset(seed=seed)
+    answer = env.reset()
     if (fault := validation.reset_fault(answer, space)) is not None:
         found.setdefault("reset", Finding("error", fault))
     has_info = isinstance(answer, tuple) and len(answer) == 2 and isinstance(answer[1], dict)
@@ -263,9 +263,10 @@ def _gymnasium_messages(env: gym.Env, skip_render_check: bool) -> list[str]:
             refused = [f"{error}"]
     said = [re.sub(r"\x1b\[[\d;]*m|WARN: ", "", str(one.message)) for one in caught] + refused
     return [
-        f"gymnasium.utils.env_checker: {' '.join(one.split())}{SCALED if 'symmetric and normalized' in one else ''}"
+        f"gymnasium.utils.env_checker: {' '.join(one.split())}"
         for one in dict.fromkeys(said)
         if "different from the unwrapped version" not in one
+        and "symmetric and normalized" not in one  # rejeu scales actions
     ]
 
 
@@ -369,6 +370,17 @@ def _agree(one: Any, two: Any) -> bool:
 
 def _describe_result(result: Any) -> str:
     return f"raised {type(result).__name__}: {result}" if isinstance(result, Exception) else f"{result}"
+
+
+def advice_on_actions(space: spaces.Space) -> Iterator[str]:
+    """Yields advice on unbounded actions, which only some algorithms take."""
+    for part in members(space) if isinstance(space, spaces.Dict | spaces.Tuple) else ():
+        yield from advice_on_actions(part)
+    if isinstance(space, spaces.Box) and not bounded(space).all():
+        yield (
+            f"the actions {space} have no bounds, or practically none; SAC, TD3 and others refuse them, and PPO does not "
+            "scale them: declare the bounds that they really have, such as Box(-1.0, 1.0, ...)"
+        )
 
 
 def advice_on_observations(space: spaces.Space, path: str = "") -> Iterator[str]:

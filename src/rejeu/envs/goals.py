@@ -68,13 +68,19 @@ def over_batches(function: Callable[..., Any], dtype: Any) -> Callable[..., np.n
             single goal.
     """
     vectorized: bool | None = None
+    name = getattr(function, "__name__", "the function of goals")
 
     def by_row(achieved: np.ndarray, desired: np.ndarray, infos: Sequence[Any] | None = None) -> np.ndarray:
         each = [{}] * len(achieved) if infos is None else infos
-        rows = [one_number(function(a, d, info)) for a, d, info in zip(achieved, desired, each, strict=True)]
+        try:
+            rows = [one_number(function(a, d, info)) for a, d, info in zip(achieved, desired, each, strict=True)]
+        except KeyError as error:
+            raise BadEnvironmentError(
+                f"{name} found no key {error}: the info is empty in hindsight replay; let it depend on the goals alone, or "
+                "keep infos with replay_buffer_kwargs={'copy_info_dict': True}"
+            ) from error
         if any(row is None or np.shape(row) != () for row in rows):
             wrong = next(row for row in rows if row is None or np.shape(row) != ())
-            name = getattr(function, "__name__", "the function of goals")
             raise BadEnvironmentError(
                 f"{name} returned {describe_value(wrong)} of one goal, expected one number; rejeu.check_env(env) says more"
             )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import traceback
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -16,6 +17,12 @@ from rejeu.envs.base import SUCCESS_KEYS, Seed, Step, VectorEnv, describe_spec, 
 from rejeu.envs.goals import GoalFunctions
 from rejeu.errors import BadEnvironmentError, WorkerError
 from rejeu.spaces import leaves, plain
+
+SAME_ARRAY = (
+    "the final observations of the first episodes of {} are those of the resets that followed: does it write all of them into "
+    "one array? Return a copy, or make the vector with autoreset_mode=AutoresetMode.DISABLED"
+)
+"""Warning, where an environment overwrites its final observations before they are copied."""
 
 
 class GymnasiumVector(VectorEnv):
@@ -47,6 +54,7 @@ class GymnasiumVector(VectorEnv):
         self._after_reset: Any = None
         self._reset_info: Any = None
         """What the last reset said besides, or the last step that contained one."""
+        self._endings_to_compare = 3
         self._flags = (np.zeros(self.n_envs, bool),) * 2
         """Flags of terminated and of truncated environments that await a reset. All False with automatic resets."""
         self._desynced = np.zeros(self.n_envs, bool)
@@ -85,11 +93,22 @@ class GymnasiumVector(VectorEnv):
             if len(done):
                 obs = jax.tree.map(np.copy, obs)
                 for i in done.tolist():
-                    _put(obs, i, plain(self.observation_space, info["final_obs"][i]))
+                    final = plain(self.observation_space, info["final_obs"][i])
+                    self._compare(final, i)
+                    _put(obs, i, final)
         else:
             self._flags = terminated, truncated
         self._obs = obs
         return Step(obs, reward, terminated, truncated, info)
+
+    def _compare(self, final: Any, i: int) -> None:
+        """Warns if the final observations of the first endings are those of the resets that followed, and not constant."""
+        if self._endings_to_compare:
+            rows = [jax.tree.leaves(jax.tree.map(lambda leaf: leaf[i], one)) for one in (self._after_reset, self._obs)]
+            is_reset, is_last = (all(map(np.array_equal, jax.tree.leaves(final), row)) for row in rows)
+            self._endings_to_compare = self._endings_to_compare - 1 if is_reset and not is_last else 0
+            if is_reset and not is_last and not self._endings_to_compare:
+                warnings.warn(SAME_ARRAY.format(self.env_id), UserWarning, stacklevel=2)
 
     def _step_some(self, action: np.ndarray, active: np.ndarray) -> Step:
         over = (self._flags[0] | self._flags[1]) & ~active

@@ -32,6 +32,8 @@ class InProcess(VectorEnv):
     backend = "gymnasium"
 
     def __init__(self, envs: Sequence[gym.Env], seed: Seed = None, venv: Any = None) -> None:
+        for fault in filter(None, map(validation.environment_fault, envs)):
+            raise TypeError(fault)
         if len({id(env) for env in envs}) < len(envs):
             raise ValueError(
                 "the same environment was given more than once; the function must make a new one each time"
@@ -103,8 +105,6 @@ class InProcess(VectorEnv):
             try:
                 obs, reward[i], terminated[i], truncated[i], info[i] = convert_step(answer)
                 self._put(i, obs)
-                if not isinstance(info[i], dict):
-                    raise TypeError("the info is not a dict")
             except Exception as error:  # any exception of NumPy for a value of the wrong type or shape
                 raise self._bad(i, validation.step_fault(answer, self.observation_space), error) from error
         return Step(self._obs, reward, terminated, truncated, info)

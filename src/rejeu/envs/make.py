@@ -21,10 +21,13 @@ from rejeu.envs.functional.vector import JaxVector
 from rejeu.envs.gymnasium_vector import GymnasiumVector
 from rejeu.envs.in_process import InProcess
 from rejeu.envs.registry import maker, register
+from rejeu.envs.validation import environment_fault
 from rejeu.envs.workers.pool import TIMEOUT, check_options
 from rejeu.envs.workers.remote import Actors
 from rejeu.envs.workers.vector import InWorkers
 
+KINDS = "an id, a Gymnasium environment, a function that makes one or a vector environment"
+"""What the functions that make vector environments take."""
 Backend = Literal["auto", "envpool", "gymnasium", "gymnasium-async", "jax", "ray"]
 BACKENDS: tuple[Backend, ...] = ("auto", "envpool", "gymnasium", "gymnasium-async", "jax", "ray")
 WORKERS: tuple[Backend, ...] = ("gymnasium-async", "ray")
@@ -169,10 +172,7 @@ def _made(
             return InWorkers(env, n_envs, seed, *workers[:4], starter)
         return InProcess([env() for _ in range(n_envs)], seed)
     if not isinstance(env, str):
-        raise TypeError(
-            f"env must be an id, a Gymnasium environment, a function that makes one or a vector environment, got "
-            f"{type(env).__name__}"
-        )
+        raise TypeError(environment_fault(env, KINDS))
     vector = _of_id(env, n_envs, backend, seed, workers, env_kwargs)
     vector.made_from = env, env_kwargs
     return vector

@@ -44,7 +44,9 @@ from rejeu.spaces import Leaf
 OBSERVATION, MASK = "observation", "action_mask"
 """Keys of the observations of :class:`MaskInObservation`."""
 METHOD = "action_masks"
-NO_MASKS = 'does not return action masks; put info["action_mask"] into what reset and step return, or define action_masks()'
+NO_MASKS = (
+    'does not return action masks; put info["action_mask"] into what reset and step return, or define action_masks()'
+)
 
 
 def n_choices(space: spaces.Space, env_id: str) -> int:

@@ -76,7 +76,8 @@ def convert_step(answer: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
     Raises any exception if they are invalid; :func:`step_fault` then describes what is wrong.
     """
     obs, reward, terminated, truncated, info = answer
-    return obs, to_reward(reward), to_bool(terminated), to_bool(truncated), info
+    # A copy of the info, because an environment may empty its only dict at the next reset.
+    return obs, to_reward(reward), to_bool(terminated), to_bool(truncated), {**info}
 
 
 def to_reward(reward: Any) -> float:
@@ -145,15 +146,32 @@ def called_reset(env: gym.Env, seed: int | None = None, options: dict[str, Any] 
     """Returns what ``reset`` returns, given ``seed`` and ``options`` only if they are not None.
 
     Raises:
-        BadEnvironmentError: if it does not accept a seed.
+        BadEnvironmentError: if it does not accept a seed, or not this one.
     """
-    arguments = {key: value for key, value in (("seed", seed), ("options", options)) if value is not None}
+    arguments: dict[str, Any] = {} if options is None else {"options": options}
+    if seed is None:
+        return env.reset(**arguments)
     try:
-        return env.reset(**arguments)  # type: ignore[arg-type]
-    except TypeError as error:
-        if seed is not None and (fault := arguments_fault(env)) is not None:
-            raise BadEnvironmentError(fault) from error
-        raise
+        return env.reset(seed=seed, **arguments)
+    except Exception as error:
+        fault = arguments_fault(env) if isinstance(error, TypeError) else None
+        if fault is None and not _resets(env, arguments):
+            raise
+        raise BadEnvironmentError(
+            fault
+            or f"reset(seed={seed}) raised {type(error).__name__}: {error}, and reset without a seed does not; accept every "
+            "seed from 0 to 2**31 - 2, of which rejeu chose this one, or give one seed for each environment: "
+            "rejeu.make_vector(env, 2, seed=[0, 1])"
+        ) from error
+
+
+def _resets(env: gym.Env, arguments: dict[str, Any]) -> bool:
+    """Returns whether an environment can be reset without a seed."""
+    try:
+        env.reset(**arguments)
+    except Exception:  # whatever it raises
+        return False
+    return True
 
 
 def reset_env(
@@ -232,6 +250,33 @@ def to_vector(name: str, values: Any, n_envs: int, dtype: Any) -> np.ndarray:
         if large.size:
             raise BadEnvironmentError(reward_fault(large[0].item()))
     return kept
+
+
+def environment_fault(env: Any, expected: str = "a gymnasium.Env") -> str | None:
+    """Describes why an object is not a Gymnasium environment."""
+    if isinstance(env, gym.Env):
+        missing = [name for name in ("observation_space", "action_space") if not hasattr(env, name)]
+        return f"{type(env).__name__} has no {' and no '.join(missing)}; set it in __init__" if missing else None
+    name, fix = type(env).__name__, "derive its class from gymnasium.Env"
+    if callable(env):
+        name, fix = (
+            f"the {'class' if isinstance(env, type) else 'function'} {getattr(env, '__name__', name)}",
+            "call it",
+        )
+    elif isinstance(env, str):
+        fix = f"make it: gymnasium.make({env!r:.60})"
+    elif hasattr(env, "possible_agents"):
+        name += ", an environment of several agents as PettingZoo's"
+        fix = "rejeu trains one: derive a class from gymnasium.Env in which one of them acts, and the others are its world"
+    elif hasattr(env, "action_spec"):
+        name += ", as dm_control's"
+        fix = "wrap it: shimmy.DmControlCompatibilityV0(env)"
+    elif hasattr(env, "num_envs") or hasattr(env, "n_envs"):
+        name += ", several environments as one"
+        fix = "give a single one"
+    elif hasattr(env, "reset") and hasattr(env, "step"):
+        fix += ", or wrap it, if it is of the old package gym: shimmy.GymV21CompatibilityV0(env=env)"
+    return f"env must be {expected}, got {name}; {fix}"
 
 
 def arguments_fault(env: gym.Env) -> str | None:

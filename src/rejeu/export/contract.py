@@ -229,7 +229,7 @@ def action_scaler(space: gym.Space) -> Callable[[Array], Array]:
     """Returns :func:`rejeu.spaces.scale_action` in JAX: float32 instead of double precision, int32 instead of int64."""
     shape = (-1, *(space.shape or ()))
     if isinstance(space, gym.spaces.Box):
-        bounded = np.isfinite(space.low) & np.isfinite(space.high)
+        bounded = spaces.bounded(space)
         low, high = (np.where(bounded, one, one.dtype.type(0)).astype(np.float64) for one in (space.low, space.high))
         if space.dtype.kind != "f":
             half, first, dtype = jnp.float32(0.5 * (high - low + 1.0)), jnp.float32(low), spaces.narrow(space.dtype)

@@ -16,7 +16,7 @@ from gymnasium import spaces
 
 from rejeu.io.records import Malformed
 from rejeu.networks import convolutions
-from rejeu.spaces import Leaf
+from rejeu.spaces import Leaf, bounded
 
 EXTRACTORS = ("NatureCNN", "FlattenExtractor", "CombinedExtractor")
 """The feature extractors that have a counterpart here."""
@@ -247,9 +247,9 @@ def actor_critic(policy: Policy, latent: bool) -> Network:
 def in_unit_range(space: spaces.Box) -> Network:
     """Returns the head of a policy in the environment's unit as one in [-1, 1]: as far as actions are bounded."""
     low, high = space.low.ravel().astype(np.float64), space.high.ravel().astype(np.float64)
-    bounded = np.isfinite(low) & np.isfinite(high)
+    is_bounded = bounded(space)
     with np.errstate(invalid="ignore"):
-        half, middle = np.where(bounded, 0.5 * (high - low), 1.0), np.where(bounded, 0.5 * (high + low), 0.0)
+        half, middle = np.where(is_bounded, 0.5 * (high - low), 1.0), np.where(is_bounded, 0.5 * (high + low), 0.0)
     return {
         "weight": lambda view: view.scaled(view.get("action_net.weight").T, 1.0 / half),
         "bias": lambda view: view.scaled(view.shifted(view.get("action_net.bias"), -middle), 1.0 / half),

@@ -133,6 +133,8 @@ def serve(pipe: Connection, make: CloudpickleWrapper, encoder: Encoder) -> None:
     seed_globals(None)  # the fork server has imported NumPy, so that all its children would draw the same
     try:
         env = make.fn()
+        if (fault := validation.environment_fault(env)) is not None:
+            raise TypeError(fault)
         encode = encoder(env.observation_space)
         keep = ToLeaves()(env.observation_space) if isinstance(encoder, ToSharedMemory) else encode
         send(pipe, Description(env.observation_space, env.action_space, env.metadata, env.render_mode))

@@ -135,6 +135,8 @@ class InWorkers(VectorEnv):
         starter: Starter | None = None,
     ) -> None:
         one = make_one()
+        if (fault := validation.environment_fault(one)) is not None:
+            raise TypeError(fault)
         self.observation_space, self.action_space = one.observation_space, one.action_space
         self.env_id, self.max_episode_steps, self.reward_threshold = describe_spec(one)
         one.close()

@@ -409,7 +409,7 @@ def scale(space: gym.Space, action: Array) -> Any:
         if space.dtype.kind != "f":
             levels = jnp.floor(low[None] + (action + 1.0) * (0.5 * (high - low + 1.0))[None])
             return jnp.clip(levels, low[None], high[None]).astype(jax.dtypes.canonicalize_dtype(space.dtype))
-        bounded = np.isfinite(low) & np.isfinite(high)
+        bounded = spaces.bounded(space)
         middle = np.where(bounded, 0.5 * (low + high), 0.0).astype(np.float32)
         half = np.where(bounded, 0.5 * (high - low), 1.0).astype(np.float32)
         scaled = jnp.clip(middle[None] + action * half[None], space.low[None], space.high[None])

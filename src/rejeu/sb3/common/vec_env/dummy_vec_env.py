@@ -8,7 +8,7 @@ from typing import Any
 
 import gymnasium as gym
 
-from rejeu.envs.validation import copy_observation, id_of, reset_env, with_location
+from rejeu.envs.validation import copy_observation, environment_fault, id_of, reset_env, with_location
 from rejeu.envs.workers.process import step_and_reset
 from rejeu.errors import BadEnvironmentError
 from rejeu.sb3.common.vec_env.base_vec_env import Indices, SingleEnvs, StepResult, stacked
@@ -46,6 +46,8 @@ class DummyVecEnv(SingleEnvs):
         if not env_fns:
             raise ValueError("env_fns is empty; give one function for each environment")
         self.envs = [function() for function in env_fns]
+        for fault in filter(None, map(environment_fault, self.envs)):
+            raise TypeError(fault)
         if len({id(env.unwrapped) for env in self.envs}) < len(self.envs):
             raise ValueError("two functions of env_fns returned the same environment; each must make a new one")
         super().__init__(len(self.envs), self.envs[0].observation_space, self.envs[0].action_space)
