@@ -30,10 +30,10 @@ from gymnasium.envs.registration import EnvSpec
 from rejeu import interrupt, spaces
 from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.core import Algorithm, Clock, Metrics, PyTree, averaged_fields, names
+from rejeu.demonstrations import dataset
 from rejeu.envs.masks import for_agent, split
 from rejeu.envs.registry import make_env
 from rejeu.errors import MissingExtra
-from rejeu.io.records import brief
 from rejeu.loops.learner import Learner
 from rejeu.loops.off_policy import STEPS_OFFLINE, learn_from
 from rejeu.networks.batch_renorm import in_training, is_normalized, with_statistics
@@ -103,11 +103,12 @@ def read(path: str | Path) -> Demonstrations:
         MissingExtra: if Minari is not installed.
     """
     try:
-        import minari
+        import h5py  # noqa: F401
     except ImportError:
         raise MissingExtra("reading demonstrations", "minari[hdf5]", "play") from None
     path = Path(path)
-    found = sorted({file.parent for file in path.rglob("metadata.json") if file.parent.name == "data"})
+    files = (file for pattern in (dataset.METADATA, "*.hdf5") for file in path.rglob(pattern))
+    found = sorted({file.parent for file in files if file.parent.name == "data"})
     if not found:
         raise FileNotFoundError(
             f"{path} holds no Minari dataset; give another folder (rejeu resume: --set demonstrations=FOLDER) or None, or "
@@ -116,18 +117,15 @@ def read(path: str | Path) -> Demonstrations:
     if len(found) > 1:
         names = ", ".join(str(one.parent.relative_to(path)) for one in found[:5])
         raise ValueError(f"{path} holds {len(found)} datasets ({names}); give the folder of one of them")
-    try:
-        data = minari.MinariDataset(found[0])
-        episodes = tuple(
-            Episode(e.observations, e.actions, np.asarray(e.rewards, np.float32), bool(e.terminations[-1]))
-            for e in data.iterate_episodes()
-            if len(e.rewards)
-        )
-    except (AssertionError, KeyError, OSError, ValueError) as error:
-        raise ValueError(f"{found[0]} is damaged ({brief(error)}); copy or record it again") from error
+    rows, observation_space, action_space, spec = dataset.read(found[0])
+    episodes = tuple(
+        Episode(obs, actions, np.asarray(rewards, np.float32), bool(terminations[-1]))
+        for obs, actions, rewards, terminations in rows
+        if len(rewards) and len(terminations)
+    )
     if not episodes:
         raise ValueError(f"{path} holds no step; play at least one episode")
-    return Demonstrations(episodes, data.observation_space, data.action_space, data.env_spec)
+    return Demonstrations(episodes, observation_space, action_space, spec)
 
 
 def record(

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import copy
+import json
 import re
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +14,11 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
-from rejeu.envs.rendering import environment_variable
+from rejeu.demonstrations import dataset
 from rejeu.envs.validation import id_of
 from rejeu.errors import MissingExtra
+from rejeu.io import atomic
+from rejeu.io.failed_writes import FailedWrites
 from rejeu.reporting.formatting import counted
 from rejeu.reporting.video import HOLD_SECONDS, VideoFile, ffmpeg
 
@@ -24,9 +28,11 @@ VIDEO_NAME = "video.mp4"
 class Recording:
     """A folder with a Minari dataset and a video of the same episodes. Mutable.
 
-    The folder is a Minari path. The dataset is complete after every episode. It contains the environment's spec, if an
-    environment can be made from it. An aborted episode ends in a truncation; an episode without steps is left out. The
-    video has one frame after each reset and one for each step. The last frame of an episode is shown for half a second.
+    The folder is a Minari path. Every complete episode is on disk, and :func:`rejeu.demonstrations.read` finds it even if the
+    process is killed; Minari itself finds it after :meth:`close`, or :func:`rejeu.demonstrations.dataset.merge`. Episodes that
+    cannot be written wait in memory, with a warning, and are tried again. The dataset contains the environment's spec, if an
+    environment can be made from it. An aborted episode ends in a truncation; an episode without steps is left out. The video
+    has one frame after each reset and one for each step. The last frame of an episode is shown for half a second.
 
     Args:
         folder: new or empty; created with the first episode.
@@ -43,26 +49,35 @@ class Recording:
         try:
             import h5py  # noqa: F401 - Minari's files
             import minari
-            from minari.data_collector.episode_buffer import EpisodeBuffer
+            from minari.serialization import serialize_space
         except ImportError:
             raise MissingExtra("recording", "minari[hdf5]", "play") from None
         if fps is not None:
             ffmpeg()
-        self._minari, self._buffer_type = minari, EpisodeBuffer
         self.folder = Path(folder).absolute()
         if self.folder.exists() and (not self.folder.is_dir() or any(self.folder.iterdir())):
             raise FileExistsError(f"{folder} exists and is not an empty folder; choose another one")
         self.dataset_id = re.sub(r"[^\w/-]", "-", id_of(env)) + f"/{by}-v0"
         self.episodes = 0
         """Number of recorded episodes."""
-        self._description = gym.Env[Any, Any]()
-        """The spec and the spaces, which are all that Minari reads of an environment."""
-        self._description.spec = spec_of(env)
-        self._description.observation_space, self._description.action_space = env.observation_space, env.action_space
-        self._dataset: Any = None
+        self._data = self.folder / self.dataset_id / "data"
+        spec = spec_of(env)
+        self._metadata = {
+            "dataset_id": self.dataset_id,
+            "data_format": "hdf5",
+            "jpeg_encoding": False,  # lossless images
+            "minari_version": minari.__version__,
+            "observation_space": serialize_space(env.observation_space),
+            "action_space": serialize_space(env.action_space),
+            "algorithm_name": by,
+            "description": "Played by hand with rejeu play" if by == "human" else "Played by an agent",
+            **({} if spec is None else dict.fromkeys(("env_spec", "eval_env_spec"), spec.to_json())),
+        }
+        self._writes = FailedWrites("playing" if by == "human" else "the run")
         self._video = None if fps is None else VideoFile(self.folder / VIDEO_NAME, fps)
-        self._by = by
-        self._buffer: Any = None
+        self._seed: int | None = None
+        self._steps: list[tuple[Any, ...]] = []
+        """Of the running episode: ``(obs,)``, then ``(obs, action, reward, terminated, truncated)``."""
         self._frame: Any = None
 
     def __str__(self) -> str:
@@ -71,12 +86,12 @@ class Recording:
         return (
             f"{self.folder}: {counted(self.episodes, 'episode')} in {VIDEO_NAME} and for MINARI_DATASETS_PATH={self.folder}, "
             f"minari.load_dataset({self.dataset_id!r})"
-        )
+        ) + (f"; {lost}" if (lost := self._writes.summary()) else "")
 
     def begin(self, obs: Any, seed: int | None, frame: np.ndarray | None = None) -> None:
         """Starts an episode, and ends a running one as truncated."""
         self._end()
-        self._buffer = self._buffer_type(seed=seed, observations=copy.deepcopy(obs))
+        self._seed, self._steps = seed, [(copy.deepcopy(obs),)]
         self._frame = frame
 
     def step(
@@ -89,21 +104,10 @@ class Recording:
         frame: np.ndarray | None = None,
     ) -> None:
         """Adds a step."""
-        if self._video is not None and frame is not None:
-            if not len(self._buffer):
-                self._video.write(self._frame)
-            self._video.write(frame)
+        if frame is not None:
+            self._show(*([self._frame] if len(self._steps) == 1 else []), frame)
             self._frame = frame
-        self._buffer = self._buffer.add_step_data(
-            {
-                "observation": copy.deepcopy(obs),
-                "action": copy.deepcopy(action),
-                "reward": reward,
-                "terminated": terminated,
-                "truncated": truncated,
-                "info": {},
-            }
-        )
+        self._steps.append((copy.deepcopy(obs), copy.deepcopy(action), reward, terminated, truncated))
         if terminated or truncated:
             self._end()
 
@@ -111,44 +115,45 @@ class Recording:
         """Completes dataset and video. Nothing is written if nothing was played."""
         try:
             self._end()
+            if self._writes.retry() and self.episodes:
+                self._writes.attempt("the dataset", lambda: dataset.merge(self._data), retry=False)
         except BaseException:
             if self._video is not None:
                 self._video.discard()
             raise
         if self._video is not None and self._video.n_frames:
-            self._video.close()
+            self._filmed(self._video.close)
 
     def _end(self) -> None:
-        buffer, self._buffer = self._buffer, None
-        if buffer is None or not len(buffer):
+        steps, self._steps = self._steps, []
+        if len(steps) < 2:
             return
-        if not buffer.terminations[-1]:
-            buffer.truncations[-1] = True
-        if self._dataset is None:
-            self._dataset = self._create(buffer)
-        else:
-            self._dataset.update_dataset_from_buffer([buffer])
+        *most, terminated, truncated = steps[-1]
+        steps[-1] = (*most, terminated, truncated or not terminated)
+        content = dataset.episode(self.episodes, steps, self._seed, {} if self.episodes else self._metadata)
+        self._writes.put("episodes of the recording", self._write, self.episodes, content)
         self.episodes += 1
         if self._video is not None:
-            for _ in range(round(HOLD_SECONDS * self._video.fps)):
-                self._video.write(self._frame)
+            self._show(*[self._frame] * round(HOLD_SECONDS * self._video.fps))
 
-    def _create(self, buffer: Any) -> Any:
-        described = None if self._description.spec is None else self._description
-        with environment_variable("MINARI_DATASETS_PATH", str(self.folder)), warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # for example about the missing author
-            return self._minari.create_dataset_from_buffers(
-                self.dataset_id,
-                [buffer],
-                env=described,
-                eval_env=described,
-                observation_space=self._description.observation_space,
-                action_space=self._description.action_space,
-                algorithm_name=self._by,
-                description="Played by hand with rejeu play" if self._by == "human" else "Played by an agent",
-                data_format="hdf5",
-                jpeg_encoding=False,  # lossless images
-            )
+    def _write(self, i: int, content: bytes) -> None:
+        if not (self._data / dataset.METADATA).exists():
+            text = json.dumps({"total_episodes": 0, "total_steps": 0, **self._metadata})
+            atomic.write(self._data / dataset.METADATA, text)
+        atomic.write(self._data / f"episode_{i}.hdf5", content)
+
+    def _show(self, *frames: np.ndarray) -> None:
+        for frame in frames:
+            if self._video is not None:
+                self._filmed(self._video.write, frame)
+
+    def _filmed(self, write: Callable[..., object], *frame: np.ndarray) -> None:
+        """Calls a method of the video; what cannot be written ends it, with a warning, and the dataset goes on."""
+        try:
+            write(*frame)
+        except OSError as error:
+            warnings.warn(f"{error}; the game and its dataset go on without a video", UserWarning, stacklevel=3)
+            self._video = None
 
 
 def spec_of(env: gym.Env) -> EnvSpec | None:

@@ -1,0 +1,238 @@
+"""Minari datasets in HDF5, read as data: nothing that a file names is imported or opened, and its sizes are those of the file.
+
+A folder ``data`` holds ``metadata.json``, with the spaces, and ``main_data.hdf5``, with a group for each episode. While an
+episode is recorded, those before it are each a file of their own, which is written at once or not at all; :func:`merge` moves
+them into ``main_data.hdf5`` at the end.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import json
+import math
+import re
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.envs.registration import EnvSpec
+
+from rejeu import spaces
+from rejeu.io import atomic
+from rejeu.io.records import WRONG, brief, shown
+
+METADATA, MAIN = "metadata.json", "main_data.hdf5"
+EPISODE = re.compile(r"episode_(\d{1,9})")
+SPACES = ("observation_space", "action_space")
+MOST_METADATA = 16 * 2**20
+"""Upper limit on the bytes of the metadata; the bounds of images are written as numbers."""
+SLACK, ROOM, PACKED, IMAGES = 2**20, 16, 32, 256
+"""How many bytes may be read: a fixed number, and multiples of those of the file, because some disks compress files. Of bytes
+that the file itself has compressed only a part counts, of general ones and of JPEG images."""
+
+
+class Rows:
+    """Reads arrays from the files of a dataset, until more was asked for than they can hold. Mutable."""
+
+    def __init__(self, files: list[Path]) -> None:
+        found = [file.stat() for file in files]
+        self.left = SLACK + ROOM * sum(min(one.st_size, 512 * getattr(one, "st_blocks", one.st_size)) for one in found)
+
+    def part(self, group: Any, path: str, space: gym.Space | None, is_jpeg: bool) -> Any:
+        """Returns a part of an episode: arrays in the structure of a space, or one array."""
+        import h5py
+
+        for name in path.split("/"):
+            if not isinstance(group, h5py.Group) or not isinstance(group.get(name, getlink=True), h5py.HardLink):
+                raise ValueError(f"{shown(path)} is missing, or a link to somewhere else")
+            group = group[name]
+        if isinstance(space, gym.spaces.Dict):
+            return {key: self.part(group, key, one, is_jpeg) for key, one in space.spaces.items()}
+        if isinstance(space, gym.spaces.Tuple):
+            return tuple(self.part(group, f"_index_{i}", one, is_jpeg) for i, one in enumerate(space.spaces))
+        if not isinstance(group, h5py.Dataset) or group.external or group.is_virtual or not group.ndim:
+            raise ValueError(f"{shown(path)} is no array that the file itself holds")
+        shape = () if space is None else space.shape or ()
+        if is_jpeg and len(shape) > 1 and (group.dtype.kind == "O" or group.ndim != 1 + len(shape)):
+            self._take(path, len(group) * math.prod(shape), IMAGES)
+            pictures = np.empty((len(group), *shape), np.uint8)
+            for i, row in enumerate(group):
+                pictures[i] = picture(row, shape)
+            return pictures
+        if group.dtype.kind not in "biuf":
+            raise ValueError(f"{shown(path)} has the dtype {group.dtype}, expected numbers")
+        self._take(path, group.nbytes, PACKED if group.id.get_create_plist().get_nfilters() else 1)
+        return group[()]
+
+    def _take(self, path: str, n: int, packed: int) -> None:
+        self.left -= n // packed
+        if self.left < 0:
+            raise ValueError(f"{shown(path)} has {n:,} bytes, more than the file holds")
+
+
+def read(data: Path) -> tuple[list[tuple[Any, ...]], gym.Space, gym.Space, EnvSpec | None]:
+    """Returns the episodes of a dataset as (observations, actions, rewards, terminations), its two spaces and its spec.
+
+    Warns if the metadata cannot be read and those in the episodes' file are used.
+
+    Raises:
+        ValueError: if the dataset is damaged, on one line.
+    """
+    import h5py
+
+    files = [path for path in (data / MAIN, *parts(data)) if path.is_file()]
+    try:
+        rows, metadata = Rows(files), metadata_of(data, files)
+        if (form := metadata.get("data_format", "hdf5")) != "hdf5":
+            raise ValueError(f"it is in the format {shown(form)}, and only hdf5 is read")
+        most, is_jpeg = max(spaces.MAX_NUMBERS, rows.left), bool(metadata.get("jpeg_encoding", True))
+        both = [spaces.rebuild(described(json.loads(metadata[name])), most) for name in SPACES]
+        keys = dict(zip(("observations", "actions", "rewards", "terminations"), (*both, None, None), strict=True))
+        found: dict[int, tuple[Any, ...]] = {}
+        for path in files:
+            with h5py.File(path, "r") as file:
+                for name in file:
+                    if (match := EPISODE.fullmatch(name)) and (i := int(match[1])) not in found:
+                        found[i] = tuple(
+                            rows.part(file, f"{name}/{key}", space, is_jpeg) for key, space in keys.items()
+                        )
+        return [found[i] for i in sorted(found)], both[0], both[1], spec_of(metadata.get("env_spec"))
+    except (*WRONG, OSError, RuntimeError) as error:
+        problem = f"{atomic.shortened(data)} is damaged or of another kind ({brief(error)})"
+        raise ValueError(f"{problem}; copy or record it again") from error
+
+
+def metadata_of(data: Path, files: list[Path]) -> Mapping[str, Any]:
+    """Returns the metadata of a dataset; where they are damaged those of its episodes' file, with a warning."""
+    import h5py
+
+    try:
+        if not (data / METADATA).is_file():
+            raise ValueError(f"{METADATA} is missing")
+        with (data / METADATA).open("rb") as file:
+            found = json.loads(file.read(MOST_METADATA))
+        if not isinstance(found, dict) or not found.keys() >= {*SPACES}:
+            raise ValueError(f"{METADATA} does not describe the spaces")
+        return found
+    except (ValueError, RecursionError) as error:
+        for path in files:
+            with h5py.File(path, "r") as file:
+                if file.attrs.keys() >= {*SPACES}:
+                    where = atomic.shortened(data / METADATA)
+                    warnings.warn(f"{where} is damaged ({brief(error)}); {path.name} is read without it", stacklevel=4)
+                    return dict(file.attrs)
+        raise
+
+
+def parts(data: Path) -> list[Path]:
+    """Returns the files of the episodes that are not in the main file yet."""
+    return sorted(data.glob("episode_*.hdf5"))
+
+
+def described(space: Any) -> Any:
+    """Returns Minari's description of a space as one of :func:`rejeu.spaces.describe`."""
+    kind = space["type"]
+    if kind == "Dict":
+        return {kind: {key: described(one) for key, one in space["subspaces"].items()}}
+    if kind == "Tuple":
+        return {kind: [described(one) for one in space["subspaces"]]}
+    if kind == "MultiBinary":
+        return {kind: {"shape": np.ravel(space["n"]).tolist()}}
+    return {kind: {"start": 0, **space}}
+
+
+def spec_of(text: str | None) -> EnvSpec | None:
+    """Returns the spec of an environment, also one that another version of Gymnasium wrote; it names code, and runs none."""
+    if text is None:
+        return None
+    known = {field.name for field in dataclasses.fields(EnvSpec) if field.init}
+    given = {key: value for key, value in json.loads(text).items() if key in known}
+    return EnvSpec.from_json(json.dumps({"additional_wrappers": [], **given}))
+
+
+def picture(data: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """Returns the image of a JPEG file, ``uint8`` of this shape."""
+    from PIL import Image
+
+    try:
+        image = Image.open(io.BytesIO(bytes(data)), formats=["JPEG"])
+    except Image.DecompressionBombError as error:
+        raise ValueError(str(error)) from None
+    if image.size != shape[1::-1]:
+        raise ValueError(f"an image has the size {image.size}, expected {shape[1::-1]}")
+    return np.asarray(image).reshape(shape)
+
+
+def episode(i: int, steps: list[tuple[Any, ...]], seed: int | None, metadata: Mapping[str, Any]) -> bytes:
+    """Returns the file of an episode: ``(obs,)`` of the reset, then ``(obs, action, reward, terminated, truncated)``."""
+    import h5py
+
+    content = io.BytesIO()
+    with h5py.File(content, "w", libver="latest") as file:  # of which attributes can be large
+        file.attrs.update(metadata)
+        group = file.create_group(f"episode_{i}")
+        group.attrs.update({"id": i, "total_steps": len(steps) - 1, **({} if seed is None else {"seed": seed})})
+        obs, *others = zip(*steps[1:], strict=True)
+        put(group, "observations", [steps[0][0], *obs])
+        for name, column in zip(("actions", "rewards", "terminations", "truncations"), others, strict=True):
+            put(group, name, column)
+    return content.getvalue()
+
+
+def put(group: Any, name: str, rows: Sequence[Any]) -> None:
+    """Adds rows to a file in Minari's layout: a dict or tuple is a group, everything else an array."""
+    first = rows[0]
+    if isinstance(first, Mapping | tuple):
+        within = group.create_group(name)
+        for key in range(len(first)) if isinstance(first, tuple) else first:
+            put(within, f"_index_{key}" if isinstance(first, tuple) else str(key), [row[key] for row in rows])
+    else:
+        group.create_dataset(name, data=list(rows) if isinstance(first, str) else np.stack(rows))
+
+
+class Sink(io.FileIO):
+    """A file for HDF5, which ends the process where a write fails; here the first error is kept for later. Mutable."""
+
+    error: OSError | None = None
+
+    def write(self, content: Any) -> int:
+        """Writes all of it, or nothing after an error."""
+        rest = memoryview(content).cast("B")
+        try:
+            while rest and self.error is None:
+                rest = rest[super().write(rest) :]
+        except OSError as error:
+            self.error = error
+        return len(content)
+
+
+def merge(data: Path) -> None:
+    """Moves recorded episodes into the main file and counts them, as Minari reads them; may be called again after a crash.
+
+    Raises:
+        OSError: if that cannot be written; the episodes are then where they were.
+    """
+    import h5py
+
+    waiting = parts(data)
+    sources = [path for path in (data / MAIN, *waiting) if path.is_file()]
+    with atomic.replacing(data / MAIN) as replaced, Sink(replaced.name, "r+b") as sink:
+        with h5py.File(sink, "w", libver="latest", track_order=True) as file:
+            for path in sources:
+                with h5py.File(path, "r") as source:
+                    file.attrs.update(source.attrs)
+                    for name in sorted(source.keys() - file.keys(), key=lambda name: int(name.rpartition("_")[2])):
+                        source.copy(name, file)
+            steps = [int(group.attrs["total_steps"]) for group in file.values()]
+        if sink.error is not None:
+            raise sink.error
+    metadata = json.loads((data / METADATA).read_text(encoding="utf-8"))
+    metadata |= {"total_episodes": len(steps), "total_steps": sum(steps)}
+    metadata["dataset_size"] = round((data / MAIN).stat().st_size / 1e6, 1)
+    atomic.write(data / METADATA, json.dumps(metadata))
+    for path in waiting:
+        path.unlink()
