@@ -22,7 +22,6 @@ from rejeu.sb3 import A2C, DDPG, DQN, PPO, SAC, TD3, HerReplayBuffer
 from rejeu.sb3.common import callbacks as cb
 from rejeu.sb3.common.env_checker import check_env
 from rejeu.sb3.common.env_util import make_atari_env, make_vec_env
-from rejeu.sb3.common.envs import BitFlippingEnv, FakeImageEnv, SimpleMultiObsEnv
 from rejeu.sb3.common.evaluation import evaluate_policy
 from rejeu.sb3.common.logger import Figure, HParam, Image, TensorBoardOutputFormat, Video, configure
 from rejeu.sb3.common.monitor import Monitor
@@ -39,6 +38,7 @@ from rejeu.sb3.common.vec_env import (
     VecNormalize,
     VecVideoRecorder,
 )
+from tests.sb3.envs import BitFlippingEnv, FakeImageEnv, InvalidActionEnvDiscrete, SimpleMultiObsEnv
 
 
 @dataclass(frozen=True)
@@ -719,7 +719,6 @@ def trpo():
 @example("sb3-contrib")
 def masks():
     from rejeu.sb3_contrib import MaskablePPO
-    from rejeu.sb3_contrib.common.envs import InvalidActionEnvDiscrete
     from rejeu.sb3_contrib.common.maskable.evaluation import evaluate_policy as evaluate_by_masks
     from rejeu.sb3_contrib.common.maskable.utils import get_action_masks
     from rejeu.sb3_contrib.common.wrappers import ActionMasker

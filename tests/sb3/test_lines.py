@@ -15,9 +15,9 @@ from gymnasium import spaces
 
 from rejeu import sb3
 from rejeu.algorithms import a2c, optimizers
-from rejeu.sb3.common import base_class, distributions, envs, logger as loggers, save_util, torch_layers, utils
+from rejeu.sb3.common import base_class, distributions, logger as loggers, save_util, torch_layers, utils
 from rejeu.sb3.common.atari_wrappers import AtariWrapper
-from rejeu.sb3.common.buffers import DictReplayBuffer, DictRolloutBuffer, HerReplayBuffer, ReplayBuffer
+from rejeu.sb3.common.buffers import HerReplayBuffer
 from rejeu.sb3.common.callbacks import LogEveryNTimesteps
 from rejeu.sb3.common.env_util import make_atari_env, make_vec_env
 from rejeu.sb3.common.monitor import ResultsWriter, load_results
@@ -28,9 +28,9 @@ from rejeu.sb3.common.preprocessing import (
     is_image_space,
     preprocess_obs,
 )
-from rejeu.sb3.common.type_aliases import DictReplayBufferSamples
 from rejeu.sb3.common.vec_env import DummyVecEnv, VecNormalize, VecTransposeImage, is_vecenv_wrapped
 from rejeu.sb3.common.vec_env.base_vec_env import VecEnvWrapper
+from tests.sb3 import envs
 
 SMALL = {"policy_kwargs": {"net_arch": [8]}}
 
@@ -201,48 +201,6 @@ def test_squashed_actions_stay_in_their_bounds():
     assert 1.9 < np.abs(actions).max() <= 2.0  # of Pendulum
 
 
-@pytest.mark.parametrize("nested", [False, True])
-def test_replay_buffers_by_hand(nested):
-    box = spaces.Box(-1, 1, (2,), np.float32)
-    space = spaces.Dict({"a": box, "b": spaces.Discrete(3)}) if nested else box
-    kind = DictReplayBuffer if nested else ReplayBuffer
-    buffer = kind(10, space, box, device="auto", n_envs=2, optimize_memory_usage=False, handle_timeout_termination=True)
-    show = lambda i: {"a": np.full((2, 2), i / 10), "b": np.full((2,), i % 3)} if nested else np.full((2, 2), i / 10)  # noqa: E731
-    for i in range(7):
-        infos = [{"TimeLimit.truncated": i == 3}, {}]
-        buffer.add(show(i), show(i + 1), np.full((2, 2), 0.5), np.array([i, -i]), np.full(2, i == 3), infos)
-    assert (buffer.buffer_size, buffer.size(), buffer.pos, buffer.full) == (5, 5, 2, True)
-    batch = buffer.sample(200)
-    first, following = (part["a"] if nested else part for part in (batch.observations, batch.next_observations))
-    np.testing.assert_allclose(following - first, 0.1, atol=1e-6)
-    np.testing.assert_allclose(np.abs(batch.rewards[:, 0]), 10 * first[:, 0], atol=1e-5)
-    ends = np.isclose(first[:, 0], 0.3)
-    assert ends.any()
-    assert (
-        batch.dones[:, 0] == (ends & (batch.rewards[:, 0] < 0))
-    ).all()  # the first environment's end was a time limit
-    assert batch.actions.dtype == np.float32
-    assert isinstance(batch, DictReplayBufferSamples) == nested
-    env = VecNormalize(DummyVecEnv([lambda: gym.make("Pendulum-v1")]), norm_obs=False)
-    env.ret_rms.var = np.array(4.0)
-    np.testing.assert_allclose(np.abs(buffer.sample(50, env=env).rewards).max(), 3.0, atol=1.0)
-
-
-def test_rollouts_of_dicts_are_drawn_in_minibatches():
-    box = spaces.Box(-1, 1, (2,), np.float32)
-    buffer = DictRolloutBuffer(4, spaces.Dict({"a": box}), spaces.Discrete(3), gae_lambda=0.9, gamma=0.5, n_envs=2)
-    for i in range(4):
-        buffer.add(
-            {"a": np.full((2, 2), i / 10)}, np.array([i % 3] * 2), np.ones(2), np.zeros(2), np.zeros(2), np.zeros(2)
-        )
-    buffer.compute_returns_and_advantage(np.zeros(2), np.ones(2))
-    parts = [*buffer.get(4)]
-    assert [part.observations["a"].shape for part in parts] == [(4, 2)] * 2
-    # With values of 0 an advantage is the sum of the rewards that follow, discounted by gamma lambda = 0.45.
-    expected = {round(sum(0.45**k for k in range(4 - i)), 5) for i in range(4)}
-    assert {round(float(one), 5) for part in parts for one in part.advantages} == expected
-
-
 def test_attributes_of_agents():
     model = sb3.DQN("MlpPolicy", "CartPole-v1", learning_rate=1e-3, batch_size=16, learning_starts=8, **SMALL)
     assert (model.gamma, model.learning_rate, model.batch_size, model.lr_schedule(0.5)) == (0.99, 1e-3, 16, 1e-3)
@@ -400,11 +358,8 @@ LINES = {
     "policy_kwargs: use_expln": "test_expln_continues_the_exponential_smoothly",
     "policy_kwargs: squash_output": "test_squashed_actions_stay_in_their_bounds",
     "policy classes of one's own": "test_a_policy_class_of_ones_own_sets_the_layers",
-    "buffers: ReplayBuffer, DictReplayBuffer": "test_replay_buffers_by_hand",
-    "buffers: NStepReplayBuffer": "test_n_step_returns_stop_where_episodes_end",
-    "buffers: RolloutBuffer": "test_rollout_buffer_computes_advantages_by_the_recursion",
-    "buffers: DictRolloutBuffer": "test_rollouts_of_dicts_are_drawn_in_minibatches",
-    "buffers: HerReplayBuffer": "test_hindsight_by_hand_gives_goals_that_were_reached",
+    "buffers: what a replay buffer shows, draws and is set to": "test_everything_of_a_replay_buffer_works_on_agents",
+    "buffers: what a rollout buffer shows": "test_everything_of_a_rollout_buffer_works_on_agents",
     "buffers: copy_info_dict": "test_rewards_of_new_goals_are_computed_from_the_infos_of_their_steps",
     "buffers: handle_timeout_termination": "test_time_limits_are_terminal_without_handle_timeout_termination",
     "model.policy": "test_policy_parts_agree_with_the_agent",
@@ -425,7 +380,6 @@ LINES = {
     "callbacks: functions of locals and globals": "test_functions_as_callbacks_take_locals_and_globals",
     "logger": "test_logger_formats",
     "env_checker": "test_the_checker_states_the_difference",
-    "envs": "test_environments_pass_the_checker_without_warnings",
     "atari_wrappers, make_atari_env": "test_atari_wrappers_by_a_game_that_is_none",
     "preprocessing": "test_observations_are_prepared_by_their_spaces",
     "save_util": "test_files_by_path_or_open",

@@ -117,8 +117,6 @@ class Original(Agent):
     Hyperparameters are attributes (``model.gamma``) that can be set, which compiles the agent again.
     """
 
-    replaced_buffer: Any = None
-    """What was assigned to ``replay_buffer``; None: the agent's own is shown."""
     exploration_rate_set: float | None = None
     """What was assigned to ``exploration_rate``."""
     has_own_logger: bool = False
@@ -283,33 +281,26 @@ class Original(Agent):
         """The replay buffer with Stable-Baselines3's attributes; ``run.replay`` is the one that batches are drawn from."""
         if not isinstance(self, OffPolicyAgent) or "replay_buffer_deleted" in self.__dict__:
             raise AttributeError(f"{self.name} has no replay buffer")
-        if self.replaced_buffer is not None:
-            return self.replaced_buffer
-        is_her = self.config.hindsight is not None
-        kind = buffers.HerReplayBuffer if is_her else buffers.ReplayBuffer
-        if isinstance(self.observation_space, gym.spaces.Dict) and not is_her:
-            kind = buffers.DictReplayBuffer
-        if self.config.n_steps > 1 and not is_her:
-            kind = buffers.NStepReplayBuffer
-        shown = kind.of(self)
-        shown.__dict__.update(n_steps=self.config.n_steps, gamma=self.config.gamma)
-        return shown
+        is_her, kind = self.config.hindsight is not None, buffers.ReplayBuffer
+        if isinstance(self.observation_space, gym.spaces.Dict):
+            kind = buffers.HerReplayBuffer if is_her else buffers.DictReplayBuffer
+        return (buffers.NStepReplayBuffer if self.config.n_steps > 1 and not is_her else kind).of(self)
 
     @replay_buffer.setter
     def replay_buffer(self, value: Any) -> None:
+        if not isinstance(value, buffers.ReplayBuffer):
+            raise TypeError(f"replay_buffer={value!r:.60} must be the replay buffer of an agent, or a copy of it")
         self.__dict__.pop("replay_buffer_deleted", None)
-        if isinstance(value, buffers.ReplayBuffer) and value.core is not self.run.replay:
-            self.run.replay = self.make_buffer(self.run.env)
-            self.replaced_buffer = None
-            order = [*range(value.pos, value.buffer_size), *range(value.pos)] if value.full else range(value.pos)
-            own = self.replay_buffer
-            for i in order:
-                infos = [{"TimeLimit.truncated": bool(timeout)} for timeout in value.timeouts[i]]
-                obs, following = (
-                    buffers.by_leaf(lambda leaf, i=i: leaf[i], part)
-                    for part in (value.observations, value.next_observations)
-                )
-                own.add(obs, following, value.actions[i], value.rewards[i], value.dones[i], infos)
+        if value.core is self.run.replay:
+            return
+        steps = [getattr(value, name) for name in value.SHOWN]
+        self.run.replay = self.make_buffer(self.run.env)
+        own = self.replay_buffer
+        for i in range(value.size()):
+            obs, following, action, reward, done, timeout = (
+                buffers.by_leaf(lambda leaf, i=i: leaf[i], part) for part in steps
+            )
+            own.add(obs, following, action, reward, done, [{"TimeLimit.truncated": bool(one)} for one in timeout])
 
     @replay_buffer.deleter
     def replay_buffer(self) -> None:
@@ -329,23 +320,26 @@ class Original(Agent):
         if isinstance(self, OffPolicyAgent):
             raise AttributeError(f"{self.name} has no rollout buffer")
         shape = (core.n_steps, core.n_envs)
-        shown = buffers.RolloutBuffer(shape[0], self.observation_space, self.action_space, n_envs=shape[1])
+        is_dict = isinstance(self.observation_space, gym.spaces.Dict)
+        shown = (buffers.DictRolloutBuffer if is_dict else buffers.RolloutBuffer).of(self)
+        (shown.buffer_size, shown.n_envs), shown.gamma = shape, self.config.gamma
+        shown.gae_lambda = getattr(self.config, "gae_lambda", 1.0)
         shown.pos = core.length or int(core.valid.any(axis=1).sum())
         shown.full = shown.pos == core.n_steps
         obs, next_obs = (jax.tree.unflatten(core.obs_structure, leaves) for leaves in (core.obs, core.next_obs))
         valid = core.valid & (np.arange(core.n_steps) < shown.pos)[:, None]
         seen = Rollout(obs, core.action, core.reward, next_obs, core.discount, core.ended, valid, (), (), ())
         seen = jax.tree.map(np.copy, seen)
-        shown.observations, shown.rewards, shown.actions = seen.obs, seen.reward, seen.action.reshape(*shape, -1)
-        shown.episode_starts[0] = core.started if core.length else core.previously_started
-        shown.episode_starts[1:] = seen.ended[:-1]
+        shown.observations, shown.rewards = buffers.by_leaf(buffers.fixed, seen.obs), buffers.fixed(seen.reward)
+        shown.actions = buffers.fixed(seen.action.reshape(*shape, -1))
+        first = core.started if core.length else core.previously_started
+        shown.episode_starts = buffers.fixed(np.concatenate([first[None], seen.ended[:-1]]).astype(np.float32))
         network = getattr(self.state, "network", None)
         if not isinstance(network, ActorCritic):
-            del shown.log_probs, shown.values, shown.advantages, shown.returns
             return shown
         found = samples(network, jax.tree.map(jnp.asarray, seen), self.config.gae_lambda)
         shown.log_probs, shown.values, shown.advantages, shown.returns = (
-            np.where(valid, np.reshape(x, shape), 0.0) for x in found[2:6]
+            buffers.fixed(np.where(valid, np.reshape(x, shape), 0.0)) for x in found[2:6]
         )
         return shown
 

@@ -92,7 +92,7 @@ def convert_buffer(settings: dict[str, Any]) -> None:
         if kind.__name__ not in REPLAY_BUFFERS and kind.__module__ != buffers.__name__:
             raise TypeError(
                 f"replay_buffer_class={kind.__name__}: a class of your own derives from rejeu.buffers.ReplayBuffer, "
-                "which stores every observation once; the classes of rejeu.sb3.common.buffers are for use by hand"
+                "which stores every observation once; the classes of rejeu.sb3.common.buffers show an agent's"
             )
         if kind is buffers.NStepReplayBuffer:
             settings["n_steps"] = given.pop("n_steps", settings.get("n_steps", 3))

@@ -20,7 +20,6 @@ from rejeu.sb3 import define
 from rejeu.sb3.algorithms import ARS, QRDQN, TQC, TRPO, CrossQ, MaskablePPO, RecurrentPPO
 from rejeu.sb3.common import distributions
 from rejeu.sb3.common.callbacks import EvalCallback
-from rejeu.sb3.common.envs import InvalidActionEnvDiscrete, InvalidActionEnvMultiBinary, InvalidActionEnvMultiDiscrete
 from rejeu.sb3.common.evaluation import evaluate_policy as evaluate_by_masks
 from rejeu.sb3.common.policies import ActorCriticPolicy, CnnPolicy, MlpPolicy, MultiInputPolicy
 from rejeu.sb3.common.vec_env.base_vec_env import VecEnv
@@ -152,14 +151,6 @@ def is_masking_supported(env: Any) -> bool:
 
 MODULES: dict[str, dict[str, Any]] = {
     "common": {},
-    "common.envs": {
-        one.__name__: one
-        for one in (InvalidActionEnvDiscrete, InvalidActionEnvMultiBinary, InvalidActionEnvMultiDiscrete)
-    },
-    "common.envs.invalid_actions_env": {
-        one.__name__: one
-        for one in (InvalidActionEnvDiscrete, InvalidActionEnvMultiBinary, InvalidActionEnvMultiDiscrete)
-    },
     "common.wrappers": {"ActionMasker": ActionMasker, "TimeFeatureWrapper": TimeFeatureWrapper},
     "common.wrappers.action_masker": {"ActionMasker": ActionMasker},
     "common.wrappers.time_feature": {"TimeFeatureWrapper": TimeFeatureWrapper},

@@ -8,21 +8,6 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from rejeu.sb3 import alias
-
-__all__ = [
-    "BitFlippingEnv",
-    "FakeImageEnv",
-    "IdentityEnv",
-    "IdentityEnvBox",
-    "IdentityEnvMultiBinary",
-    "IdentityEnvMultiDiscrete",
-    "InvalidActionEnvDiscrete",
-    "InvalidActionEnvMultiBinary",
-    "InvalidActionEnvMultiDiscrete",
-    "SimpleMultiObsEnv",
-]
-
 
 class IdentityEnv(gym.Env):
     """The action must equal the observation, for a reward of 1; observations are random.
@@ -75,20 +60,6 @@ class IdentityEnvBox(IdentityEnv):
         return float(np.all(np.abs(self.state - action) <= self.eps))
 
 
-class IdentityEnvMultiDiscrete(IdentityEnv):
-    """The same with two choices among ``dim``."""
-
-    def __init__(self, dim: int = 1, ep_length: int = 100) -> None:
-        super().__init__(space=spaces.MultiDiscrete([dim, dim]), ep_length=ep_length)
-
-
-class IdentityEnvMultiBinary(IdentityEnv):
-    """The same with ``dim`` bits."""
-
-    def __init__(self, dim: int = 1, ep_length: int = 100) -> None:
-        super().__init__(space=spaces.MultiBinary(dim), ep_length=ep_length)
-
-
 class InvalidActionEnv(IdentityEnv):
     """An :class:`IdentityEnv` that allows the right action and all others but ``n_invalid_actions``. Abstract."""
 
@@ -114,22 +85,6 @@ class InvalidActionEnvDiscrete(InvalidActionEnv):
     def __init__(self, dim: int | None = None, ep_length: int = 100, n_invalid_actions: int = 0) -> None:
         dim = 1 if dim is None else dim
         super().__init__(spaces.Discrete(dim), [dim], n_invalid_actions, ep_length)
-
-
-class InvalidActionEnvMultiDiscrete(InvalidActionEnv):
-    """Several choices among ``dims``, of whose options ``n_invalid_actions`` are masked."""
-
-    def __init__(self, dims: list[int] | None = None, ep_length: int = 100, n_invalid_actions: int = 0) -> None:
-        dims = [1, 1] if dims is None else list(dims)
-        super().__init__(spaces.MultiDiscrete(dims), dims, n_invalid_actions, ep_length)
-
-
-class InvalidActionEnvMultiBinary(InvalidActionEnv):
-    """``dims`` bits, of whose values ``n_invalid_actions`` are masked: two for each, 0 and 1."""
-
-    def __init__(self, dims: int | None = None, ep_length: int = 100, n_invalid_actions: int = 0) -> None:
-        dims = 1 if dims is None else dims
-        super().__init__(spaces.MultiBinary(dims), [2] * dims, n_invalid_actions, ep_length)
 
 
 class FakeImageEnv(gym.Env):
@@ -308,6 +263,3 @@ class SimpleMultiObsEnv(gym.Env):
     def render(self) -> None:
         """Prints the number of the cell."""
         print(self.state)
-
-
-alias(__name__, "bit_flipping_env", "identity_env", "multi_input_envs")
