@@ -52,7 +52,16 @@ class OffPolicyAgent(Agent):
         return self.run.replay
 
     def save_replay_buffer(self, path: str | Path) -> Path:
-        """Writes the replay buffer to one safetensors file and returns its path."""
+        """Writes the replay buffer to one safetensors file and returns its path.
+
+        Raises:
+            ValueError: if the agent has no steps to write, and there is such a file: that of an earlier buffer, perhaps.
+        """
+        if (self.run.replay is None or not self.run.replay.size()) and checkpoint.resolve(path).exists():
+            raise ValueError(
+                f"{path} exists, and the replay buffer of this {self.name} is empty; load_replay_buffer comes first, or give "
+                "another path"
+            )
         header = {
             "observation_space": spaces.describe(self.observation_space),
             "action_space": spaces.describe(self.action_space),

@@ -264,7 +264,7 @@ def common_stops(
 
 def reason_against(agent: Agent, callbacks: Sequence[Callback]) -> str | None:
     """Returns why an agent cannot be trained with others in one program, None if it can."""
-    assert agent.env is not None
+    assert agent.run.env is not None
     if isinstance(agent.config, OffPolicyConfig) and not isinstance(agent.config.train_freq, int):
         return f"updates depend on episodes (train_freq={agent.config.train_freq!r})"
     return device.reason_against(agent, callbacks)

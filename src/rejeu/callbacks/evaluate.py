@@ -97,7 +97,7 @@ class Evaluate(TrainingCallback):
             ValueError: if the environments are those that the agent trains on.
             Stopped: if Ctrl-C or SIGTERM asks training to stop.
         """
-        if agent.env is not None and agent.env.identities() & self.env.identities():
+        if agent.run.env is not None and agent.run.env.identities() & self.env.identities():
             raise ValueError("Evaluate was given the environments that the agent trains on; give it others, or an id")
         self._is_due = True
         root = agent.seed if self.seed is None else self.seed

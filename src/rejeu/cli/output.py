@@ -89,7 +89,7 @@ def as_dict(
     seconds, compile_seconds = stopwatch.seconds()
     return {
         "run": folder.path,
-        "env_id": None if agent.env is None else agent.env.env_id,
+        "env_id": None if agent.run.env is None else agent.run.env.env_id,
         "algorithm": agent.name,
         "seed": agent.seed,
         "complete": is_complete,

@@ -273,7 +273,7 @@ def saved_at_exit(agent: Agent, folder: RunFolder, evaluate: Evaluate) -> Iterat
 
 def write_arrivals(agent: Agent, folder: RunFolder) -> None:
     """Writes the order in which the results of environments were taken, if they did not wait for each other."""
-    if agent.env is not None and (arrivals := agent.env.arrivals) is not None:
+    if agent.run.env is not None and (arrivals := agent.run.env.arrivals) is not None:
         write = partial(write_order, folder, arrivals)
         agent.failed_writes.attempt(f"order of arrival {folder.arrivals}", write)
 

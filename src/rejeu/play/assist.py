@@ -148,7 +148,7 @@ class Assist(TrainingCallback):
         """Checks the agent; the window opens after the first step, when there is something to show."""
         check(agent)
         if self.folder is not None:
-            self.recording = Recording(self.folder, agent.env.envs[0], None)  # type: ignore[union-attr]
+            self.recording = Recording(self.folder, agent.run.env.envs[0], None)
 
     def __call__(self, agent: Agent, progress: Progress) -> None:
         """Records the step that was taken, and replaces the action of the next one if a key is held."""
@@ -188,11 +188,11 @@ def check(agent: Agent) -> None:
         raise ValueError(
             f"nobody can take over from {agent.name}, because {why}; use an algorithm with a replay buffer, as SAC"
         )
-    if not isinstance(agent.env, InProcess) or agent.n_envs != 1:
+    if not isinstance(agent.run.env, InProcess) or agent.n_envs != 1:
         raise ValueError(
-            f"taking over needs one environment of the backend gymnasium, got {agent.n_envs} of {agent.env.backend}"  # type: ignore
+            f"taking over needs one environment of the backend gymnasium, got {agent.n_envs} of {agent.run.env.backend}"
         )
-    keys_for(agent.env.env_id, agent.action_space)
+    keys_for(agent.run.env.env_id, agent.action_space)
     Window("").close()
 
 

@@ -195,11 +195,16 @@ def evaluate(
         obs = env.reset_done(done) if done.any() and to_play.any() else step.obs
     returns, lengths, successes = zip(*rows, strict=True)
     if cut:
-        warnings.warn(
-            f"{counted(cut, 'episode')} of an evaluation did not end in {MOST_STEPS:,} steps and "
-            f"{'was' if cut == 1 else 'were'} cut off; give the environment a time limit: "
-            "gymnasium.register(..., max_episode_steps=1000)",
-            UserWarning,
-            stacklevel=2,
-        )
+        cut_off(cut)
     return Evaluation(np.array(returns), np.array(lengths), np.array(successes), cut)
+
+
+def cut_off(n: int) -> None:
+    """Warns that ``n`` episodes of an evaluation did not end."""
+    warnings.warn(
+        f"{counted(n, 'episode')} of an evaluation did not end in {MOST_STEPS:,} steps and "
+        f"{'was' if n == 1 else 'were'} cut off; give the environment a time limit: "
+        "gymnasium.register(..., max_episode_steps=1000)",
+        UserWarning,
+        stacklevel=3,
+    )

@@ -233,7 +233,7 @@ def rendering_env(agent: Any, env: Any) -> gym.Env:
                 f"{type(made).__name__}"
             )
         return made
-    vector = agent.env
+    vector = agent.run.env
     if vector is None:
         raise ValueError("this agent has no environment; pass one: record_video(agent, path, env='parking-v0')")
     if vector.wrapped_by is not None:

@@ -14,7 +14,6 @@ import warnings
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, ClassVar, Self
@@ -35,6 +34,7 @@ from rejeu.algorithms.config import REPLAY_BUFFERS
 from rejeu.callbacks.base import Callback, TrainingCallback
 from rejeu.core import Rollout
 from rejeu.envs.masks import split
+from rejeu.envs.registry import register
 from rejeu.envs.wrappers import TimeLimitTerminates
 from rejeu.errors import CheckpointError
 from rejeu.exploration.noise import ActionNoise
@@ -103,6 +103,10 @@ SHAPING = {
 """Hyperparameters that the arrays of a file depend on."""
 
 
+OUTPUTS = {"verbose": int, "tensorboard_log": str}
+"""Attributes that say where statistics go, which every file has, with their types."""
+
+
 class Refused(ValueError, AssertionError):
     """A setting or a space that an algorithm does not take: scripts catch either error."""
 
@@ -155,6 +159,8 @@ class Original(Agent):
         if made is not None:
             made.model, made.observation_space, made.action_space = self, self.observation_space, self.action_space
             self.policy_object = made
+        if settings.get("seed") is not None:
+            utils.set_random_seed(self.seed)
 
     @staticmethod
     def _prepared(kind: type[Any], env: Any, settings: dict[str, Any]) -> tuple[Any, str, BasePolicy | None]:
@@ -227,7 +233,7 @@ class Original(Agent):
             AttributeError: for what is computed from something else, such as a network.
             ValueError: for a hyperparameter that networks or buffer depend on.
         """
-        config = self.__dict__.get("config")
+        config: Any = self.__dict__.get("config")
         known = () if config is None or name in self.STORED else validation.field_names(type(config))
         if name in known:
             if "run" in self.__dict__:
@@ -344,11 +350,21 @@ class Original(Agent):
         return shown
 
     def make_envs(self, env: Any, *args: Any, **kwargs: Any) -> Any:
-        """Returns vector environments; of those that :meth:`get_env` returned, the images as they were given before."""
+        """Returns vector environments; an id is made with ``render_mode="rgb_array"`` in a ``Monitor``.
+
+        Of those that :meth:`get_env` returned, the images are as they were given before.
+        """
         mine = self.__dict__.get("observation_space")
+        if isinstance(env, str) and args in ((), (1,)) and {*kwargs} <= {"seed"} and register(env):
+            env = make_vec_env(env)  # as the original: Gymnasium's, which can be rendered to images
         if isinstance(env, VecTransposeImage) and mine is not None and env.venv.observation_space == mine:
             env = env.venv
         return super().make_envs(env, *args, **kwargs)  # type: ignore[safe-super]
+
+    @property
+    def env(self) -> Any:
+        """The training environments, as :meth:`get_env` returns them; ``run.env`` is rejeu's vector environment."""
+        return self.get_env()
 
     def get_env(self) -> Any:
         """Returns the training environments; images with the channels last are shown with the channels first."""
@@ -536,15 +552,25 @@ class Original(Agent):
             TypeError: if JSON has no such value; ``save_replay_buffer`` writes the replay buffer.
         """
         kept = {*(include or ())}
-        return written(partial(self._write, {*(exclude or ())} - kept, kept), path, ".zip")
+        return written(lambda file: self.snapshot(file, {*(exclude or ())} - kept, kept)(), path, ".zip")
 
-    def _write(self, exclude: set[str], include: set[str], path: Path) -> Path:
-        """Writes a file without some hyperparameters and with further attributes."""
-        header, defaults = model_files.header(self), configs.to_json(type(self.config)())
-        header["config"] |= {key: defaults[key] for key in exclude & defaults.keys() - SHAPING}
-        header["attributes"] = {key: getattr(self, key) for key in sorted(include - defaults.keys())}
-        self.last_saved = checkpoint.write(path, "agent", super().get_parameters(), header)
-        return self.last_saved
+    def snapshot(self, path: Any, exclude: Iterable[str] = (), include: Iterable[str] = ()) -> Callable[[], Path]:
+        """Returns a function that writes the model as it is now, as :meth:`save` does."""
+        arrays, header, defaults = (
+            super().get_parameters(),
+            model_files.header(self),
+            configs.to_json(type(self.config)()),
+        )
+        header["config"] |= {key: defaults[key] for key in {*exclude} & defaults.keys() - SHAPING}
+        others = {*OUTPUTS, *include} - {*exclude} - defaults.keys()
+        folder = {"tensorboard_log": self.tensorboard_log and str(self.tensorboard_log)}
+        header["attributes"] = {key: folder.get(key, getattr(self, key)) for key in sorted(others)}
+
+        def write() -> Path:
+            self.last_saved = checkpoint.write(path, "agent", arrays, header)
+            return self.last_saved
+
+        return write
 
     def save_replay_buffer(self, path: Any) -> Any:
         """Writes the replay buffer to exactly this path, or to a file object; ``.pkl`` is added to a path without a suffix."""
@@ -601,10 +627,18 @@ class Original(Agent):
                 shape = header.get("config", {}).get("policy_kwargs")
                 register_again(shape.get("encoder") if isinstance(shape, dict) else None)
                 agent = load_agent(cls, found, env, changes)
-                attributes = header.get("attributes")
-                for name, value in attributes.items() if isinstance(attributes, dict) else ():
-                    if not hasattr(agent, name) or (name == "verbose" and name not in changes and value in (0, 1, 2)):
-                        setattr(agent, name, value)
+                attributes = header["attributes"] if isinstance(header.get("attributes"), dict) else {}
+                for name in attributes.keys() - {*OUTPUTS}:
+                    if not hasattr(agent, name):
+                        setattr(agent, name, attributes[name])
+                outputs = {
+                    key: attributes[key]
+                    for key in attributes.keys() & OUTPUTS.keys()
+                    if type(attributes[key]) is OUTPUTS[key]
+                }
+                agent.set_outputs(**outputs | {key: changes[key] for key in OUTPUTS if key in changes})
+        if changes.get("seed") is not None:
+            utils.set_random_seed(agent.seed)
         agent.device = utils.Device(agent.device)
         return agent
 

@@ -308,7 +308,7 @@ def to_callback(callback: BaseCallback | Callable[..., Any]) -> BaseCallback:
 
 def env_infos(agent: Agent, progress: Progress) -> list[dict[str, Any]]:
     """Returns one info for each environment, with the keys that Stable-Baselines3's ``VecEnv`` and ``Monitor`` add."""
-    result, env = progress.result, agent.env
+    result, env = progress.result, agent.run.env
     assert result is not None
     assert env is not None
     infos = [

@@ -66,7 +66,7 @@ class BaseBuffer:
     @classmethod
     def of(cls, agent: Any) -> Any:
         """Returns a view of the buffer of an agent."""
-        view = cls.__new__(cls)
+        view: Any = cls.__new__(cls)
         view.agent, view.device = agent, agent.device
         view.observation_space, view.action_space = agent.observation_space, agent.action_space
         view.obs_shape, view.action_dim = get_obs_shape(agent.observation_space), get_action_dim(agent.action_space)

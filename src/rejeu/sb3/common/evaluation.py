@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from contextlib import nullcontext
 from typing import Any
 
 import numpy as np
 
+from rejeu import interrupt
 from rejeu.agents import Agent
 from rejeu.agents.policy import lent
 from rejeu.core import Masked
 from rejeu.envs.make import make_vector
 from rejeu.envs.masks import make_masked
+from rejeu.reporting.evaluation import MOST_STEPS, cut_off
 
 __all__ = ["evaluate_policy"]
 
@@ -65,6 +68,9 @@ def evaluate_policy(
 
     if n_eval_episodes < 1:
         raise ValueError(f"n_eval_episodes={n_eval_episodes} must be at least 1")
+    if agent is not None and agent.get_vec_normalize_env() is not None and vector.vec_normalize is None:
+        warnings.warn("the agent learns in a VecNormalize, and is evaluated without; wrap env alike", UserWarning, 2)
+    longest = max(MOST_STEPS, vector.max_episode_steps or 0)
     share = (n_eval_episodes + np.arange(vector.n_envs)) // vector.n_envs
     current_rewards, current_lengths = np.zeros(vector.n_envs), np.zeros(vector.n_envs, int)
     episode_counts = np.zeros(vector.n_envs, int)
@@ -72,25 +78,30 @@ def evaluate_policy(
     episode_lengths: list[int] = []
     with nullcontext() if agent is None else lent(agent, vector):
         observations, dones = vector.reset(), np.ones(vector.n_envs, bool)
-        while len(episode_rewards) < n_eval_episodes:
+        while (episode_counts < share).any():
             actions = policy(observations, dones)
+            if (signal := interrupt.requested()) is not None:
+                raise interrupt.Stopped(signal)
             step = vector.step(actions)
             rewards, dones, infos = step.reward, step.terminated | step.truncated, step.info
             current_rewards += rewards
             current_lengths += 1
+            endless = ~dones & (episode_counts < share) & (current_lengths >= longest)
             for i in range(vector.n_envs):
                 if callback is not None and episode_counts[i] < share[i]:
                     reward, done, info = rewards[i], dones[i], infos[i] if isinstance(infos, list) else infos
                     callback(locals(), globals())
-                if dones[i]:
+                if dones[i] or endless[i]:
                     if episode_counts[i] < share[i]:
                         episode_rewards.append(step.return_of(i, current_rewards[i]))
                         episode_lengths.append(int(current_lengths[i]))
-                        episode_counts[i] += 1
+                        episode_counts[i] += share[i] + 1 if endless[i] else 1  # more than its share: cut off
                     current_rewards[i] = current_lengths[i] = 0
             observations = vector.reset_done(dones) if dones.any() else step.obs
             if render and hasattr(env, "render"):
                 env.render()
+    if cut := int((episode_counts > share).sum()):
+        cut_off(cut)
     mean, std = float(np.mean(episode_rewards)), float(np.std(episode_rewards))
     if reward_threshold is not None and not mean > reward_threshold:
         raise ValueError(f"the mean return {mean:.2f} is not above reward_threshold={reward_threshold:.2f}")

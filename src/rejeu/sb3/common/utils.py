@@ -54,9 +54,9 @@ TABLE_INTERVALS = 1_000
 
 
 def set_random_seed(seed: int, using_cuda: bool = False) -> None:
-    """Seeds the global generators of Python and NumPy. rejeu does not use them; see the ``seed`` of the agents.
+    """Seeds the global generators of Python and NumPy, as agents of ``rejeu.sb3`` do with their ``seed``.
 
-    ``using_cuda`` is accepted and ignored.
+    They learn from generators of their own. ``using_cuda`` is accepted and ignored.
     """
     random.seed(seed)
     np.random.seed(seed)  # noqa: NPY002 - the global generator is what is meant
