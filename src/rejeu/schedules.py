@@ -17,6 +17,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from rejeu.validation import is_finite
 
@@ -91,6 +92,22 @@ class Table:
             below = min(int(place), len(self.values) - 2)
             return self.values[below] + (place - below) * (self.values[below + 1] - self.values[below])
         return jnp.interp(place, jnp.arange(len(self.values)), jnp.array(self.values, jnp.float32))
+
+
+class Live:
+    """A number that compiled functions read when they run, so that it can be set without compiling them again.
+
+    A model file contains the number. Before it is set, wait for the updates that have been started.
+    """
+
+    def __init__(self, value: float) -> None:
+        self.value = value
+
+    def __call__(self, progress: Any) -> Any:
+        if isinstance(progress, int | float):
+            return self.value
+        shape = jax.ShapeDtypeStruct((), jnp.float32)
+        return jax.pure_callback(lambda _: np.float32(self.value), shape, progress, vmap_method="sequential")
 
 
 ROUNDING = 1e-6

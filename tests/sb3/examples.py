@@ -216,6 +216,7 @@ def save_and_load_replay_buffer_and_policy():
     model.save("sac_pendulum")
     model.save_replay_buffer("sac_replay_buffer")
     loaded_model = SAC.load("sac_pendulum")
+    assert loaded_model.replay_buffer.size() == 0
     loaded_model.load_replay_buffer("sac_replay_buffer")
     assert loaded_model.replay_buffer.size() == 60
     model.policy.save("sac_policy_pendulum")
@@ -248,11 +249,23 @@ def record_a_video():
 
 @example("guide/examples")
 def make_images_for_a_gif():
-    model = A2C("MlpPolicy", gym.make("CartPole-v1", render_mode="rgb_array")).learn(20)
-    obs = model.get_env().reset()
-    action, _ = model.predict(obs)
-    model.get_env().step(action)
-    assert model.get_env().render(mode="rgb_array").ndim == 3
+    model = A2C("MlpPolicy", "CartPole-v1").learn(20)
+    images = []
+    obs = model.env.reset()
+    img = model.env.render(mode="rgb_array")
+    for _ in range(3):
+        images.append(img)
+        action, _ = model.predict(obs)
+        obs, _, _, _ = model.env.step(action)
+        img = model.env.render(mode="rgb_array")
+    assert [image.ndim for image in images] == [3, 3, 3]
+
+
+@example("guide/examples", fails="the original's environments for its own tests are not included")
+def the_environments_for_tests():
+    import importlib
+
+    importlib.import_module("rejeu.sb3.common.envs")
 
 
 @example("guide/vec_envs")
@@ -523,10 +536,11 @@ def log_values():
 
 @example("guide/tensorboard", needs="tensorboard")
 def log_images():
-    image = np.zeros((8, 8, 3), np.uint8)
-    logged(
-        lambda callback: callback.logger.record("image", Image(image, "HWC"), exclude=("stdout", "log", "json", "csv"))
-    )
+    def record(callback):
+        image = callback.training_env.render(mode="rgb_array")
+        callback.logger.record("image", Image(image, "HWC"), exclude=("stdout", "log", "json", "csv"))
+
+    logged(record)
 
 
 @example("guide/tensorboard", needs="tensorboard")
@@ -540,8 +554,17 @@ def log_figures():
 
 @example("guide/tensorboard", needs="tensorboard")
 def log_videos():
-    frames = np.zeros((1, 3, 3, 8, 8), np.uint8)
-    logged(lambda callback: callback.logger.record("video", Video(frames, fps=40), exclude=("stdout", "csv")))
+    def record(callback):
+        screens, env = [], make_vec_env("CartPole-v1")
+
+        def grab(_locals, _globals):
+            screens.append(env.render(mode="rgb_array").transpose(2, 0, 1))
+
+        evaluate_policy(callback.model, env, callback=grab, n_eval_episodes=1)
+        frames = np.stack(screens)[None, :3]
+        callback.logger.record("video", Video(frames, fps=40), exclude=("stdout", "csv"))
+
+    logged(record)
 
 
 @example("guide/tensorboard", needs="tensorboard")

@@ -104,6 +104,13 @@ def test_ends_by_time_limits_are_no_terminations():
     assert 0 < batch.dones.sum() < (batch.rewards == 7).sum()
 
 
+def test_a_full_replay_buffer_has_its_size():
+    model = SAC("MlpPolicy", gym.make("Pendulum-v1"), learning_starts=100, buffer_size=8, **TINY).learn(30)
+    assert model.replay_buffer.full
+    assert model.replay_buffer.size() == model.replay_buffer.buffer_size
+    assert len(model.replay_buffer.rewards) == model.replay_buffer.pos
+
+
 def test_an_agent_that_was_loaded_alone_shows_an_empty_replay_buffer(tmp_path):
     model = made(buffers.HerReplayBuffer)
     model.save(tmp_path / "m")

@@ -47,6 +47,27 @@ def test_a_learning_rate_set_in_a_callback_counts_from_the_next_update(kind, set
     assert (model.num_timesteps, model.lr_schedule(1.0)) == (48, 0.0)
 
 
+def test_a_number_that_a_callback_sets_at_every_step_is_compiled_once(tmp_path):
+    learners, seen = [], []
+
+    class Decays(BaseCallback):
+        def _on_step(self):
+            self.model.ent_coef = 0.1 / self.n_calls
+            self.model.clip_range = 0.2
+            learners.append(self.model.learner)
+            seen.append(self.model.ent_coef)
+            return True
+
+    model = PPO("MlpPolicy", gym.make("CartPole-v1"), **TINY, n_steps=4, batch_size=4, n_epochs=1)
+    with pytest.raises(ValueError, match="must not fall below 0"):
+        model.ent_coef = -1
+    model.learn(12, Decays())
+    assert len({id(one) for one in learners}) == 1
+    assert seen == [0.1 / n for n in range(1, 13)]
+    model.save(tmp_path / "m")
+    assert PPO.load(tmp_path / "m").ent_coef == model.ent_coef == 0.1 / 12
+
+
 @pytest.fixture(scope="module")
 def dqn():
     return DQN("MlpPolicy", gym.make("CartPole-v1"), **TINY, **FAST, buffer_size=100)

@@ -354,6 +354,8 @@ def to_json(config: Any) -> dict[str, Any]:
 
 def value_to_json(value: Any) -> Any:
     """Returns the JSON form of the value of a setting."""
+    if isinstance(value, schedules.Live):
+        return value.value
     if type(value) in schedules.SCHEDULES.values():
         return schedules.to_json(value)
     if type(value) in action_noises.NOISES.values():

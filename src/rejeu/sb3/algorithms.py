@@ -13,7 +13,7 @@ import tempfile
 import warnings
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, ClassVar, Self
@@ -39,6 +39,7 @@ from rejeu.envs.wrappers import TimeLimitTerminates
 from rejeu.errors import CheckpointError
 from rejeu.exploration.noise import ActionNoise
 from rejeu.io import checkpoint
+from rejeu.loops import finite
 from rejeu.reporting import logging
 from rejeu.sb3 import arguments, policy as policies
 from rejeu.sb3.common import base_callback, buffers, logger as loggers, utils
@@ -210,6 +211,8 @@ class Original(Agent):
             return None if value is None else utils.FloatSchedule(utils.of_remaining(value))
         if name in validation.field_names(type(config)):
             value = getattr(config, name)
+            if isinstance(value, schedules.Live):
+                return value.value
             return utils.of_remaining(value) if name in arguments.SCHEDULED and callable(value) else value
         if name in policies.NETWORKS:
             return getattr(self.policy, name)
@@ -236,8 +239,16 @@ class Original(Agent):
         config: Any = self.__dict__.get("config")
         known = () if config is None or name in self.STORED else validation.field_names(type(config))
         if name in known:
-            if "run" in self.__dict__:
-                self.change(dataclasses.replace(config, **self.converted({name: value})))
+            new = dataclasses.replace(config, **self.converted({name: value}))
+            old, number = getattr(config, name), getattr(new, name)
+            if isinstance(old, schedules.Live) and isinstance(number, int | float):
+                finite.settle(self)
+                old.value = number
+            elif "run" in self.__dict__ and new != config:
+                if self.is_learning and name in arguments.SCHEDULED and isinstance(number, int | float):
+                    with suppress(TypeError, ValueError):  # what is set once may be set at every step
+                        new = dataclasses.replace(config, **{name: schedules.Live(number)})
+                self.change(new)
             return
         if known and name in (fixed := {**FIXED, **dict.fromkeys(policies.NETWORKS, "set_parameters(...)")}):
             raise AttributeError(f"{name} of {self.name} cannot be set; use {fixed[name]}")
@@ -302,7 +313,7 @@ class Original(Agent):
         steps = [getattr(value, name) for name in value.SHOWN]
         self.run.replay = self.make_buffer(self.run.env)
         own = self.replay_buffer
-        for i in range(value.size()):
+        for i in range(value.pos):
             obs, following, action, reward, done, timeout = (
                 buffers.by_leaf(lambda leaf, i=i: leaf[i], part) for part in steps
             )

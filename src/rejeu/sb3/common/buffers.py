@@ -123,8 +123,8 @@ class ReplayBuffer(BaseBuffer):
         return self.core is not None and bool((self.core.ring.head >= self.core.ring.rows).all())
 
     def size(self) -> int:
-        """Returns the number of steps of every environment."""
-        return self.pos
+        """Returns the number of steps of every environment; of a full buffer its size, as scripts compare them."""
+        return self.buffer_size if self.full else self.pos
 
     def __getattr__(self, name: str) -> Any:
         if name not in self.SHOWN or self.core is None:
