@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import signal
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -152,3 +154,16 @@ def test_without_a_screen_nothing_is_trained_first(monkeypatch, tmp_path, capsys
     assert not out.exists()
     with pytest.raises(OSError, match="cannot open a window"):
         Expert(gym.make(SLIDE, render_mode="rgb_array"))
+
+
+def test_a_pause_ends_with_the_training(monkeypatch):
+    """After Ctrl-C nobody waits for a key in a window that is paused."""
+
+    def stop():
+        pygame.event.post(pygame.event.Event(pygame.KEYDOWN, key=pygame.K_p))
+        signal.raise_signal(signal.SIGINT)
+
+    at_steps(monkeypatch, {3: stop})
+    env = gym.make(SLIDE, render_mode="rgb_array")
+    agent = rejeu.SAC("MlpPolicy", env, learning_starts=1000, **SMALL).learn(30, Assist())
+    assert 0 < agent.num_timesteps < 10

@@ -10,7 +10,7 @@ import gymnasium as gym
 import jax
 import numpy as np
 
-from rejeu import spaces
+from rejeu import interrupt, spaces
 from rejeu.agents import Agent, OffPolicyAgent
 from rejeu.callbacks.base import TrainingCallback
 from rejeu.demonstrations.recording import Recording
@@ -49,8 +49,11 @@ class Seat:
         self.window.open(self.game, self.keys)
 
     def action(self) -> Any:
-        """Draws the environment, waits for its next step, and returns the action of the person; None where no key is held."""
-        while not self.game.closed:
+        """Draws the environment, waits for its next step, and returns the action of the person; None where no key is held.
+
+        After Ctrl-C, which ends the training or the clone, nobody is waited for.
+        """
+        while not self.game.closed and interrupt.requested() is None:
             for event in self.window.events():
                 if event.kind == "press" and (event.key in self.keys.names or CONTROLS.get(event.key) != "restart"):
                     self.game.press(event.key)
