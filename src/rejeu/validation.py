@@ -15,6 +15,10 @@ from functools import cache
 from typing import Any, TypeVar
 
 C = TypeVar("C")
+MOST_OUTPUTS = 10_000
+"""Upper limit on the numbers that describe the distribution of one value: atoms, quantiles, bins."""
+LARGEST_VALUE = 1e30
+"""Upper limit on returns; sums of products with them are finite in single precision."""
 
 
 def whole(key: str, value: Any, least: int, most: int = 2**63 - 1) -> int:

@@ -11,6 +11,7 @@ import pytest
 import rejeu
 from rejeu.errors import CheckpointError
 from rejeu.export.numpy_policy import load_policy
+from tests import hostile_files
 from tests.export.policies import KINDS, agent_of, observations
 from tests.export.test_export import OTHERS
 from tests.tiers import exhaustive
@@ -91,3 +92,35 @@ def test_wrong_observations_are_one_line(tmp_path):
         policy.predict(np.zeros(4), deterministic=False)
     with pytest.raises(FileNotFoundError):
         load_policy(tmp_path / "missing")
+
+
+HEADERS = {
+    "IQN": {"n_policy_quantiles": (10**9, 0, -1, 1.5, "8", None)},
+    "QRDQN": {"n_quantiles": (10**9, 25, 100, 0)},
+    "DQN": {"n_atoms": (10**9, 2, 1), "v_min": (-1e308, "x"), "v_max": (1e308, None)},
+    "SAC": {"normalize": ({"norm_obs": True, "epsilon": -9.0, "clip_obs": 10.0, "norm_reward": False},)},
+}
+"""Numbers that the shape of no array checks."""
+
+
+@pytest.mark.parametrize("name", HEADERS)
+def test_a_number_in_a_header_is_refused_where_no_array_checks_it(name, tmp_path):
+    settings = {"DQN": {"distribution": "categorical"}, "SAC": {"normalize": True}}.get(name, {})
+    env_id = "Pendulum-v1" if name == "SAC" else "CartPole-v1"
+    agent = rejeu.AGENTS[name]("MlpPolicy", env_id, policy_kwargs={"net_arch": [4]}, seed=0, **settings)
+    path = agent.save(tmp_path / "model")
+    rejeu.load_policy(path).predict(agent.observation_space.sample())
+    content = path.read_bytes()
+    for key, values in HEADERS[name].items():
+        for variant in hostile_files.with_values(content, "number", f"config.{key}", values):
+            if name == "SAC":
+                variant = variant._replace(content=hostile_files.changed(variant.content, seen_once))
+            path.write_bytes(variant.content)
+            for load in (rejeu.load_policy, rejeu.load):
+                with pytest.raises(rejeu.CheckpointError) as caught:
+                    load(path)
+                assert "\n" not in str(caught.value)
+
+
+def seen_once(header, arrays):
+    arrays.update({key: np.ones_like(array) for key, array in arrays.items() if key.endswith("n_seen")})

@@ -72,7 +72,7 @@ from rejeu.networks.noisy import drawn, noisy
 from rejeu.prng import nth
 from rejeu.schedules import Exponential, Linear, Schedule, at
 from rejeu.spaces import Leaf, check_discrete_action, nth_allowed
-from rejeu.validation import choice, coerce, flag, number, whole
+from rejeu.validation import LARGEST_VALUE, MOST_OUTPUTS, choice, coerce, flag, number, whole
 
 MARGIN = 0.8
 """By how much a demonstrated action should be better than the others; that of arXiv 1704.03732."""
@@ -191,8 +191,8 @@ class Config(QLearningConfig):
         coerce(self, "loss", choice, among=tuple(LOSSES))
         coerce(self, "clip_grad_value", number, above=0, optional=True)
         coerce(self, "distribution", choice, among=("expected", "categorical"))
-        coerce(self, ("v_min", "v_max"), number)
-        coerce(self, "n_atoms", whole, least=2)
+        coerce(self, ("v_min", "v_max"), number, least=-LARGEST_VALUE, most=LARGEST_VALUE)
+        coerce(self, "n_atoms", whole, least=2, most=MOST_OUTPUTS)
         if self.v_min >= self.v_max:
             raise ValueError(f"v_min={self.v_min} must be below v_max={self.v_max}")
 

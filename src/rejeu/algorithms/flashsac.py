@@ -67,7 +67,7 @@ from rejeu.normalization import NormalizationConfig
 from rejeu.prng import nth
 from rejeu.schedules import Linear, Schedule, at
 from rejeu.spaces import Leaf, action_dimension, check_box_action, leaves
-from rejeu.validation import coerce, number, whole
+from rejeu.validation import LARGEST_VALUE, MOST_OUTPUTS, coerce, number, whole
 
 ACTOR_LAYERS = (128, 128)
 """Default widths of the actor's blocks."""
@@ -113,8 +113,8 @@ class Config(EntropyConfig):
     def __post_init__(self) -> None:
         EntropyConfig.__post_init__(self)
         coerce(self, "policy_delay", whole, least=1)
-        coerce(self, "n_bins", whole, least=2)
-        coerce(self, "value_limit", number, above=0)
+        coerce(self, "n_bins", whole, least=2, most=MOST_OUTPUTS)
+        coerce(self, "value_limit", number, above=0, most=LARGEST_VALUE)
         check_shape(self.policy_kwargs, self.name)
         self.check_widths()
 

@@ -37,7 +37,7 @@ from rejeu.core import Algorithm, PyTree, rows_read
 from rejeu.networks import Linear, Network, PolicyConfig, Torso, make_encoder, make_torso
 from rejeu.schedules import Schedule
 from rejeu.spaces import Leaf
-from rejeu.validation import coerce, whole
+from rejeu.validation import MOST_OUTPUTS, coerce, whole
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,7 +61,13 @@ class Config(QLearningConfig):
 
     def __post_init__(self) -> None:
         QLearningConfig.__post_init__(self)
-        coerce(self, ("n_quantiles", "n_target_quantiles", "n_policy_quantiles", "n_cosines"), whole, least=1)
+        coerce(
+            self,
+            ("n_quantiles", "n_target_quantiles", "n_policy_quantiles", "n_cosines"),
+            whole,
+            least=1,
+            most=MOST_OUTPUTS,
+        )
 
 
 def make(config: Config, observation_space: spaces.Space, action_space: spaces.Space) -> Algorithm:

@@ -30,7 +30,7 @@ from rejeu.algorithms.dqn import QLearningConfig, Returns, q_learning, taken, va
 from rejeu.algorithms.quantile_loss import quantile_huber_loss
 from rejeu.core import Algorithm, PyTree
 from rejeu.schedules import Schedule
-from rejeu.validation import coerce, whole
+from rejeu.validation import MOST_OUTPUTS, coerce, whole
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,7 +48,7 @@ class Config(QLearningConfig):
 
     def __post_init__(self) -> None:
         QLearningConfig.__post_init__(self)
-        coerce(self, "n_quantiles", whole, least=1)
+        coerce(self, "n_quantiles", whole, least=1, most=MOST_OUTPUTS)
 
 
 def make(config: Config, observation_space: spaces.Space, action_space: spaces.Space) -> Algorithm:

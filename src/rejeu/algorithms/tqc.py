@@ -49,7 +49,7 @@ from rejeu.networks import Network, QNetwork, each, with_dropout
 from rejeu.prng import nth
 from rejeu.schedules import at
 from rejeu.spaces import Leaf, action_dimension, check_box_action, leaves
-from rejeu.validation import coerce, whole
+from rejeu.validation import MOST_OUTPUTS, coerce, whole
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,7 +66,7 @@ class Config(SACConfig):
 
     def __post_init__(self) -> None:
         SACConfig.__post_init__(self)
-        coerce(self, "n_quantiles", whole, least=1)
+        coerce(self, "n_quantiles", whole, least=1, most=MOST_OUTPUTS)
         coerce(self, "top_quantiles_to_drop_per_net", whole, least=0)
         if self.top_quantiles_to_drop_per_net >= self.n_quantiles:
             raise ValueError(

@@ -15,6 +15,7 @@ from rejeu.errors import CheckpointError
 from rejeu.io import checkpoint
 from rejeu.runs.folder import find_model
 from rejeu.spaces import Leaf
+from rejeu.validation import LARGEST_VALUE, MOST_OUTPUTS, number, whole
 
 Function = Callable[[np.ndarray], np.ndarray]
 GELU = math.sqrt(2 / math.pi)
@@ -55,13 +56,13 @@ class NumpyPolicy:
         scaled = self._normalizations(config["normalize"]) if is_normalized else [None] * len(self._leaves)
         self._encoders = [encoder(leaf, scale) for leaf, scale in zip(self._leaves, scaled, strict=True)]
         self._shape = config["policy_kwargs"]
-        n_outputs = config["n_quantiles"] if name == "QRDQN" else None
+        n_outputs = _count(config, "n_quantiles") if name == "QRDQN" else None
         prefix = ACTORS[name]
         if config.get("distribution") == "categorical":
-            prefix, n_outputs = "network.outputs", config["n_atoms"]
+            prefix, n_outputs = "network.outputs", _count(config, "n_atoms")
         hidden = self._torso(f"{prefix}.torso")
         if name == "IQN":
-            described = self._described(config["n_policy_quantiles"])
+            described = self._described(_count(config, "n_policy_quantiles"))
             hidden += [lambda x: x[..., None, :] * described, *self._torso("network.reader.torso")]
             prefix = "network.reader"
         if f"{prefix}.value_head.weight" in self._arrays and f"{prefix}.advantage_head.weight" in self._arrays:
@@ -73,7 +74,7 @@ class NumpyPolicy:
         else:
             hidden.append(self._linear(f"{prefix}.head"))
         if n_outputs is not None:
-            mean = np.mean if name == "QRDQN" else categorical_mean(config["v_min"], config["v_max"], n_outputs)
+            mean = np.mean if name == "QRDQN" else categorical_mean(config, n_outputs)
             hidden.append(lambda x: mean(x.reshape(*x.shape[:-1], -1, n_outputs), axis=-1))
         if name == "IQN":
             hidden.append(lambda x: x.mean(axis=-2))
@@ -85,7 +86,11 @@ class NumpyPolicy:
         self._choose = chooser(self.action_space, is_squashed)
         self._scale = spaces.action_scaler(self.action_space)
         zero = [np.zeros((1, *leaf.shape), leaf.dtype) for leaf in self._leaves]
-        self._act(zero, None)  # shapes that do not fit raise here
+        n, width = self._outputs(zero).shape[-1], spaces.leaves(self.action_space)[0].n_features  # wrong shapes raise
+        if n < width if isinstance(self.action_space, Box) else n != width:
+            raise ValueError(f"its network has {n} outputs, expected {width}")
+        if not np.isfinite(self._act(zero, None)).all():
+            raise ValueError("its actions are not finite")
 
     def predict(
         self,
@@ -123,9 +128,12 @@ class NumpyPolicy:
         action = self._act([one[None] for one in arrays] if is_single else arrays, action_masks)
         return (action[0] if is_single else action), state
 
-    def _act(self, arrays: list[np.ndarray], masks: Any) -> np.ndarray:
+    def _outputs(self, arrays: list[np.ndarray]) -> np.ndarray:
         parts = [encode(array) for encode, array in zip(self._encoders, arrays, strict=True)]
-        x = applied(self._steps, parts[0] if len(parts) == 1 else np.concatenate(parts, axis=-1))
+        return applied(self._steps, parts[0] if len(parts) == 1 else np.concatenate(parts, axis=-1))
+
+    def _act(self, arrays: list[np.ndarray], masks: Any) -> np.ndarray:
+        x = self._outputs(arrays)
         if masks is not None:
             x = np.where(np.asarray(masks, bool), x, np.float32(-1e9))
         return self._scale(self._choose(x))
@@ -233,9 +241,14 @@ def joined(value: np.ndarray, advantage: np.ndarray, n: int) -> np.ndarray:
     return (value[..., None, :] + advantages - advantages.mean(axis=-2, keepdims=True)).reshape(advantage.shape)
 
 
-def categorical_mean(v_min: float, v_max: float, n: int) -> Callable[..., np.ndarray]:
+def _count(config: Mapping[str, Any], key: str) -> int:
+    return whole(key, config[key], least=1, most=MOST_OUTPUTS)
+
+
+def categorical_mean(config: Mapping[str, Any], n: int) -> Callable[..., np.ndarray]:
     """Returns the function from logits to the means of their distributions."""
-    atoms = np.linspace(v_min, v_max, n, dtype=np.float32)
+    low, high = (number(key, config[key], least=-LARGEST_VALUE, most=LARGEST_VALUE) for key in ("v_min", "v_max"))
+    atoms = np.linspace(low, high, n, dtype=np.float32)
 
     def mean(logits: np.ndarray, axis: int) -> np.ndarray:
         exponential = np.exp(logits - logits.max(axis=axis, keepdims=True))
@@ -246,6 +259,7 @@ def categorical_mean(v_min: float, v_max: float, n: int) -> Callable[..., np.nda
 
 def standardizer(mean: Any, variance: Any, epsilon: float, limit: float) -> Function:
     """Returns the function that standardizes observations and clips them to ``limit``."""
+    epsilon, limit = number("epsilon", epsilon, above=0), number("clip_obs", limit, above=0)
     factor = (1.0 / np.sqrt(variance + np.float32(epsilon))).astype(np.float32)
     low, high = np.float32(-limit), np.float32(limit)
     return lambda x: np.minimum(np.maximum((x - mean) * factor, low), high)
