@@ -320,3 +320,50 @@ def test_the_command_exports_a_run(tmp_path, capsys):
     errors = capsys.readouterr().err.splitlines()
     assert "there is no run folder or model file" in errors[0]
     assert "is no format that a policy can be exported to" in errors[1]
+
+
+WORDS = [
+    "int",
+    "double",
+    "for",
+    "static",
+    "tanhf",
+    "INFINITY",
+    "v0",
+    "c1",
+    "int8_t",
+    "A",
+    "a",
+    "action",
+    "sum",
+    "main",
+    "class",
+]
+
+
+@pytest.mark.skipif(not has_compiler, reason="needs a C compiler")
+@pytest.mark.parametrize("name", ["main.c", "-o.c", "int.c", "model.onnx", "model.stablehlo"])
+def test_keys_may_be_words_of_c_and_names_of_outputs(name, tmp_path):
+    space = gym.spaces.Dict({word: gym.spaces.Box(-1, 1, (1 + i % 3,)) for i, word in enumerate(WORDS)})
+
+    class Words(gym.Env):
+        observation_space, action_space = space, gym.spaces.Discrete(2)
+
+        def reset(self, *, seed=None, options=None):
+            super().reset(seed=seed)
+            return space.sample(), {}
+
+        def step(self, action):
+            return space.sample(), 0.0, True, False, {}
+
+    agent = rejeu.PPO("MultiInputPolicy", Words(), policy_kwargs={"net_arch": [4], "activation_fn": "tanh"}, seed=0)
+    found = agent.export(tmp_path / name)
+    assert found.check.n == check.OBSERVATIONS
+
+
+@pytest.mark.parametrize("name", ['x"y.c', "x\\y.c", "x\ny.c"])
+def test_a_name_that_no_include_can_hold_is_refused(name, tmp_path):
+    agent = rejeu.PPO("MlpPolicy", "CartPole-v1", policy_kwargs={"net_arch": [4]}, seed=0)
+    with pytest.raises(ValueError, match="cannot be included by a C program"):
+        agent.export(tmp_path / name)
+    assert not [*tmp_path.iterdir()]

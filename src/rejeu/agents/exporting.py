@@ -95,6 +95,8 @@ def export(
     path = path if path.suffix else path.with_suffix(SUFFIXES[target])
     if isinstance(agent.action_space, gym.spaces.Dict | gym.spaces.Tuple):
         raise ValueError("policies with Dict or Tuple actions cannot be exported; load the model with rejeu.load")
+    if target == "c" and (not path.stem.isprintable() or {*path.stem} & {*'"\\'}):
+        raise ValueError(f"{path.name!r} cannot be included by a C program; leave out quotes and backslashes")
     if target == "web" and noise:
         raise ValueError("noise=True: a page contains the deterministic policy; leave it out")
     if target in ("c", "web"):

@@ -20,16 +20,19 @@ TYPES = {
     "bool": "uint8_t",
 }
 C = Language("C", TYPES)
+TAKEN = frozenset((TEMPLATES / "words.txt").read_text(encoding="utf-8").split())
+"""Words of C and C++, and names of the mathematical library, which also have the suffixes f and l there."""
 
 
 def identifier(name: str) -> str:
     """Returns a name of C that resembles another one.
 
-    >>> identifier("camera.left"), identifier("2nd-car")
-    ('camera_left', 'p2nd_car')
+    >>> identifier("camera.left"), identifier("2nd-car"), identifier("tanhf")
+    ('camera_left', 'p2nd_car', 'tanhf_')
     """
     name = re.sub(r"\W", "_", name, flags=re.ASCII)
-    return name if name[:1].isalpha() else f"p{name}"
+    name = name if name[:1].isalpha() else f"p{name}"
+    return f"{name}_" if {name, name.removesuffix("f"), name.removesuffix("l")} & TAKEN else name
 
 
 def filled(template: str, **texts: Any) -> bytes:
@@ -99,12 +102,12 @@ def size(port: Port) -> int:
 
 def names_of(policy: Policy) -> dict[str, str]:
     """Returns names of C for the inputs, by their own; those that are taken already get an underscore."""
-    result, taken = {}, {"action", "x", "sum", "best"}
+    result, taken = {}, {"ACTION", "X", "SUM", "BEST"}
     for port in policy.inputs:
         name = identifier(port.name)
-        while name in taken or re.fullmatch(r"[vci]\d+", name):
+        while name.upper() in taken or re.fullmatch(r"[vci]\d+|u?int\w*_t|[A-Z0-9_]*[A-Z0-9]", name):
             name += "_"
-        taken.add(name)
+        taken.add(name.upper())  # of the macro with its size
         result[port.name] = name
     return result
 

@@ -163,11 +163,11 @@ def c_run(policy: Policy, source: bytes, header: bytes, stem: str, compiler: str
     def run(inputs: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         with tempfile.TemporaryDirectory() as name:
             folder = Path(name)
-            (folder / f"{stem}.c").write_bytes(source)
+            (folder / "policy.c").write_bytes(source)  # whose own name may be one that a compiler takes for an option
             (folder / f"{stem}.h").write_bytes(header)
             (folder / "main.c").write_bytes(main_of(policy, stem))
-            options = ["-O2", "-std=c99", "-Wall", "-Wextra", "-Werror", "-c", f"{stem}.c"]
-            for arguments in (options, ["-O2", "main.c", f"{stem}.o", "-lm", "-o", "main"]):
+            options = ["-O2", "-std=c99", "-Wall", "-Wextra", "-Werror", "-c", "policy.c"]
+            for arguments in (options, ["-O2", "main.c", "policy.o", "-lm", "-o", "main"]):
                 made = subprocess.run([compiler, *arguments], cwd=folder, capture_output=True, text=True, check=False)
                 if made.returncode:
                     raise RuntimeError(f"{compiler} does not compile the C file: {made.stderr[:1000]}")

@@ -198,16 +198,16 @@ def policy_of(
     is_integer = isinstance(action_space, gym.spaces.Discrete | gym.spaces.MultiDiscrete)
     dtype = "int64" if is_integer else str(program.outputs[0].dtype)
     action = Port("action", "action", action_space.shape or (), dtype, *bounds(action_space))
-    return Policy(program, distinct(inputs), (action, *(one._replace(name=f"next_{one.name}") for one in state)), batch)
+    outputs = (action, *(one._replace(name=f"next_{one.name}") for one in state))
+    return Policy(program, distinct(inputs, {one.name for one in outputs}), outputs, batch)
 
 
-def distinct(ports: Sequence[Port]) -> tuple[Port, ...]:
-    """Returns ports whose names differ; an underscore is added to what is no observation."""
-    taken = {port.name for port in ports if port.role == "observation"}
+def distinct(ports: Sequence[Port], taken: set[str]) -> tuple[Port, ...]:
+    """Returns ports, observations first, whose names differ from each other and from those taken, by underscores."""
     result = []
     for port in ports:
         name = port.name
-        while port.role != "observation" and name in taken:
+        while name in taken:
             name += "_"
         taken.add(name)
         result.append(port._replace(name=name))

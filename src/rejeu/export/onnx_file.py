@@ -41,7 +41,7 @@ class Graph:
 
     def node(self, kind: str, inputs: Sequence[str], **attributes: Any) -> str:
         """Adds a node and returns the name of its output."""
-        name = f"v{len(self.nodes)}"
+        name = f"/v{len(self.nodes)}"  # which no key of an observation is called
         self.nodes.append(helper.make_node(kind, inputs, [name], **attributes))
         return name
 
@@ -50,7 +50,7 @@ class Graph:
         array = np.asarray(array)
         key = repr((array.dtype, array.shape)).encode() + array.tobytes()
         if key not in self._constants:
-            self._constants[key] = name = f"c{len(self.initializers)}"
+            self._constants[key] = name = f"/c{len(self.initializers)}"
             self.initializers.append(numpy_helper.from_array(array, name))
         return self._constants[key]
 
@@ -97,7 +97,7 @@ def add(graph: Graph, operation: Operation) -> None:
         graph.names[outputs[0]] = elementwise(graph, operation, names)
     elif name == "split":
         lengths = graph.constant(np.array(operation.params["sizes"], np.int64))
-        names = [f"v{len(graph.nodes)}_{i}" for i in range(len(outputs))]
+        names = [f"/v{len(graph.nodes)}_{i}" for i in range(len(outputs))]
         node = helper.make_node("Split", [graph.name(inputs[0]), lengths], names, axis=operation.params["axis"])
         graph.nodes.append(node)
         graph.names |= zip(outputs, names, strict=True)
