@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import math
 import os
+import time
 from collections.abc import Callable
 from contextlib import nullcontext
 from typing import Any, TypeVar, cast
@@ -42,10 +43,12 @@ SPLIT = 2**16
 """Most elements of a result for which XLA does not split an operation between threads. Inside of one kernel it cannot, and
 fails to compile a concatenation ("Invalid LLVM IR", jaxlib 0.10.2); programs in the cache hide it."""
 
+on_compile: Callable[[str, float], Any] = lambda event, seconds: None  # noqa: E731
+"""Called with the name of each event of JAX's compiler and its seconds; the progress bar replaces it while it is shown."""
+
 _n_runs = 1
 """How many runs the function that is traced computes at once."""
 _seconds = 0.0
-_listening = False
 _threads: int | None = None
 
 
@@ -54,10 +57,7 @@ def enable_cache() -> None:
 
     The environment variable ``JAX_COMPILATION_CACHE_DIR`` moves it; an empty value turns the cache off.
     """
-    global _listening
-    if not _listening:
-        _listening = True
-        jax.monitoring.register_event_duration_secs_listener(_listen)
+    _start_listening()
     unset = jax.config.jax_compilation_cache_dir is None  # type: ignore[attr-defined]
     if unset and "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         jax.config.update("jax_compilation_cache_dir", platformdirs.user_cache_dir("rejeu", appauthor=False))
@@ -196,7 +196,16 @@ def seconds() -> float:
     return _seconds
 
 
+def clock() -> float:
+    """Returns the time in seconds, as ``time.perf_counter``, without that of tracing and compiling functions."""
+    return time.perf_counter() - _seconds
+
+
 def _listen(event: str, duration_secs: float, **_: str | int) -> None:
     global _seconds
     if event.startswith("/jax/core/compile/"):
         _seconds += duration_secs
+        on_compile(event, duration_secs)
+
+
+_start_listening = functools.cache(lambda: jax.monitoring.register_event_duration_secs_listener(_listen))

@@ -5,6 +5,7 @@ from collections import deque
 from types import SimpleNamespace
 
 import gymnasium as gym
+import jax
 import numpy as np
 import pytest
 from rich.console import Console
@@ -15,7 +16,6 @@ from rejeu.callbacks import (
     Film,
     ProgressBar,
     RecordVideo,
-    progress_bar,
     stop_on_return,
     stop_on_success,
 )
@@ -204,7 +204,7 @@ def test_progress_bar_prints_plain_lines_without_a_terminal():
 
 def test_progress_bar_prints_a_line_every_ten_seconds_without_a_terminal(monkeypatch):
     ticks = iter(range(0, 1000, 3))
-    monkeypatch.setattr(progress_bar.time, "perf_counter", lambda: float(next(ticks)))
+    monkeypatch.setattr("time.perf_counter", lambda: float(next(ticks)))
     text = shown(20, None, range(1, 21), Console(file=io.StringIO(), force_terminal=False, width=200))
     lines = text.splitlines()
     assert [line.split("/20")[0].split()[-1] for line in lines] == ["5", "9", "13", "17", "20"]
@@ -218,6 +218,22 @@ def test_progress_bar_draws_a_bar_on_a_terminal():
     assert "100%" in text
 
 
+@pytest.mark.parametrize("is_terminal", [False, True])
+def test_progress_bar_says_that_a_large_function_is_compiled(is_terminal):
+    console = Console(file=io.StringIO(), force_terminal=is_terminal, width=100, _environ={"TERM": "xterm"})
+    bar = ProgressBar(100, None, console)
+    trace = lambda seconds: jax.monitoring.record_event_duration_secs("/jax/core/compile/jaxpr_trace_duration", seconds)  # noqa: E731
+    bar.before_training(SimpleNamespace(run=SimpleNamespace(step=0)))
+    trace(0.01)
+    assert "compiling" not in console.file.getvalue()
+    trace(1.0)
+    assert "compiling" in console.file.getvalue()
+    bar.close()
+    console.file.truncate(0)
+    trace(1.0)
+    assert "compiling" not in console.file.getvalue()
+
+
 def steps_that_grow_slower(step):
     """Of each of the first 20 steps' seconds the environment takes all, of each later one's the update three quarters."""
     early, late = min(step, 20), max(step - 20, 0)
@@ -226,7 +242,7 @@ def steps_that_grow_slower(step):
 
 def test_progress_bar_says_what_the_time_went_into_lately(monkeypatch):
     clock = [0.0]
-    monkeypatch.setattr(progress_bar.time, "perf_counter", lambda: clock[0])
+    monkeypatch.setattr("time.perf_counter", lambda: clock[0])
 
     def spent(step):
         clock[0] = float(step)

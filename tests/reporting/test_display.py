@@ -56,7 +56,7 @@ def formatted(thing):
 
 def test_the_progress_bar_is_one_output_that_stays_in_the_notebook(notebook, monkeypatch):
     ticks = iter(range(100))
-    monkeypatch.setattr(progress_bar.time, "perf_counter", lambda: float(next(ticks)))
+    monkeypatch.setattr("time.perf_counter", lambda: float(next(ticks)))
     agent = SimpleNamespace(n_envs=1, ep_info_buffer=[{"r": -3.0}], ep_success_buffer=[], seconds=SECONDS)
     bar = ProgressBar(4, None)
     for step in range(1, 5):

@@ -7,11 +7,13 @@ import sys
 from types import SimpleNamespace
 
 import gymnasium as gym
+import jax
 import numpy as np
 import pytest
 from scipy import stats
 
 import rejeu
+from rejeu import xla
 from rejeu.envs.make import InProcess
 from rejeu.reporting.evaluation import Evaluation, evaluate
 from tests.environments import Counter, Reach
@@ -57,12 +59,19 @@ def test_exactly_as_many_episodes_are_played_as_asked_for(n_envs):
     assert len(evaluate(still, InProcess([Counter((2,)) for _ in range(n_envs)]), 7).returns) == 7
 
 
-def timed(monkeypatch, envs, episodes, seconds):
-    """Returns the lengths of the episodes played where every step of all environments takes one second."""
+def timed(monkeypatch, envs, episodes, seconds, compiling=0.0):
+    """Returns the lengths of the episodes played where every step of all environments takes one second.
+
+    The first takes ``compiling`` seconds more, of compilation.
+    """
+    xla.enable_cache()
     clock = SimpleNamespace(now=0.0)
-    monkeypatch.setattr("rejeu.reporting.evaluation.time", SimpleNamespace(perf_counter=lambda: clock.now))
+    monkeypatch.setattr("time.perf_counter", lambda: clock.now)
 
     def policy(obs, began):
+        if clock.now == 0.0:
+            clock.now += compiling
+            jax.monitoring.record_event_duration_secs("/jax/core/compile/backend_compile_duration", compiling)
         clock.now += 1.0
         return still(obs, began)
 
@@ -72,6 +81,10 @@ def timed(monkeypatch, envs, episodes, seconds):
 def test_when_the_time_is_over_no_episode_begins_and_the_one_under_way_is_played_to_its_end(monkeypatch):
     """Episodes of 3 and 5 steps in turn end after 3, 8 and 11 s: the third began before 10 s, and no fourth begins."""
     assert timed(monkeypatch, [Counter((3, 5))], None, 10.0) == [3, 5, 3]
+
+
+def test_compilation_takes_none_of_the_time_of_an_evaluation(monkeypatch):
+    assert timed(monkeypatch, [Counter((3, 5))], None, 10.0, compiling=100.0) == [3, 5, 3]
 
 
 def test_long_episodes_under_way_when_the_time_is_over_count(monkeypatch):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from importlib import metadata
@@ -15,7 +14,7 @@ import gymnasium as gym
 import jax
 import numpy as np
 
-from rejeu import spaces
+from rejeu import spaces, xla
 from rejeu.agents.base import BaseAgent
 from rejeu.buffers.ring import stacked_leaves
 from rejeu.core import Masked
@@ -231,12 +230,12 @@ def record(
     ports = [port for port in one.inputs if port.role in ("observation", "action_mask")]
     rows: list[list[np.ndarray]] = []
     actions, starts = [], []
-    rng, end = np.random.default_rng(0), time.perf_counter() + MOST_SECONDS
+    rng, end = np.random.default_rng(0), xla.clock() + MOST_SECONDS
     agent.observation_space.seed(0)
     memory, ended = None, np.ones(1, bool)
     obs = vector.reset(0) if vector is not None else _sample(agent, one, rng)
     try:
-        while len(rows) < check.OBSERVATIONS and time.perf_counter() < end:
+        while len(rows) < check.OBSERVATIONS and xla.clock() < end:
             if vector is None and stack is not None:
                 obs = _restacked(agent, stack, obs, rows[-1] if rows else None, bool(ended[0]))
             arrays = [np.array(array[0]) for array in jax.tree.leaves(obs)]

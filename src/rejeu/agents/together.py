@@ -66,7 +66,7 @@ def train_seeds(
         total_timesteps: environment steps of each run.
         seeds: how many runs, with the seeds 0, 1, ...; or their seeds.
         n_envs: environments of each run.
-        minutes: stop after this wall time, which runs that are trained one after another have each.
+        minutes: stop after so many, without compilation, which runs that are trained one after another have each.
         callback: called with each agent before training; returns its callbacks.
         log_interval: episodes of a run between two rows of its statistics.
         progress_bar: show the progress of the first run, which is that of all that are trained together.

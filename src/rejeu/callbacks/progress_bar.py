@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-import time
 from collections import deque
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
+from rejeu import xla
 from rejeu.callbacks.base import TrainingCallback, step_before
 from rejeu.loops.run import Progress, TrainingCall, time_shares
 from rejeu.reporting import formatting
@@ -22,6 +22,8 @@ NOTEBOOK_SECONDS = 0.5
 """The same in a notebook, where each is a message to the browser."""
 LINE_SECONDS = 10.0
 """Least time between two lines of progress if the output is not a terminal."""
+LONG_TRACE = 0.1
+"""Seconds of tracing from which on a function takes a while to compile."""
 RATE_SECONDS = 10.0
 """Interval over which steps per second and shares of time are measured."""
 
@@ -58,10 +60,10 @@ class ProgressBar(TrainingCallback):
 
         Args:
             n_steps: environment steps to take; None without such a limit.
-            seconds: wall time to take; None without such a limit.
+            seconds: time to take, without compilation; None without such a limit.
             console: where to write; None: standard output.
             taken: steps of a resumed run that were taken before.
-            spent: wall time that it had taken before, in seconds.
+            spent: time that it had taken before, in seconds.
         """
         from rich.progress import BarColumn, Progress as RichProgress, TaskProgressColumn, TextColumn
 
@@ -75,8 +77,8 @@ class ProgressBar(TrainingCallback):
         columns = (BarColumn(bar_width=None), TaskProgressColumn(), TextColumn("{task.description}", markup=False))
         self._bar = RichProgress(*columns, console=self._console, auto_refresh=False, expand=True)
         self._task = self._bar.add_task("", total=1.0)
-        self._began = time.perf_counter()
-        self._refresh_at = 0.0
+        self._began = xla.clock()
+        self._refresh_at = -math.inf
         self._taken, self._spent = taken, spent
         self._first_step = 0
         self._step_before: int | None = None
@@ -92,10 +94,13 @@ class ProgressBar(TrainingCallback):
     def before_training(self, agent: Any) -> None:
         """Notes the step at which training begins, since the bar is first called after a turn, or after many at once."""
         self._step_before = agent.run.step
+        xla.on_compile = lambda event, seconds: (
+            self._show_compiling() if seconds > LONG_TRACE and "trace" in event else None
+        )
 
     def __call__(self, agent: Any, progress: Progress) -> None:
         """Refreshes the bar if it is due."""
-        now = time.perf_counter()
+        now = xla.clock()
         if self._latest is None:
             self._start(agent, progress, now)
         self._latest = agent, progress.step
@@ -106,13 +111,22 @@ class ProgressBar(TrainingCallback):
         """Closes it."""
         self.close()
 
+    def _show_compiling(self) -> None:
+        """Says why nothing moves when a large function has been traced; the next refresh replaces it."""
+        if self._animated:
+            self._bar.start()
+            self._bar.update(self._task, description="compiling")
+            self._bar.refresh()
+        elif self._display is not None:
+            self._display.show("compiling")
+        else:
+            self._console.print("compiling", highlight=False)
+
     def close(self) -> None:
         """Shows the last step and releases the terminal."""
-        if self._latest is None:
-            return
-        agent, step = self._latest
-        if step != self._shown_step:
-            self._refresh(agent, step, time.perf_counter())
+        xla.on_compile = lambda event, seconds: None
+        if self._latest is not None and self._latest[1] != self._shown_step:
+            self._refresh(*self._latest, xla.clock())
         if self._animated:
             self._bar.stop()
 

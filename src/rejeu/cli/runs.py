@@ -83,10 +83,12 @@ def run_status(arguments: Status) -> tuple[int, dict[str, Any]]:
 
 def describe(run: Run) -> dict[str, Any]:
     """Returns what is worth knowing of a run, as plain values."""
-    rate = run.steps / run.seconds if run.seconds and run.seconds > 0 else math.nan
+    compiling = run.metrics.column("time/compile_seconds")
+    seconds = run.seconds - (float(compiling[-1]) if len(compiling) and np.isfinite(compiling[-1]) else 0.0)
+    rate = run.steps / seconds if seconds > 0 else math.nan
     left = max(run.steps_asked - run.steps, 0) / rate if run.steps_asked and rate else math.nan
     if run.minutes_asked is not None:
-        left = max(60 * run.minutes_asked - run.seconds, 0.0)
+        left = max(60 * run.minutes_asked - seconds, 0.0)
     returns = run.episodes.returns[-WINDOW:]
     means = run.metrics.column("rollout/ep_rew_mean")
     known = returns if len(returns) else means[np.isfinite(means)][-1:]
@@ -274,7 +276,7 @@ def replay(path: Path, arguments: Report) -> None:
     from rejeu.cli.environment import environment_of
 
     assert arguments.replay is not None
-    model = find_model(path, "best")
+    model = find_model(path)
     agent = load(model)
     rows = ["seed,return,length,success"]
     with closing(environment_of(model, arguments).make()) as env:

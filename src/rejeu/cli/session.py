@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -13,7 +12,7 @@ from typing import Any, NamedTuple
 import gymnasium
 import numpy as np
 
-from rejeu import errors
+from rejeu import errors, xla
 from rejeu.agents import Agent, load
 from rejeu.agents.training import run_name, tracker_id
 from rejeu.callbacks import Checkpoint, Evaluate, RecordVideo
@@ -245,11 +244,11 @@ def has_reached_goal(agent: Agent) -> bool:
 def pause(agent: Agent, limits: Limits) -> Callable[[Progress], bool]:
     """Returns a function that returns whether a pause is due after a turn of the loop."""
     last_step = None if limits.pause_steps is None else agent.num_timesteps + limits.pause_steps
-    until = None if limits.pause_minutes is None else time.monotonic() + 60 * limits.pause_minutes
+    until = None if limits.pause_minutes is None else xla.clock() + 60 * limits.pause_minutes
 
     def is_due(turn: Progress) -> bool:
         by_steps = last_step is not None and agent.num_timesteps >= last_step
-        return by_steps or (until is not None and time.monotonic() >= until)
+        return by_steps or (until is not None and xla.clock() >= until)
 
     return is_due
 

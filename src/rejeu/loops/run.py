@@ -24,6 +24,7 @@ from rejeu.io.records import Count, Duration, Positive, Seconds, convert
 from rejeu.loops.finite import NonFiniteMonitor
 from rejeu.loops.learner import Learner, PackedState, is_finite
 from rejeu.validation import number, whole
+from rejeu.xla import clock
 
 F = TypeVar("F", bound=Callable[..., Any])
 PARTS = ("env", "replay", "update")
@@ -266,7 +267,7 @@ class TrainingCall:
     n_episodes: Positive | None
     """Episodes to finish; None for no such limit."""
     seconds: Duration | None
-    """Wall time to take, in seconds; None for no such limit."""
+    """Time to take without compilation, in seconds; None for no such limit."""
     first_step: Count
     """Total environment steps when it started."""
     first_episode: Count
@@ -282,14 +283,14 @@ class TrainingCall:
     seconds_before: Seconds = 0.0
     """Training time before it that schedules count, in seconds."""
     spent: Seconds = 0.0
-    """Wall time it had taken before it was last resumed, in seconds."""
-    began: float = dataclasses.field(default_factory=time.perf_counter)
-    """When it was started or last resumed, by ``time.perf_counter``."""
+    """Time it had taken before it was last resumed, without compilation, in seconds."""
+    began: float = dataclasses.field(default_factory=clock)
+    """When it was started or last resumed, by :func:`rejeu.xla.clock`."""
 
     @property
     def elapsed(self) -> float:
-        """Wall time it has taken, without interruptions, in seconds."""
-        return self.spent + time.perf_counter() - self.began
+        """Time it has taken, without interruptions and compilation, in seconds."""
+        return self.spent + clock() - self.began
 
     @property
     def last_step(self) -> int | None:
@@ -330,7 +331,7 @@ class TrainingCall:
             CheckpointError: if the values are damaged.
         """
         call = convert(saved, cls)
-        call.began = time.perf_counter()
+        call.began = clock()
         return call
 
 

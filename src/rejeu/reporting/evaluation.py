@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rejeu import interrupt
+from rejeu import interrupt, xla
 from rejeu.envs.base import VectorEnv
 from rejeu.reporting import statistics
 from rejeu.reporting.formatting import counted, html_table
@@ -159,8 +158,8 @@ def evaluate(
         success_threshold: return of a successful episode, if the environment does not report success; None for the
             environment's reward threshold.
         seed: seed of the environments; None continues their random state.
-        seconds: wall time after which no episode is started, None for no limit. Every environment with a share of the
-            episodes plays at least one.
+        seconds: time, without compilation, after which no episode is started, None for no limit. Every environment with a
+            share of the episodes plays at least one.
 
     Raises:
         Stopped: if Ctrl-C or SIGTERM asks training to stop.
@@ -171,7 +170,7 @@ def evaluate(
         raise ValueError(f"episodes={episodes} must be at least 1")
     n_envs, most = env.n_envs, np.iinfo(np.int64).max
     to_play = np.full(n_envs, most) if episodes is None else (episodes + np.arange(n_envs)) // n_envs
-    end = math.inf if seconds is None else time.perf_counter() + seconds
+    end = math.inf if seconds is None else xla.clock() + seconds
     total, length = np.zeros(env.n_envs), np.zeros(env.n_envs, int)
     longest = max(MOST_STEPS, env.max_episode_steps or 0)
     rows: list[tuple[float, int, float]] = []
@@ -189,7 +188,7 @@ def evaluate(
             if to_play[i]:
                 value = step.return_of(i, total[i])
                 rows.append((value, length[i], env.judge(step, i, value, success_threshold)))
-                to_play[i] = 0 if endless[i] or time.perf_counter() >= end else to_play[i] - 1
+                to_play[i] = 0 if endless[i] or xla.clock() >= end else to_play[i] - 1
             total[i] = length[i] = 0
         cut += int(endless.sum())
         obs = env.reset_done(done) if done.any() and to_play.any() else step.obs

@@ -25,6 +25,7 @@ from rejeu.loops.device.trainer import DeviceTrainer, group_size
 from rejeu.loops.finite import NonFiniteUpdate
 from rejeu.loops.learner import Learner
 from rejeu.loops.run import Progress, Run, add_time, start_clock
+from rejeu.xla import clock
 
 SECONDS = 0.2
 """Wall time of a chunk that is aimed at: progress bar, callbacks and Ctrl-C wait for its end."""
@@ -148,7 +149,7 @@ def take_chunks(
             np.uint32(leader.learn_from),
             np.bool_(trainer.program.uses_part(leader, n_turns, last)),
         )
-        began = time.perf_counter()
+        began, paced = time.perf_counter(), clock()
         trainer.take(limits, active)
         for i in active:
             if trainer.fault(i):
@@ -159,7 +160,7 @@ def take_chunks(
             pulling = time.perf_counter()
             turns[i] = trainer.pull(i)
             add_time(runs[i], "replay", pulling)
-        pace.note(n_turns, time.perf_counter() - began)
+        pace.note(n_turns, clock() - paced)
         if step <= leader.learn_from <= leader.step:
             pace.turns = min(8, pace.turns)
         known = held(runs)
@@ -207,12 +208,8 @@ class Pace:
     def __init__(self, capacity: int) -> None:
         self.turns = min(8, capacity)
         self._capacity = capacity
-        self._is_first = True
 
     def note(self, n_turns: int, seconds: float) -> None:
-        """Takes into account that so many turns took so long; the first chunk also compiles."""
-        if self._is_first:
-            self._is_first = False
-            return
+        """Takes into account that so many turns took so long, without compilation."""
         wanted = int(n_turns * SECONDS / max(seconds, 1e-6))
         self.turns = min(max(wanted, 1), 8 * self.turns, self._capacity)
