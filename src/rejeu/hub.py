@@ -21,7 +21,7 @@ from rejeu.errors import MissingExtra
 from rejeu.io.records import brief
 from rejeu.reporting import run_list, runs, statistics
 from rejeu.reporting.formatting import counted
-from rejeu.runs.folder import RunFolder, find_model
+from rejeu.runs.folder import find_model
 
 FILES = ("config.json", "episodes.csv", "metrics.csv", "evaluations.csv", "curve.png", "video.mp4")
 """Files of a run folder that are pushed, besides the model."""
@@ -72,8 +72,7 @@ def push(source: str | Path, repo: str, private: bool = False, note: Callable[[s
         MissingExtra: if ``huggingface-hub`` is not installed.
     """
     source = Path(source)
-    best = not source.is_dir() or RunFolder(source).best.is_file()
-    model = find_model(source, "best" if best else "last")
+    model = find_model(source)
     agent = load(model)
     with tempfile.TemporaryDirectory() as made, interface() as hub:
         room = Path(made)

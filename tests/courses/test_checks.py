@@ -22,8 +22,9 @@ EACH_RIGHT = pytest.mark.parametrize(
 
 
 @pytest.fixture(autouse=True)
-def notebook():
+def notebook(monkeypatch):
     """Sets what a notebook has: a language, and JAX's own rule for broadcasting."""
+    monkeypatch.setenv("REJEU_LANGUAGE", "en")  # restored at the end
     checks.speak("en")
     with jax.numpy_rank_promotion("allow"):
         yield
@@ -52,6 +53,7 @@ def test_unfilled_exercises_and_errors_give_one_line(check, answer, language, ca
         out = capsys.readouterr().out
         assert len(out.splitlines()) == 1
         assert out.startswith({"en": "Not yet - ", "fr": "Pas encore - "}[language])
+        assert "...." not in out  # the three dots of the exercise and a full stop
     assert "NameError: name 'undefined_name' is not defined" in out
     assert "return undefined_name + 1" in out
 

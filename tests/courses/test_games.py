@@ -24,9 +24,9 @@ def test_a_french_notebook_says_so_in_french(monkeypatch, capsys):
         raise OSError("cannot open a window")
 
     monkeypatch.setattr("rejeu.play.play", play)
+    monkeypatch.setenv("REJEU_LANGUAGE", "en")  # restored at the end
     checks.speak("fr")
     assert courses.by_hand("Mountain", episodes=3) == []
-    checks.speak("en")
     assert "Impossible d'ouvrir une fenêtre" in capsys.readouterr().out
 
 

@@ -1,6 +1,7 @@
 """The leaderboard of a folder of models: ranks, limits, and files that are not what they should be."""
 
 import json
+import zipfile
 
 import pytest
 
@@ -46,6 +47,56 @@ def test_models_are_ranked_and_other_files_get_one_line_each(folder, tmp_path, c
     assert reasons.keys() == {"cut", "empty", "flipped", "other"}
     assert reasons["other"] == "it was trained on MountainCar-v0, not on CartPole-v1"
     assert "checksum" in reasons["flipped"]
+
+
+@pytest.fixture
+def entrants(tmp_path):
+    """A file of ``rejeu.sb3``, a copy of it under another suffix and another name, a run folder, and a zip file of others."""
+    agent = rejeu.DQN("MlpPolicy", "CartPole-v1", policy_kwargs={"net_arch": [8]}, seed=0)
+    for name in (
+        "anna.zip",
+        "anna.safetensors",
+        "ben/best.safetensors",
+        "ben/agent.safetensors",
+        "odd/agent.safetensors",
+    ):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        agent.save(tmp_path / name)
+    (tmp_path / "ben" / "config.json").write_text("{}", encoding="utf-8")
+    with zipfile.ZipFile(tmp_path / "theirs.zip", "w") as file:
+        file.writestr("data", "{}")
+    return tmp_path
+
+
+def test_zip_files_are_models_and_a_run_folder_is_one_entrant(entrants, capsys):
+    run(entrants, entrants / "board.json")
+    board = json.loads((entrants / "board.json").read_text(encoding="utf-8"))
+    names = ["anna.safetensors", "anna.zip", "ben", "odd/agent"]
+    assert [model["name"] for model in board["models"]] == names
+    assert board["equal_files"] == [names]
+    (other,) = board["not_evaluated"]
+    assert other["name"] == "theirs"
+    assert "rejeu import" in other["reason"]
+    run(entrants, entrants / "board.md", "--language", "fr")
+    assert f"- Le même fichier : {', '.join(names)}" in (entrants / "board.md").read_text(encoding="utf-8")
+
+
+def test_a_run_folder_alone_has_its_own_name(entrants):
+    run(entrants / "ben", entrants / "board.json")
+    (model,) = json.loads((entrants / "board.json").read_text(encoding="utf-8"))["models"]
+    assert model["name"] == "ben"
+
+
+def test_the_language_is_that_of_the_setting(folder, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("REJEU_LANGUAGE", "fr")
+    run(folder, tmp_path / "board.md")
+    out = capsys.readouterr().out
+    assert out.startswith("CartPole-v1, 3 épisodes pour chacun des 6 modèles\nanna : retour moyen ")
+    assert "\ncut : le fichier est endommagé" in out
+    assert "- cut : le fichier" in (tmp_path / "board.md").read_text(encoding="utf-8")
+    monkeypatch.setenv("REJEU_LANGUAGE", "de")
+    assert run(folder, tmp_path / "board.md") == 2
+    assert "language 'de' must be one of en, fr" in capsys.readouterr().err
 
 
 def test_all_models_play_the_same_episodes(folder, tmp_path):
@@ -139,7 +190,7 @@ def test_invalid_options_give_one_line(folder, options, message, capsys):
 
 def test_a_folder_without_models_gives_one_line(tmp_path, capsys):
     assert main(["class", str(tmp_path)]) == 2
-    assert "holds no .safetensors files" in capsys.readouterr().err
+    assert "holds no .safetensors or .zip files" in capsys.readouterr().err
     assert main(["class", str(tmp_path / "missing")]) == 2
     assert "there is no folder" in capsys.readouterr().err
 
@@ -159,7 +210,7 @@ def test_large_files_and_symbolic_links_are_not_opened(tmp_path, monkeypatch, ca
     assert [one["name"] for one in board["not_evaluated"]] == ["large"]
     assert "MiB at most" in board["not_evaluated"][0]["reason"]
     run(tmp_path, tmp_path / "board.md", "--language", "fr")
-    assert "- large: le fichier a 0 Mio, au lieu de 0 Mio au plus" in (tmp_path / "board.md").read_text("utf-8")
+    assert "- large : le fichier a 0 Mio, au lieu de 0 Mio au plus" in (tmp_path / "board.md").read_text("utf-8")
 
 
 def test_a_model_whose_spaces_are_not_those_of_its_environment_is_not_ranked(tmp_path):
@@ -176,5 +227,5 @@ def test_json_is_all_of_standard_output(folder, tmp_path, capsys):
     assert run(folder, tmp_path / "board.md", "--json") == 0
     printed = capsys.readouterr()
     board = json.loads(printed.out)
-    assert board.keys() == {"env_id", "episodes", "models", "not_evaluated", "file"}
+    assert board.keys() == {"env_id", "episodes", "models", "not_evaluated", "equal_files", "file"}
     assert "cut: " in printed.err

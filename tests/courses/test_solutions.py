@@ -67,9 +67,9 @@ def test_a_solution_is_graded_as_right_and_an_exercise_as_not_yet(source, tmp_pa
             (tmp_path / f"{version}{ending}").write_text(text, encoding="utf-8")
     assert main(["course", "grade", str(tmp_path / "solution.ipynb"), str(tmp_path / "exercise.py")]) == 0
     solution, exercise, *rest = capsys.readouterr().out.splitlines()
-    n = int(solution.split(" of ")[1].split()[0])
-    assert solution == f"{tmp_path / 'solution.ipynb'}: {n} of {n} passed"
-    assert exercise == f"{tmp_path / 'exercise.py'}: 0 of {n} passed"
+    n = int(solution.split(" sur ")[1])
+    assert solution == f"{tmp_path / 'solution.ipynb'} : {n} réussies sur {n}"
+    assert exercise == f"{tmp_path / 'exercise.py'} : 0 réussies sur {n}"
     assert len(rest) == n
     assert len(set(rest)) >= n - 2
 

@@ -7,15 +7,18 @@ import sys
 import time
 import warnings
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
 import rejeu
 from rejeu.cli import main
 from rejeu.envs.registry import make_env
+from rejeu.language import french
 from rejeu.play import Game, play, watch
 from rejeu.play.game import Player
-from rejeu.play.window import HEADER, MARGIN, Window, message, score_summary
+from rejeu.play.keys import KNOWN, keys_for
+from rejeu.play.window import HEADER, HELP, MARGIN, Window, legend, message, score_summary
 from tests.playing import LEVER, Pull, down, error_of, hold, lever, perform, pygame, tap, up
 
 
@@ -350,6 +353,20 @@ def test_scores_are_summed_up_once_there_is_one():
     player.scores.append(-3.0)
     assert score_summary(player, by_hand=False) == "mean -3 of 1 episode   best -3"
     assert score_summary(player, by_hand=True) == "best -3"
+
+
+def test_a_french_window(monkeypatch):
+    monkeypatch.setenv("REJEU_LANGUAGE", "fr")
+    player = Player("you", None, None, steps=5, over=True, success=1.0, score=2.5, scores=[2.5])
+    assert score_summary(player, by_hand=False) == "moyenne 2.5 sur 1 épisode   meilleur 2.5"
+    assert message(Game([player], 0), player) == "réussi : 2.5"
+    entries = legend(keys_for("LunarLander-v3", gym.spaces.Discrete(4), None))
+    assert [entry.label for entry in entries][:3] == ["gauche", "droite", "moteur principal"]
+
+
+def test_every_text_of_a_window_and_a_grade_has_a_translation():
+    labels = {label for entries in KNOWN.values() for _, label in entries.values()}
+    assert {*labels, *(label for _, label in HELP), "you", "agent", "success", "failed", "over"} <= {*french(), ""}
 
 
 def test_a_smaller_window_shows_everything_smaller():

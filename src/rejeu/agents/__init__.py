@@ -14,7 +14,6 @@ from typing import Any, TypeVar
 import gymnasium as gym
 
 from rejeu import presets as all_presets
-from rejeu.agents import model_files
 from rejeu.agents.agent import Agent
 from rejeu.agents.off_policy import (
     DDPG,
@@ -39,6 +38,7 @@ from rejeu.errors import CheckpointError
 from rejeu.io import checkpoint
 from rejeu.io.records import shown
 from rejeu.presets import Preset
+from rejeu.runs.folder import find_model
 from rejeu.validation import whole_seed
 
 __all__ = [
@@ -252,6 +252,6 @@ def load(path: str | Path, env: Any = None, **changes: Any) -> Agent:
     Raises:
         CheckpointError: also if the algorithm is not registered; the message says what to import.
     """
-    path = model_files.find(path)
+    path = find_model(path)
     agent = agent_of_file(checkpoint.read_header(path, "agent").get("algorithm"), path)
     return agent.load(path, env, **changes)

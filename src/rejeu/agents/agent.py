@@ -21,6 +21,7 @@ from rejeu.reporting import summary
 from rejeu.reporting.evaluation import Evaluation, evaluate
 from rejeu.reporting.formatting import counted
 from rejeu.reporting.logging import Logger, Sink
+from rejeu.runs.folder import find_model
 from rejeu.validation import number, whole
 
 if TYPE_CHECKING:
@@ -59,8 +60,8 @@ class Agent(BaseAgent):
                 Weights and buffer are kept in either case.
             progress_bar: show a progress bar.
             episodes: stop after this number of episodes, over all environments.
-            minutes: stop after this wall time. Schedules follow the nearest limit; with ``reset_num_timesteps=False``
-                earlier episodes and training time count as earlier steps do.
+            minutes: stop after so many, without compilation. Schedules follow the nearest limit; with
+                ``reset_num_timesteps=False`` earlier episodes and training time count as earlier steps do.
             sinks: further outputs for the rows of statistics, such as ``rejeu.reporting.logging.CsvFile(path)`` or
                 ``rejeu.reporting.trackers.WandB(project="car")``; they are not closed.
 
@@ -154,7 +155,7 @@ class Agent(BaseAgent):
             seed: of the environments; None draws one for new environments and does not seed others.
             success_threshold: least return of a successful episode where the environment does not report success; None:
                 that of the agent.
-            minutes: of wall time, after which no further episode starts. Episodes that have started are completed and
+            minutes: without compilation, after which no further episode starts. Episodes that have started are completed and
                 count, so that long ones are not left out, and every environment plays at least one. None for no limit.
 
         A callback may call it during ``learn``. If it uses the training environments, training continues in new
@@ -257,7 +258,7 @@ class Agent(BaseAgent):
             FileNotFoundError: if there is no such file.
             CheckpointError: if the file is damaged, or its algorithm, spaces, schema or shapes do not match.
         """
-        with checkpoint.opened(model_files.find(path), "agent") as file:
+        with checkpoint.opened(find_model(path), "agent") as file:
             agent = model_files.load(
                 cls, file, lambda agent: None if env is None else agent.make_envs(env, seed=agent.seed), changes
             )

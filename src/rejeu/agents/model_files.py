@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeVar
 
 import gymnasium as gym
@@ -184,23 +182,6 @@ def trained_on(header: Mapping[str, Any]) -> tuple[str, dict[str, Any]] | None:
     if not isinstance(said, dict) or not is_plain_id(said.get("env_id")) or not are_plain(said.get("env_kwargs")):
         return None
     return said["env_id"], said["env_kwargs"]
-
-
-def find(path: str | Path) -> str | Path:
-    """Returns the model of a run folder, the best one if it exists, or the path itself if it is not a folder.
-
-    Raises:
-        FileNotFoundError: if a folder holds no model.
-    """
-    folder = Path(path)
-    if not os.path.isdir(folder) or (folder.name not in ("", "..") and checkpoint.resolve(path).is_file()):
-        return path
-    for name in ("best", "agent"):
-        if (folder / f"{name}.safetensors").is_file():
-            return folder / f"{name}.safetensors"
-    raise FileNotFoundError(
-        f"{str(path)!r} is a folder without a model; a run folder holds best.safetensors or agent.safetensors"
-    )
 
 
 def load(

@@ -21,7 +21,9 @@ EPISODES = "Episodes of each evaluation; by default the preset's, else 20."
 
 Which = Annotated[Literal["best", "last"], Shown("{best,last}", help=WHICH)]
 EnvironmentId = Annotated[str, Shown("ENV", is_positional=True)]
-ModelPath = Annotated[Path, Shown("RUN", is_positional=True, help="Folder of a run, or a .safetensors file.")]
+ModelPath = Annotated[
+    Path, Shown("RUN", is_positional=True, help="Folder of a run, or a model file (.safetensors, .zip).")
+]
 RunPath = Annotated[Path, Shown("RUN", is_positional=True, help="Its folder.")]
 Count = Annotated[Positive | None, Shown("N")]
 EnvCount = Annotated[Annotated[int, Meta(ge=1, le=MAX_ENVS)] | None, Shown("N")]
@@ -100,7 +102,7 @@ class Clone(RunOptions):
     critic_updates: Annotated[int, Meta(ge=0), Shown("N")] = 0
     """Then gradient steps of the critics alone on the dataset: before rejeu resume trains SAC, TD3 or a relative of them."""
     expert: Annotated[Path | None, Shown("RUN")] = None
-    """Folder of a run, or a .safetensors file, of the agent that labels what the clone does."""
+    """Folder of a run, or a model file, of the agent that labels what the clone does."""
     by_hand: bool = False
     """Be the expert: open a window in which you take over from the clone while you hold a key."""
     fps: Rate = None
@@ -251,7 +253,7 @@ class Evaluate(RunOptions):
     episodes: Count = None
     """How many; 100, or with --minutes as many as there is time for."""
     minutes: Minutes = None
-    """Wall time after which no further episode begins; running episodes are finished."""
+    """Time, without compilation, after which no further episode begins; running episodes are finished."""
     backend: Annotated[str, Shown("NAME")] = "auto"
     """auto, envpool, gymnasium, gymnasium-async or jax; gymnasium is the environment's own package."""
     device: Annotated[str, Shown("NAME")] = "auto"
@@ -322,7 +324,7 @@ class Play(EnvironmentOptions):
     record: Folder = None
     """New or empty folder for a Minari dataset and a video of what you play."""
     against: Annotated[Path | None, Shown("RUN")] = None
-    """Folder of a run, or a .safetensors file, whose agent plays the same episodes next to you."""
+    """Folder of a run, or a model file, whose agent plays the same episodes next to you."""
     which: Which = "best"
     json: Json = False
 
@@ -409,19 +411,19 @@ class Class(EnvironmentOptions):
     """
 
     folder: Annotated[Path, Shown("FOLDER", is_positional=True)]
-    """Folder with .safetensors files, also in folders in it. Their names are the names on the leaderboard."""
+    """Folder with .safetensors and .zip files and run folders, also in folders in it. The leaderboard has their names."""
     env: Annotated[str | None, Shown("ENV")] = None
     """Environment, as for rejeu train; by default the one that most models were trained on."""
     episodes: Annotated[Positive, Shown("N")] = 50
     """Episodes of each model, up to 1000."""
     minutes: Annotated[Duration, Shown("M")] = 1.0
-    """Wall time of each model; one that needs more is not ranked."""
+    """Time of each model, without compilation; one that needs more is not ranked."""
     seed: Annotated[Seed, Shown("N")] = 0
     """Of the episodes, the same for all models."""
     success_threshold: Return = None
     """Return from which on an episode counts as a success; by default the environment's own. That of a file is not used."""
-    language: Annotated[Literal["en", "fr"], Shown("{en,fr}")] = "en"
-    """Of the leaderboard."""
+    language: Annotated[Literal["en", "fr"] | None, Shown("{en,fr}")] = None
+    """Of the leaderboard; by default that of the environment variable REJEU_LANGUAGE, else English."""
     out: Annotated[Path, Shown("FILE")] = Path("leaderboard.html")
     """Page to write; a name that ends in .md or .json is written as Markdown or JSON."""
     json: Json = False

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ from rejeu.cli.commands import Class, Course
 from rejeu.cli.output import echo
 from rejeu.courses import grading, leaderboard, write
 from rejeu.io import atomic
+from rejeu.language import chosen, said
 from rejeu.validation import whole
 
 MAX_EPISODES = 1_000
@@ -36,10 +38,11 @@ def grade(arguments: Course) -> tuple[int, dict[str, Any]]:
     for path in arguments.paths:
         one = grading.grade(path)
         grades.append(one)
-        echo(f"{path}: {one.error or f'{one.n_passed} of {len(one.found)} passed'}")
+        say = partial(said, language=one.language)
+        echo(say("{}: {}", path, one.error or say("{} of {} passed", one.n_passed, len(one.found))))
         for name, found in one.found.items():
             if found != "" and not one.error:
-                echo(f"  {name}: {found or 'its check did not run; is there an error in its cell?'}")
+                echo(say("{}: {}", f"  {name}", found or say("its check did not run; is there an error in its cell?")))
     status = 2 if any(one.error for one in grades) else 0
     return status, {"notebooks": [one._asdict() | {"passed": one.n_passed} for one in grades]}
 
@@ -51,11 +54,11 @@ def run_class(arguments: Class) -> tuple[int, dict[str, Any]]:
     out = arguments.out
     if out.suffix not in formats:
         raise ValueError(f"--out {out} must end in {', '.join(formats)}")
-    paths = leaderboard.models(arguments.folder)
+    paths, language = leaderboard.models(arguments.folder), arguments.language or chosen()
     if out.suffix == ".html":
         leaderboard.template()  # a missing package is named before the evaluations
     made = environment.from_arguments(arguments.env or leaderboard.usual_env_id(paths), arguments)
-    echo(f"{made}, {episodes} episodes of each of {len(paths)} models")
+    echo(said("{}, {} episodes of each of {} models", made, episodes, len(paths), language=language))
     board = leaderboard.build(
         arguments.folder,
         paths,
@@ -65,7 +68,7 @@ def run_class(arguments: Class) -> tuple[int, dict[str, Any]]:
         arguments.seed,
         60 * arguments.minutes,
         arguments.success_threshold,
-        arguments.language,
+        language,
         echo,
     )
     echo(atomic.write(out, formats[out.suffix](board)))

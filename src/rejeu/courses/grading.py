@@ -11,6 +11,7 @@ import contextlib
 import io
 import json
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -19,11 +20,13 @@ from typing import Any, NamedTuple
 
 from rejeu.courses import checks
 from rejeu.courses.notebooks import jupytext
+from rejeu.language import Language, checked, chosen, said
 
 SECONDS = 120.0
 """Time limit of a notebook."""
 MODULES = {"jax", "jnp", "math", "np"}
 """Modules whose functions may be called for a constant, such as ``np.linspace(0, 1)``."""
+SPEAK = re.compile(r"""^speak\(["'](en|fr)["']\)""", re.MULTILINE)
 MAX_BYTES = 64 * 2**20
 """Largest notebook, with its figures."""
 
@@ -36,6 +39,8 @@ class Grade(NamedTuple):
     """By check, in the order of the notebook: nothing if the answer is right, else the message; None if it did not run."""
     error: str = ""
     """Why the notebook could not be graded."""
+    language: Language = "en"
+    """Of the notebook."""
 
     @property
     def n_passed(self) -> int:
@@ -51,14 +56,16 @@ def grade(path: Path, seconds: float = SECONDS) -> Grade:
         OSError: if the file cannot be read.
     """
     if path.stat().st_size > MAX_BYTES:
-        return Grade(path, {}, f"it is larger than {MAX_BYTES // 2**20} MiB")
+        return Grade(path, {}, said("it is larger than {} MiB", MAX_BYTES // 2**20))
     try:
         cells = [cell.source for cell in jupytext().read(path).cells if cell.cell_type == "code"]
     except Exception as error:  # jupytext and nbformat raise errors of many kinds
-        return Grade(path, {}, f"it is not a notebook ({checks.short(error)})")
+        return Grade(path, {}, said("it is not a notebook ({})", checks.short(error)))
     names = [name for cell in cells for name in _checks(cell)]
     if not names:
-        return Grade(path, {}, "it has no checks of a course")
+        return Grade(path, {}, said("it has no checks of a course"))
+    spoken = SPEAK.search("\n".join(cells))
+    language = chosen() if spoken is None else checked(spoken[1])
     command = [sys.executable, "-c", "from rejeu.courses.grading import main; main()"]
     quiet = {"MPLBACKEND": "agg", "PYTHONIOENCODING": "utf-8"}
     try:
@@ -73,10 +80,17 @@ def grade(path: Path, seconds: float = SECONDS) -> Grade:
         )
         found = json.loads(done.stdout.splitlines()[-1])
     except subprocess.TimeoutExpired:
-        return Grade(path, dict.fromkeys(names), f"it took longer than {seconds:g} seconds")
+        return Grade(
+            path, dict.fromkeys(names), said("it took longer than {:g} seconds", seconds, language=language), language
+        )
     except (IndexError, ValueError):
-        return Grade(path, dict.fromkeys(names), f"its process ended ({checks.short(done.stderr[-160:])})")
-    return Grade(path, {name: found.get(name) for name in names})
+        return Grade(
+            path,
+            dict.fromkeys(names),
+            said("its process ended ({})", checks.short(done.stderr[-160:]), language=language),
+            language,
+        )
+    return Grade(path, {name: found.get(name) for name in names}, language=language)
 
 
 def main() -> None:

@@ -6,12 +6,12 @@ the same episodes: each in an environment of its own, with the same seeds for al
 
 from __future__ import annotations
 
+import hashlib
 import math
-import time
 import tomllib
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from functools import cache
 from html import escape
@@ -21,15 +21,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rejeu import xla
 from rejeu.agents import load
 from rejeu.agents.policy import policy
-from rejeu.courses.notebooks import Language
 from rejeu.envs.make import VectorEnv
 from rejeu.envs.registry import is_plain_id
 from rejeu.errors import MissingExtra
 from rejeu.io import checkpoint
 from rejeu.io.records import shown
+from rejeu.language import Language, said
 from rejeu.reporting.evaluation import Evaluation, evaluate
+from rejeu.runs.folder import RunFolder, find_model
 
 if TYPE_CHECKING:
     from jinja2 import Template
@@ -75,6 +77,8 @@ class Leaderboard:
     problems: tuple[tuple[str, str], ...]
     """Name and reason."""
     language: Language = "en"
+    equal: tuple[tuple[str, ...], ...] = ()
+    """Names of files with the same bytes."""
 
     @property
     def texts(self) -> Mapping[str, Any]:
@@ -91,18 +95,43 @@ def texts() -> dict[str, dict[str, Any]]:
 def models(folder: Path) -> list[Path]:
     """Returns the model files in a folder and the folders in it, sorted; symbolic links are not followed.
 
-    The checkpoints of a run folder are no models.
+    A run folder is one model, the best, and its checkpoints are none.
 
     Raises:
         FileNotFoundError: if there is no such folder, or no model in it.
     """
     if not folder.is_dir():
         raise FileNotFoundError(f"there is no folder {folder}")
-    files = (path for path in folder.rglob("*.safetensors") if path.is_file() and not path.is_symlink())
-    found = sorted(path for path in files if path.parent.name != "checkpoints")
+    suffixes = (checkpoint.SUFFIX, ".zip")
+    files = (one for one in folder.rglob("*") if one.suffix in suffixes and one.is_file() and not one.is_symlink())
+    found = {find_model(one.parent) if is_of_run(one) else one for one in files if one.parent.name != "checkpoints"}
     if not found:
-        raise FileNotFoundError(f"{folder} holds no .safetensors files; agent.save(name) writes them")
-    return found
+        raise FileNotFoundError(f"{folder} holds no {' or '.join(suffixes)} files; agent.save(name) writes them")
+    return sorted(found)
+
+
+def is_of_run(path: Path) -> bool:
+    """Returns whether a file is one of the models of a run folder."""
+    run = RunFolder(path.parent)
+    return path in (run.best, run.agent) and run.config.is_file()
+
+
+def name_of(path: Path, folder: Path, paths: Sequence[Path]) -> str:
+    """Returns the name of a model among others: its path in the folder, of a run that of the run."""
+    bare = path.parent if is_of_run(path) else path.with_suffix("")
+    is_alone = sum(other.with_suffix("") == bare for other in paths) <= 1
+    return shown((bare if is_alone else path).relative_to(folder).as_posix().replace(".", folder.name, bare == folder))
+
+
+def equal_files(paths: Sequence[Path]) -> list[list[Path]]:
+    """Returns the groups of files with the same bytes."""
+    groups: dict[bytes, list[Path]] = {}
+    for path in paths:
+        with suppress(OSError):
+            if 0 < path.stat().st_size <= MAX_BYTES:
+                with path.open("rb") as file:
+                    groups.setdefault(hashlib.file_digest(file, "sha256").digest(), []).append(path)
+    return [group for group in groups.values() if len(group) > 1]
 
 
 def usual_env_id(paths: Sequence[Path]) -> str:
@@ -159,7 +188,7 @@ def build(
         make_vector: makes a number of environments.
         episodes: episodes of each model.
         seed: seed of the environments, the same for all models.
-        seconds: wall time of each model. One that takes longer is not ranked.
+        seconds: time of each model, without compilation. One that takes longer is not ranked.
         success_threshold: return of a successful episode, the same for all models, if the environment does not report success;
             None for the environment's own. That of a file is not used: its author could choose it.
         language: of the leaderboard.
@@ -167,26 +196,29 @@ def build(
     """
     done: list[Model] = []
     problems = []
-    said = texts()[language]
+    written, board = texts()[language], Leaderboard(env_id, episodes, (), (), language)
     if len(paths) > MAX_MODELS:
-        problems.append((said["more"].format(n=len(paths) - MAX_MODELS), said["first"].format(n=MAX_MODELS)))
+        problems.append((written["more"].format(n=len(paths) - MAX_MODELS), written["first"].format(n=MAX_MODELS)))
     with closing(make_vector(episodes)) as env:
         for path in paths[:MAX_MODELS]:
-            name = shown(path.relative_to(folder).with_suffix("").as_posix())
+            name = name_of(path, folder, paths)
             try:
                 model = evaluated(name, path, env_id, env, episodes, seed, seconds, success_threshold, language)
             except Unranked as error:
                 reason = str(error)
             except PROBLEMS as error:
                 text = str(error).replace(f"{path}: ", "").replace(str(path), "the file") or type(error).__name__
-                reason = said["damaged"].format(reason=shown(" ".join(text.split()), 300))
+                reason = written["damaged"].format(reason=shown(" ".join(text.split()), 300))
             else:
                 done.append(model)
-                report(f"{name}: {model.evaluation}")
+                cells, columns = cells_of(model, board), written["columns"]
+                found = f"{columns[5]} {cells[5]} ({columns[6]} {cells[6]})"
+                report(said("{}: {}", name, found, language=language))
                 continue
             problems.append((name, reason))
-            report(f"{name}: {reason}")
-    return Leaderboard(env_id, episodes, ranked(done), tuple(problems), language)
+            report(said("{}: {}", name, reason, language=language))
+    equal = tuple(tuple(name_of(path, folder, paths) for path in group) for group in equal_files(paths[:MAX_MODELS]))
+    return replace(board, rows=ranked(done), problems=tuple(problems), equal=equal)
 
 
 class Unranked(ValueError):
@@ -210,26 +242,26 @@ def evaluated(
         Unranked: if it is too large or of another environment, takes too long, or has returns that are not finite.
         ValueError: if it is damaged.
     """
-    said = texts()[language]
+    texts_of = texts()[language]
     trained_on = header(path, language).get("env_id")
     if trained_on != env_id:
-        raise Unranked(said["other_env"].format(said=shown(trained_on), env_id=env_id))
-    end = time.perf_counter() + seconds
+        raise Unranked(texts_of["other_env"].format(said=shown(trained_on), env_id=env_id))
+    end = xla.clock() + seconds
     agent = load(path)
     try:
         agent.check_spaces(env, env_id)
     except ValueError as error:
-        raise Unranked(said["spaces"].format(env_id=env_id, reason=error)) from None
+        raise Unranked(texts_of["spaces"].format(env_id=env_id, reason=error)) from None
     choose = policy(agent, deterministic=True)
 
     def within_budget(obs: Any, started: np.ndarray) -> np.ndarray:
-        if time.perf_counter() > end:
-            raise Unranked(said["slow"].format(seconds=seconds, n=episodes))
+        if xla.clock() > end:
+            raise Unranked(texts_of["slow"].format(seconds=seconds, n=episodes))
         return choose(obs, started)
 
     result = evaluate(within_budget, env, episodes, success_threshold, seed)
     if not np.isfinite(result.returns).all():
-        raise Unranked(said["not_finite"])
+        raise Unranked(texts_of["not_finite"])
     return Model(name, agent.name, agent.num_timesteps, agent.seed, result)
 
 
@@ -261,7 +293,13 @@ def to_dict(board: Leaderboard) -> dict[str, Any]:
         for row in board.rows
     ]
     problems = [{"name": name, "reason": reason} for name, reason in board.problems]
-    return {"env_id": board.env_id, "episodes": board.episodes, "models": rows, "not_evaluated": problems}
+    return {
+        "env_id": board.env_id,
+        "episodes": board.episodes,
+        "models": rows,
+        "not_evaluated": problems,
+        "equal_files": board.equal,
+    }
 
 
 def markdown(board: Leaderboard) -> str:
@@ -270,7 +308,9 @@ def markdown(board: Leaderboard) -> str:
     rows = [columns, ["---"] * len(columns), *([quoted(cell) for cell in cells_of(row, board)] for row in board.rows)]
     lines = ["| " + " | ".join(cells) + " |" for cells in rows]
     lines += ["", f"{board.env_id}, {board.texts['episodes'].format(n=board.episodes)}.", ""]
-    lines += [f"- {quoted(name)}: {quoted(reason)}" for name, reason in board.problems]
+    for name, reason in board.problems:
+        lines.append(said("{}: {}", f"- {quoted(name)}", quoted(reason), language=board.language))
+    lines += [f"- {board.texts['equal']}{quoted(', '.join(names))}" for names in board.equal]
     return "\n".join(lines).rstrip() + "\n"
 
 

@@ -42,10 +42,9 @@ from typing import Any, Literal, get_args
 
 from rejeu.errors import MissingExtra
 from rejeu.io.atomic import make_folder
+from rejeu.language import LANGUAGES, Language
 
-Language = Literal["en", "fr"]
 Version = Literal["exercise", "solution"]
-LANGUAGES: tuple[Language, ...] = get_args(Language)
 
 ANSWER: dict[Language, str] = {"en": "*Your answer:* ...", "fr": "*Votre réponse :* ..."}
 """What stands in an exercise in place of an answer."""

@@ -300,7 +300,7 @@ def load_policy(path: str | Path) -> NumpyPolicy:
     For fully connected networks of every algorithm but RecurrentPPO. No code from the file is run.
 
     Args:
-        path: of a model file, or of a run folder, whose best model is taken.
+        path: of a run folder or a model file; see :func:`rejeu.load`.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -313,9 +313,8 @@ def load_policy(path: str | Path) -> NumpyPolicy:
     >>> action.shape
     (1,)
     """
-    model = find_model(Path(path), "best") if Path(path).is_dir() else path
     to_do = "export it with rejeu export --to onnx"
-    with checkpoint.opened(model, "agent") as file:
+    with checkpoint.opened(find_model(path), "agent") as file:
         name = file.header.get("algorithm")
         prefix = ACTORS.get(name) if isinstance(name, str) else None
         prefixes = [f"{before}{prefix}." for before in ("", "learner.", "learner.learner.")]

@@ -256,7 +256,7 @@ def opened(path: str | Path, kind: str) -> Iterator[Contents]:
     """
     with contextlib.ExitStack() as stack:
         with _explained(path):
-            path = _existing(path)
+            path = existing(path)
             file = stack.enter_context(TensorFile(path))
             header, sums = _head(path, file, kind)
             size, memory = path.stat().st_size, physical_memory()
@@ -314,8 +314,8 @@ def within(found: Mapping[str, Any], prefix: str) -> dict[str, Any]:
     return {name.removeprefix(prefix): value for name, value in found.items() if name.startswith(prefix)}
 
 
-def _existing(path: str | Path) -> Path:
-    """Returns the path of an existing file, as :func:`opened` looks for it."""
+def existing(path: str | Path) -> Path:
+    """Returns the path of an existing file, of another suffix of models if it has none."""
     path = resolve(path)
     if path.suffix in (SUFFIX, *FOREIGN) and not path.exists():
         others = (path.with_suffix(suffix) for suffix in (SUFFIX, *FOREIGN))

@@ -17,6 +17,7 @@ from rejeu.demonstrations.recording import Recording
 from rejeu.envs.in_process import InProcess
 from rejeu.envs.rendering import natural_fps, rgb_frame
 from rejeu.envs.validation import id_of
+from rejeu.language import said
 from rejeu.loops.run import Progress
 from rejeu.play.game import Game, Player
 from rejeu.play.keys import CONTROLS, keys_for
@@ -45,7 +46,7 @@ class Seat:
         self.fps = natural_fps(env) if fps is None else number("fps", fps, above=0)
         self.player = Player("agent", env, lambda obs, held, step: None, frame=rgb_frame(env), over=False)
         self.game = Game([self.player], 0, self.keys.names, phase="running")
-        self.window = Window(f"rejeu {id_of(env)}: hold a key to take over")
+        self.window = Window(said("{}: hold a key to take over", f"rejeu {id_of(env)}"))
         self.window.open(self.game, self.keys)
 
     def action(self) -> Any:

@@ -10,6 +10,7 @@ import numpy as np
 
 from rejeu import hardware
 from rejeu.errors import MissingExtra
+from rejeu.language import said
 from rejeu.play.game import Game, Player
 from rejeu.play.keys import KeyMap, equivalent_keys
 from rejeu.reporting.formatting import counted
@@ -162,10 +163,10 @@ class Window:
         self.pygame.display.flip()
 
     def _draw_header(self, player: Player, left: int, width: int, by_hand: bool) -> None:
-        self._write(player.name, (left, 12), 24, INK)
+        self._write(said(player.name), (left, 12), 24, INK)
         self._write(score_summary(player, by_hand), (left + width, 14), 22, FAINT, right=True)
-        self._write(f"score {number(player.score)}", (left, 37), 24, BLUE)
-        self._write(f"step {player.steps}", (left + width, 38), 22, FAINT, right=True)
+        self._write(said("score {}", number(player.score)), (left, 37), 24, BLUE)
+        self._write(said("step {}", player.steps), (left + width, 38), 22, FAINT, right=True)
 
     def _draw_picture(self, frame: np.ndarray, corner: tuple[int, int], size: tuple[int, int]) -> None:
         height, width = frame.shape[:2]
@@ -185,7 +186,7 @@ class Window:
 
     def _arrange(self, width: int) -> list[list[tuple[Entry, int]]]:
         """Returns the rows of the legend, each entry with its left edge; the window's keys come last."""
-        entries = [*self._legend, *(Entry([(key, frozenset())], label) for key, label in HELP)]
+        entries = [*self._legend, *(Entry([(key, frozenset())], said(label)) for key, label in HELP)]
         rows: list[list[tuple[Entry, int]]] = [[]]
         left = MARGIN
         for entry in entries:
@@ -223,7 +224,7 @@ def legend(keys: KeyMap) -> list[Entry]:
     """Returns the entries of the legend in the order of the bindings: all keys of each action, and its description."""
     entries: dict[Any, Entry] = {}
     for binding in keys.bindings:
-        entry = entries.setdefault(binding.action, Entry([], binding.label))
+        entry = entries.setdefault(binding.action, Entry([], said(binding.label)))
         entry.keys.append(("+".join(sorted(binding.keys)), equivalent_keys(binding, keys.bindings)))
     return list(entries.values())
 
@@ -232,18 +233,19 @@ def message(game: Game, player: Player) -> str:
     """Returns the message below a player's picture, empty for none."""
     if player.over and player.steps:
         outcome = {1.0: "success", 0.0: "failed"}.get(player.success, "over")
-        return f"{outcome}: {number(player.score)}"
+        return said("{}: {}", said(outcome), number(player.score))
     if game.paused:
-        return "paused"
-    return "press a key to begin" if game.phase == "ready" else ""
+        return said("paused")
+    return said("press a key to begin") if game.phase == "ready" else ""
 
 
 def score_summary(player: Player, by_hand: bool) -> str:
     """Returns a summary of the completed episodes, empty before the first; without the mean if played by hand."""
     if not player.scores:
         return ""
-    best = f"best {number(player.best)}"
-    return best if by_hand else f"mean {number(player.mean)} of {counted(len(player.scores), 'episode')}   {best}"
+    best = said("best {}", number(player.best))
+    mean = said("mean {} of {}", number(player.mean), counted(len(player.scores), said("episode")))
+    return best if by_hand else f"{mean}   {best}"
 
 
 def picture_size(frame: np.ndarray) -> tuple[int, int]:

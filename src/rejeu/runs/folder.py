@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from rejeu.errors import CheckpointError
-from rejeu.io import atomic
+from rejeu.io import atomic, checkpoint
 from rejeu.io.records import WRONG
 from rejeu.runs import config
 from rejeu.runs.config import DecidedRun, quoted
@@ -144,27 +144,28 @@ def read_arrivals(path: Path) -> np.ndarray:
         ) from None
 
 
-def find_model(run: Path, which: Literal["best", "last"]) -> Path:
-    """Returns the model file of a run folder, or ``run`` itself if it is a file.
+def find_model(run: str | Path, which: Literal["best", "last"] = "best") -> Path:
+    """Returns the model of a run folder, or a model file, whose suffix may be left out. All that takes a model takes these.
+
+    The best model of a run that was not evaluated is the last one.
 
     Raises:
         FileNotFoundError: if there is none.
     """
-    if run.is_file():
-        return run
-    folder = RunFolder(run)
-    model = folder.best if which == "best" else folder.agent
-    if not run.is_dir():
-        raise FileNotFoundError(f"there is no run folder or model file {run}")
-    if not model.is_file():
-        newest = newest_inside(run)
-        if newest:
-            raise FileNotFoundError(f"{run} is no run folder{newest}")
-        other = "last" if which == "best" else "best"
-        raise FileNotFoundError(
-            f"{run} holds no {model.name}; is it a run folder? --which {other} takes the other model"
-        )
-    return model
+    path = Path(run)
+    if path.is_file():
+        return path
+    if not path.is_dir() or (path.name not in ("", "..") and checkpoint.resolve(path).is_file()):
+        try:
+            return checkpoint.existing(path)
+        except FileNotFoundError:
+            raise FileNotFoundError(f"there is no run folder or model file {path}") from None
+    folder = RunFolder(path)
+    for model in (folder.best, folder.agent) if which == "best" else (folder.agent,):
+        if model.is_file():
+            return model
+    newest = newest_inside(path) or "; a run folder holds best.safetensors or agent.safetensors"
+    raise FileNotFoundError(f"{str(path)!r} is a folder without a model{newest}")
 
 
 def run_files(folder: Path) -> list[Path]:

@@ -34,6 +34,7 @@ A notebook says once in which language, then calls the checks, and asks for the 
 from __future__ import annotations
 
 import copy
+import os
 import sysconfig
 import tomllib
 import traceback
@@ -47,7 +48,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rejeu.courses.notebooks import LANGUAGES, Language
+from rejeu.language import SETTING, Language, checked, chosen
 
 NOT_STUDENTS = (Path(__file__).parents[2], Path(sysconfig.get_paths()["stdlib"]))
 """Folders whose code the student did not write, besides ``site-packages``."""
@@ -84,7 +85,6 @@ class Session:
     """The state of the checks in a notebook. Mutable."""
 
     def __init__(self) -> None:
-        self.language: Language = "en"
         self.found: dict[str, str] = {}
         """What each check found, by its name: nothing if the answer is right, else the message."""
 
@@ -99,7 +99,7 @@ class Session:
         """
         sections = (messages(course).get(exercise, {}), messages(course).get("shared", {}), messages("base")["shared"])
         text = next(section[key] for section in sections if key in section)
-        return text[self.language].format(**values)
+        return text[chosen()].format(**values)
 
 
 SESSION = Session()
@@ -113,14 +113,12 @@ def messages(course: str) -> dict[str, dict[str, Any]]:
 
 
 def speak(language: Language) -> None:
-    """Sets the language of the messages, and forgets which checks have been passed.
+    """Sets the language of the messages, and of the windows of games, and forgets which checks have been passed.
 
     Raises:
         ValueError: for an unknown language.
     """
-    if language not in LANGUAGES:
-        raise ValueError(f"language {language!r} must be one of {', '.join(LANGUAGES)}")
-    SESSION.language = language
+    os.environ[SETTING] = checked(language)
     SESSION.found.clear()
 
 
@@ -299,7 +297,7 @@ def close(a: Any, b: Any) -> bool:
 
 def short(value: Any) -> str:
     """Returns a value as text on one line of at most 160 characters."""
-    text = "..." if value is ... else " ".join(str(value).split())
+    text = "`...`" if value is ... else " ".join(str(value).split())
     return text if len(text) <= 160 else text[:157] + "..."
 
 
