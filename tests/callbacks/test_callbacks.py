@@ -48,7 +48,7 @@ def scripted_agent(evaluations):
     """An agent whose evaluations are given, and which remembers what was saved."""
     remaining = deque(evaluations)
     saved = []
-    agent = SimpleNamespace(env=None, n_envs=1, saved=saved, remember_best=lambda score, by: True)
+    agent = SimpleNamespace(run=SimpleNamespace(env=None), n_envs=1, saved=saved, remember_best=lambda score, by: True)
     agent.failed_writes, agent.snapshot = FailedWrites(), lambda path: lambda: saved.append(path)
     agent.logger = Logger()
     agent.evaluate = lambda episodes, env, seed: remaining.popleft()
