@@ -116,3 +116,16 @@ def test_a_setting_of_the_networks_says_where_it_belongs(kind):
         TypeError, match=r"PPO takes log_std_init in policy_kwargs: policy_kwargs=\{'log_std_init': ...\}"
     ):
         kind("MlpPolicy", "Pendulum-v1", log_std_init=-1)
+
+
+def test_a_missing_file_is_named_as_it_was_looked_for(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"no file .*model\.zip"):
+        A2C.load(tmp_path / "model")
+
+
+def test_the_old_class_of_hindsight_says_what_replaced_it():
+    from rejeu.sb3 import HER
+
+    for call in (HER, HER.load):
+        with pytest.raises(ImportError, match="replay_buffer_class=HerReplayBuffer"):
+            call("path")

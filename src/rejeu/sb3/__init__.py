@@ -47,6 +47,8 @@ class HER:
             "HER is a replay buffer: SAC(..., replay_buffer_class=HerReplayBuffer); see the documentation"
         )
 
+    load = __init__
+
 
 def __getattr__(name: str) -> Any:
     """Imports an algorithm when it is first used, so that worker processes need not."""

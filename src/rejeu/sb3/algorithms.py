@@ -709,9 +709,9 @@ def written(write: Callable[[Path], Path], path: Any, suffix: str) -> Any:
 def readable(path: Any, suffix: str) -> Iterator[Path]:
     """Yields a path that can be opened: the given one, or with ``suffix``; the content of a file object as a file."""
     if isinstance(path, str | Path):
-        given = Path(path)
-        with_suffix = checkpoint.resolve(given, suffix)
-        yield with_suffix if with_suffix.is_file() and not given.is_file() else given
+        given, with_suffix = Path(path), checkpoint.resolve(path, suffix)
+        is_there = given.exists() or (not with_suffix.is_file() and checkpoint.resolve(given).is_file())
+        yield given if is_there else with_suffix
         return
     path.seek(0)
     with tempfile.TemporaryDirectory() as folder:
