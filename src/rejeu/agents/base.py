@@ -190,7 +190,7 @@ class BaseAgent(ABC):
         hyperparameters = self.converted(hyperparameters)
         known = [*validation.field_names(self.algorithm.Config), *AGENT_ARGUMENTS]
         shape = {*validation.field_names(self.algorithm.Config.policy_kwargs_class)} - {*known}
-        if inside := [key for key in hyperparameters if key in shape]:
+        if inside := [key for key in hyperparameters if key in shape - {*validation.ELSEWHERE}]:
             raise TypeError(f"{self.name} takes {inside[0]} in policy_kwargs: policy_kwargs={{{inside[0]!r}: ...}}")
         validation.check_names(hyperparameters, known, self.name)
         config = self.algorithm.Config(**hyperparameters)
