@@ -114,9 +114,9 @@ def export(
         card["frame_stack"] = {"n": stack.n, "padding": "zero" if stack.zeros else "reset"}
     contents, run = written(made, one, card, target, path.stem, made_from(agent) or (None, {}))
     found = None if run is None else check.compare(one, recording, run)
-    if found is not None and not found.difference <= check.LARGEST_DIFFERENCE:
+    if found is not None and not found.difference <= found.allowed:
         raise ValueError(
-            f"the {target} file differs from predict by {found.difference:.3g}, more than {check.LARGEST_DIFFERENCE:g}, "
+            f"the {target} file differs from predict by {found.difference:.3g}, more than {found.allowed:.3g}, "
             f"on {found.n} observations ({found.source}), and was not kept; please report this with the model"
         )
     note = "" if run is not None else f"not checked, because {MISSING[target]} is not installed"

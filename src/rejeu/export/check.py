@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from rejeu.export.c_file import main_of
@@ -19,8 +20,11 @@ from rejeu.export.loops import TEMPLATES
 from rejeu.export.program import Value
 
 LARGEST_DIFFERENCE = 1e-5
-"""A file whose actions differ by more is not kept. Of an action with bounds in halves of its range, if these are above 1; of
-one without bounds relative to its size, if that is above 1."""
+"""A file whose actions differ by more is not kept, unless the program itself differs from double precision. Of an action with
+bounds in halves of its range, if these are above 1; of one without bounds relative to its size, if that is above 1."""
+ROUNDING = 16.0
+"""How much more a file may differ from ``predict`` than its program in float32 from the same in double precision: formats sum
+in another order."""
 OBSERVATIONS = 1000
 DECISIVE = ("argmax", "floor", "gt")
 """Primitives that make whole numbers of others."""
@@ -53,6 +57,8 @@ class Check(NamedTuple):
     """Median time for one observation, in microseconds."""
     p99: float
     """The time that 99 % of the calls need at most."""
+    allowed: float = LARGEST_DIFFERENCE
+    """The difference up to which a file is kept."""
 
     def __str__(self) -> str:
         ties = f", {self.ties} ties" if self.ties else ""
@@ -84,8 +90,38 @@ def compare(policy: Policy, recording: Recording, run: Run) -> Check:
     low, high = (np.asarray(one, np.float64) for one in (policy.outputs[0].low, policy.outputs[0].high))
     with np.errstate(invalid="ignore"):
         half = np.where(np.isfinite(low) & np.isfinite(high), 0.5 * (high - low), np.abs(expected))
-    difference = np.abs(actions - expected.astype(np.float64)) / np.maximum(half, 1.0)
-    return Check(len(actions), recording.source, float(difference.max(initial=0.0)), 0, p50, p99)
+    far = lambda one, other: float((np.abs(one - other.astype(np.float64)) / np.maximum(half, 1.0)).max(initial=0.0))  # noqa: E731
+    difference, allowed = far(actions, expected), LARGEST_DIFFERENCE
+    if difference > LARGEST_DIFFERENCE:  # where large numbers cancel, or are clipped
+        found = [one_by_one(policy, computed(policy, wide))(recording.inputs)[0] for wide in (False, True)]
+        allowed = max(allowed, ROUNDING * far(*found))
+    return Check(len(actions), recording.source, difference, 0, p50, p99, allowed)
+
+
+def computed(policy: Policy, in_double: bool) -> Callable[[dict[str, np.ndarray]], Mapping[str, Any]]:
+    """Returns a policy as a function from inputs to outputs by name, in double precision or as it is."""
+    wide = lambda x: x.astype(np.float64) if in_double and x.dtype == np.float32 else x  # noqa: E731
+    operations = []
+    for one in policy.program.operations:
+        params = {k: np.dtype("f8") if in_double and is_float32(v) else v for k, v in one.params.items()}
+        inputs = tuple(
+            value if value.data is None else Value(value.shape, value.dtype, wide(value.data)) for value in one.inputs
+        )
+        operations.append(one._replace(inputs=inputs, params=params))
+    program = policy.program._replace(operations=tuple(operations))
+    run = jax.jit(lambda *arrays: program(*arrays))
+
+    def call(inputs: dict[str, np.ndarray]) -> Mapping[str, Any]:
+        with jax.enable_x64(in_double):
+            found = run(*(wide(inputs[port.name]) for port in policy.inputs))
+            return {port.name: np.asarray(one) for port, one in zip(policy.outputs, found, strict=True)}
+
+    return call
+
+
+def is_float32(param: Any) -> bool:
+    """Returns whether a parameter of a primitive is the dtype float32."""
+    return isinstance(param, np.dtype | type) and param in (np.dtype("f4"), np.float32)
 
 
 def is_tie(policy: Policy, inputs: Mapping[str, np.ndarray], row: int) -> bool:
