@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import pickle
 import struct
@@ -13,14 +14,20 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from tests.torch_files import changed, members_of, serialized, torch_file, zipped
+from tests.torch_files import Tensor, changed, members_of, old_torch_file, serialized, torch_file, zipped
 
 BOMB = (
-    b"\x80\x02]q\x00"
+    b"\x80\x02(]q\x00"
     + b"".join(b"]q" + bytes([i]) + b"(" + b"h" + bytes([i - 1]) + b"h" + bytes([i - 1]) + b"e" for i in range(1, 200))
-    + b"."
+    + b"t."
 )
 """A pickle of nested lists whose written form has 2^200 parts."""
+
+
+KWARGS_BOMB = b"\x80\x02}X\x09\x00\x00\x00use_expln" + BOMB[2:-1] + b"s."
+OLD_HEAD = old_torch_file({})[:-12]
+"""What comes before the structure in a file of PyTorch before 1.6."""
+EMPTY_BOX = gym.spaces.Box(np.zeros((2**28, 0), np.float32), np.zeros((2**28, 0), np.float32))
 
 
 class Call:
@@ -89,14 +96,53 @@ def structures() -> Iterator[tuple[str, bytes]]:
         "no marks": b"\x80\x02t.",
         "memo": b"\x80\x02h\xff.",
         "endless": b"\x80\x02]q\x00h\x00a.",
+        "storage named by a bomb": BOMB[:-1] + tensor_pickle((4,), (1,))[2:].replace(b"X\x01\x00\x00\x000", b"h\xc7"),
     }
     for name, content in pickles.items():
         yield name, zipped({"archive/data.pkl": content, "archive/data/0": bytes(16)}, zipfile.ZIP_STORED)
+    many = {"archive/data.pkl": shared_tensors(5_000), "archive/data/0": bytes(2**20)}
+    yield "many tensors of one storage", zipped(many, zipfile.ZIP_STORED)
     yield "compressed", zipped({"archive/data.pkl": b"\x80\x02}.", "archive/data/0": bytes(2**26)})
     yield "path", zipped({"../../archive/data.pkl": b"\x80\x02}.", "/etc/passwd": b""}, zipfile.ZIP_STORED)
     yield "empty", torch_file({})
     yield "number", torch_file(5)
     yield "texts", torch_file({"action_net.weight": "a", "value_net.weight": [1], "log_std": None})
+
+
+def shared_tensors(n: int) -> bytes:
+    """Returns a structure with ``n`` names of one tensor of 2^18 numbers, 5 GB of them together."""
+    tensor = tensor_pickle((2**18,), (1,), 2**18)
+    begin, end = tensor.index(b"ctorch._utils"), tensor.index(b"Rs.") + 1
+    names = b"".join(b"X\x04\x00\x00\x00" + f"{i:04}".encode() + b"h\x01" for i in range(n))
+    return b"\x80\x02}X\x05\x00\x00\x00first" + tensor[begin:end] + b"q\x01s(" + names + b"u."
+
+
+def overfull(valid: bytes, name: str, method: int, n: int) -> bytes:
+    """Returns a file in which a member says that it has ``n`` bytes, and unpacks to 2^28."""
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w") as archive:
+        for key, content in members_of(valid).items():
+            archive.writestr(
+                key, bytes(2**28) if key == name else content, method if key == name else zipfile.ZIP_DEFLATED
+            )
+    found = bytearray(stream.getvalue())
+    sizes = struct.pack("<I", 2**28)
+    for at in (found.find(sizes), found.rfind(sizes)):
+        found[at : at + 4] = struct.pack("<I", n)
+    return bytes(found)
+
+
+def with_many_critics(valid: bytes) -> bytes:
+    """Returns a file with 400 critics that share one storage."""
+    shapes = {"0.weight": (256, 256), "0.bias": (256,), "2.weight": (1, 256), "2.bias": (1,)}
+    one = torch_file({f"critic.qf0.{key}": Tensor(np.zeros(shape)) for key, shape in shapes.items()})
+    inner = members_of(one)
+    key = next(key for key in inner if key.endswith("data.pkl"))
+    pickled = inner[key]
+    begin, end = pickled.index(b"("), pickled.rindex(b"u.")
+    copies = b"".join(pickled[begin + 1 : end].replace(b"critic.qf0", b"critic.%03d" % i) for i in range(400))
+    inner[key] = pickled[: begin + 1] + copies + b"u."
+    return zipped({**members_of(valid), "policy.pth": zipped(inner, zipfile.ZIP_STORED)})
 
 
 def hostile_zips(valid: bytes, n: int, seed: int, ran: Path) -> Iterator[tuple[str, bytes]]:
@@ -155,6 +201,23 @@ def special(valid: bytes, members: dict[str, bytes], ran: Path) -> Iterator[tupl
     for i, space in enumerate(spaces):
         yield f"space {i}", changed(valid, {"observation_space": serialized(space)})
         yield f"action space {i}", changed(valid, {"action_space": serialized(space)})
+    yield "space of no numbers", changed(valid, {"observation_space": serialized(EMPTY_BOX)})
+    bomb = b"\x80\x02}X\x04\x00\x00\x00full" + BOMB[2:-1] + b"s."
+    yield (
+        "shared policy_kwargs",
+        changed(valid, {"policy_kwargs": serialized(bomb)}),
+    )
+    yield "shared use_expln", changed(valid, {"policy_kwargs": serialized(KWARGS_BOMB)})
+    yield "shared space", changed(valid, {"observation_space": serialized(BOMB)})
+    yield "many critics", with_many_critics(valid)
+    for method in (zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA):
+        for member in ("data", "policy.pth"):
+            yield f"{member} overfull by method {method}", overfull(valid, member, method, 1000)
+    yield "old file of tensors", zipped({**members, "policy.pth": old_torch_file({"a": Tensor(np.zeros(3))})})
+    yield "old file cut", zipped({**members, "policy.pth": old_torch_file({"a": Tensor(np.zeros(300))})[:-1000]})
+    large = old_torch_file({"a": Tensor(np.zeros(3))}, size=2**60)
+    yield "old file of a huge tensor", zipped({**members, "policy.pth": large})
+    yield "old file of a bomb", zipped({**members, "policy.pth": OLD_HEAD + BOMB})
     for name in ("data", "policy.pth"):
         yield f"no {name}", zipped({key: value for key, value in members.items() if key != name})
         yield f"zip bomb in {name}", zipped({**members, name: bytes(2**28)})

@@ -6,6 +6,7 @@ import base64
 import io
 import json
 import pickle
+import struct
 import sys
 import types
 import zipfile
@@ -88,3 +89,58 @@ def serialized(value: Any) -> dict[str, str]:
     """Returns a value as Stable-Baselines3 writes it if it is not JSON."""
     content = value if isinstance(value, bytes) else pickle.dumps(value)
     return {":type:": str(type(value)), ":serialized:": base64.b64encode(content).decode()}
+
+
+def old_torch_file(content: Any, kind: str = "FloatStorage", size: int | None = None) -> bytes:
+    """Returns a file of PyTorch before 1.6 with the arrays of a dict; ``size`` replaces the number of values of storages."""
+    modules = torch_modules()
+    modules["torch"].__dict__[kind] = type(kind, (), {"__module__": "torch"})
+    arrays: dict[str, np.ndarray] = {}
+
+    class Writer(pickle.Pickler):
+        def persistent_id(self, obj: Any) -> Any:
+            return obj[1] if isinstance(obj, tuple) and obj[:1] == ("a storage",) else None
+
+        def reducer_override(self, obj: Any) -> Any:
+            if not isinstance(obj, Tensor):
+                return NotImplemented
+            key, array = str(1000 + len(arrays)), obj.array
+            arrays[key] = array
+            n = array.size if size is None else size
+            storage = ("a storage", ("storage", getattr(modules["torch"], kind), key, "cpu", n, None))
+            strides = tuple(n // 4 for n in array.strides)
+            return modules["torch._utils"]._rebuild_tensor_v2, (storage, 0, array.shape, strides, False, OrderedDict())
+
+    stream = io.BytesIO()
+    with mock.patch.dict(sys.modules, modules):
+        for value in (0x1950A86A20F9469CFC6C, 1001, {"protocol_version": 1001, "little_endian": True}):
+            pickle.dump(value, stream, protocol=2)
+        Writer(stream, protocol=2).dump(content)
+        pickle.dump(list(arrays), stream, protocol=2)
+    contents = (struct.pack("<q", one.size) + one.tobytes() for one in arrays.values())
+    return stream.getvalue() + b"".join(contents)
+
+
+def vecnormalize_file(obs_rms: Any, protocol: int = 4, **attributes: Any) -> bytes:
+    """Returns a file of ``VecNormalize``; ``obs_rms`` is ``(mean, variance, count)``, or a dict of them by key."""
+    names = ["stable_baselines3", "stable_baselines3.common", "stable_baselines3.common.running_mean_std"]
+    names += ["stable_baselines3.common.vec_env", "stable_baselines3.common.vec_env.vec_normalize"]
+    modules = {name: types.ModuleType(name) for name in names}
+    kinds = {}
+    for name, module in (("RunningMeanStd", names[2]), ("VecNormalize", names[4])):
+        kinds[name] = type(name, (), {"__module__": module})
+        setattr(modules[module], name, kinds[name])
+
+    def rms(value: Any) -> Any:
+        made = kinds["RunningMeanStd"]()
+        made.mean, made.var = (np.asarray(one, np.float64) for one in value[:2])
+        made.count = value[2]
+        return made
+
+    scaler = kinds["VecNormalize"]()
+    found = {key: rms(one) for key, one in obs_rms.items()} if isinstance(obs_rms, dict) else rms(obs_rms)
+    defaults = {"norm_obs": True, "norm_reward": True, "clip_obs": 10.0, "clip_reward": 10.0, "epsilon": 1e-8}
+    more = {"gamma": 0.99, "training": True, "obs_rms": found, "ret_rms": rms((0.5, 4.0, 100.0))}
+    scaler.__dict__.update({**defaults, **more, **attributes})
+    with mock.patch.dict(sys.modules, modules):
+        return pickle.dumps(scaler, protocol)

@@ -26,7 +26,7 @@ from rejeu.runs.folder import find_model
 FILES = ("config.json", "episodes.csv", "metrics.csv", "evaluations.csv", "curve.png", "video.mp4")
 """Files of a run folder that are pushed, besides the model."""
 MODEL, ONNX, CARD = "agent.safetensors", "policy.onnx", "README.md"
-WANTED = (*FILES, MODEL, ONNX, f"{ONNX}.json", CARD, "*.zip", "*.pkl")
+WANTED = (*FILES, MODEL, ONNX, f"{ONNX}.json", CARD, "*.zip", "*.pkl", "args.yml", "config.yml", "env_kwargs.yml")
 """Files that are pulled."""
 
 

@@ -47,12 +47,15 @@ class NormalizationConfig:
     """Maximum magnitude of a normalized reward."""
     epsilon: float = 1e-8
     """Added to variances."""
+    share_goals: bool = True
+    """Use the same statistics for the achieved and the desired goal, so that equal goals stay equal. False: statistics of
+    their own, as in Stable-Baselines3."""
     max_return: float | None = None
     """Limit on the discounted sums of normalized rewards, for critics with fixed values: rewards are divided by at least the
     largest sum in size over it. None: no limit."""
 
     def __post_init__(self) -> None:
-        coerce(self, ("norm_obs", "norm_reward"), flag)
+        coerce(self, ("norm_obs", "norm_reward", "share_goals"), flag)
         coerce(self, ("clip_obs", "clip_reward", "epsilon"), number, above=0)
         coerce(self, "max_return", number, above=0, optional=True)
 
@@ -227,7 +230,7 @@ class Normalizer(NamedTuple):
 
 def normalizer_of(leaves: tuple[Leaf, ...], config: NormalizationConfig, gamma: float = 1.0) -> Normalizer:
     """Returns what normalizes observations of these leaves, and rewards."""
-    indices = groups(leaves)
+    indices = groups(leaves, config.share_goals)
     shapes = {g: leaf.shape for g, leaf in zip(indices, leaves, strict=True) if g is not None}
     return Normalizer(indices, shapes, config, gamma)
 

@@ -88,11 +88,11 @@ def leaves(space: spaces.Space, path: str = "") -> tuple[Leaf, ...]:
     )
 
 
-def groups(leaves: tuple[Leaf, ...]) -> list[int | None]:
+def groups(leaves: tuple[Leaf, ...], share_goals: bool = True) -> list[int | None]:
     """Returns the index of each leaf's moments in the statistics of normalization, None for leaves that are not normalized.
 
-    The achieved and the desired goal share theirs: hindsight replaces one by the other, and their difference must keep its
-    meaning.
+    With ``share_goals`` the achieved and the desired goal have the same: hindsight replaces one by the other, and their
+    difference must keep its meaning.
     """
     found: dict[str, int] = {}
     result: list[int | None] = []
@@ -100,7 +100,7 @@ def groups(leaves: tuple[Leaf, ...]) -> list[int | None]:
         if leaf.kind != "continuous":
             result.append(None)
             continue
-        name = "goal" if leaf.path in ("achieved_goal", "desired_goal") else f"leaf {leaf.path}"
+        name = "goal" if share_goals and leaf.path in ("achieved_goal", "desired_goal") else f"leaf {leaf.path}"
         result.append(found.setdefault(name, len(found)))
     return result
 

@@ -480,12 +480,14 @@ class Status:
 class Import(EnvironmentOptions):
     """Converts a model of Stable-Baselines3 to a model file of rejeu, without executing code from it.
 
-    The agent acts as the original does. Example: rejeu import model.zip --vecnormalize vecnormalize.pkl --env CartPole-v1
+    The agent acts as the original does. Example: rejeu import a2c/Pendulum-v1_1 --env Pendulum-v1
     """
 
-    model: Annotated[Path, Shown("FILE", is_positional=True, help="The zip file.")]
+    model: Annotated[Path, Shown("FILE", is_positional=True, help="The zip file, or a folder of RL Zoo.")]
+    which: Which = "last"
+    """In a folder, best_model.zip or the model at the end of training."""
     vecnormalize: Annotated[Path | None, Shown("FILE")] = None
-    """File of the VecNormalize that the policy was trained behind; the agent then normalizes by its statistics."""
+    """File of the VecNormalize that the policy was trained behind; by default the one beside the zip file. "none" for none."""
     env: Annotated[str | None, Shown("ENV")] = None
     """Environment, as for rejeu train, which the model file then names, for rejeu evaluate and others."""
     hyperparameters: Annotated[dict[str, Any], Shown("NAME=VALUE ...", "set")] = field(default_factory=dict)

@@ -154,15 +154,19 @@ def scores(game: Game) -> str:
 def run_import(arguments: Import) -> tuple[int, dict[str, Any]]:
     """Converts a model of Stable-Baselines3 and prints what was taken over."""
     from rejeu.sb3.zip_files import load_zip
+    from rejeu.sb3.zoo import model_in
 
-    out = arguments.model.with_suffix(".safetensors") if arguments.out is None else arguments.out
+    model = arguments.model
+    model = model_in(model, arguments.which) if model.is_dir() else model
+    statistics: Any = False if str(arguments.vecnormalize) == "none" else arguments.vecnormalize
+    out = model.with_suffix(".safetensors") if arguments.out is None else arguments.out
     if out.exists():
         raise FileExistsError(f"{out} exists; name another file with --out")
     made = (
         None if arguments.env is None else environment.from_arguments(arguments.env, arguments).vector(1, "auto", None)
     )
     with nullcontext() if made is None else closing(made):
-        agent = load_zip(arguments.model, made, arguments.vecnormalize, **arguments.hyperparameters)
+        agent = load_zip(model, made, statistics, **arguments.hyperparameters)
         path = agent.save(out)
     echo(f"{path}: {agent.name}, {counted(agent.num_timesteps, 'step')}, {counted(agent.n_updates, 'update')}")
     for note in agent.notes:  # type: ignore[attr-defined]
@@ -185,8 +189,6 @@ def run_pull(arguments: Pull) -> tuple[int, dict[str, Any]]:
 
     folder = hub.pull(arguments.repo, arguments.out)
     models = sorted([*folder.glob("*.safetensors"), *folder.glob("*.zip")])
-    scaler = "".join(f" --vecnormalize {quoted(path)}" for path in sorted(folder.glob("*.pkl"))[:1])
     for model in models:
-        is_zip = model.suffix == ".zip"
-        echo(f"rejeu import {quoted(model)}{scaler}" if is_zip else f"rejeu evaluate {quoted(model)}")
+        echo(f"rejeu {'import' if model.suffix == '.zip' else 'evaluate'} {quoted(model)}")
     return 0, {"folder": folder, "models": models}

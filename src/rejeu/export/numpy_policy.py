@@ -141,7 +141,7 @@ class NumpyPolicy:
     def _normalizations(self, settings: Mapping[str, Any]) -> list[Function | None]:
         """Returns what normalizes each leaf; None for leaves that are not."""
         found: list[Function | None] = []
-        for group in spaces.groups(self._leaves):
+        for group in spaces.groups(self._leaves, settings["share_goals"]):
             moments = [self._arrays.get(f"statistics.obs.{group}.{one}") for one in ("mean", "variance", "n_seen")]
             if group is None or not settings["norm_obs"] or moments[2] is None or moments[2] == 0:
                 found.append(None)

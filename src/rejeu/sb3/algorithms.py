@@ -51,6 +51,7 @@ from rejeu.sb3.common.vec_env.vec_normalize import VecNormalize
 from rejeu.sb3.common.vec_env.vec_transpose import VecTransposeImage
 from rejeu.sb3.policy import BasePolicy
 from rejeu.sb3.zip_files import load_zip
+from rejeu.sb3.zoo import statistics_beside
 
 __all__ = [
     "A2C",
@@ -632,7 +633,14 @@ class Original(Agent):
         with readable(path, ".zip") as found:
             agent: Any
             if zipfile.is_zipfile(found):
-                agent = load_zip(found, env, kind=cls, **cls.converted(changes))
+                statistics = statistics_beside(found) if isinstance(path, str | Path) else None
+                if statistics is not None and not isinstance(env, VecNormalize):
+                    warnings.warn(
+                        f"{statistics} lies beside the model, whose observations were normalized by it; use "
+                        f"env = VecNormalize.load({str(statistics)!r}, env), and give the model its observations",
+                        stacklevel=2,
+                    )
+                agent = load_zip(found, env, False, cls, **cls.converted(changes))
             else:
                 header = checkpoint.read_header(found, "agent")
                 shape = header.get("config", {}).get("policy_kwargs")

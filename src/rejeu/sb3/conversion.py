@@ -113,6 +113,30 @@ def linear(name: str, order: Any = ALL) -> Network:
     return {"weight": lambda view: view.get(f"{name}.weight").T[order], "bias": lambda view: view.get(f"{name}.bias")}
 
 
+def linear_or_zero(name: str, policy: Policy) -> Network:
+    """Returns a linear layer, whose bias is 0 if it has none there."""
+    layer = linear(name)
+    if f"{name}.bias" not in policy.weights:
+        layer["bias"] = lambda view: np.zeros(len(view.get(f"{name}.weight")), np.float32)
+    return layer
+
+
+def action_layers(policy: Policy) -> list[str]:
+    """Returns the names of the layers of ARS, whose only one has no number in older versions."""
+    return policy.layers("action_net") or ["action_net"]
+
+
+def searched(policy: Policy) -> Network:
+    """Returns the policy of ARS, whose actions are clipped where it is linear, and else squashed."""
+    *hidden, last = action_layers(policy)
+    if any(f"{name}.bias" not in policy.weights for name in hidden):
+        raise Malformed("its hidden layers have no bias")
+    head = linear_or_zero(last, policy)
+    if isinstance(policy.action_space, spaces.Box) and not hidden:
+        head = in_unit_range(policy.action_space, head)
+    return plain(policy, "features_extractor", hidden, head)
+
+
 def mlp(names: Sequence[str], order: Any) -> Network:
     """Returns hidden layers."""
     layers: Network = {}
@@ -236,7 +260,7 @@ def actor_critic(policy: Policy, latent: bool) -> Network:
         action = (
             action | {"log_std": lambda view: view.get("log_std")}
             if policy.squashes
-            else in_unit_range(policy.action_space)
+            else in_unit_range(policy.action_space, action, "log_std")
         )
         made["log_std"] = action.pop("log_std")
     for name, head in (("", action), ("value_", value)):
@@ -244,17 +268,18 @@ def actor_critic(policy: Policy, latent: bool) -> Network:
     return made if latent else made | encoders(policy)
 
 
-def in_unit_range(space: spaces.Box) -> Network:
+def in_unit_range(space: spaces.Box, head: Network, log_std: str = "") -> Network:
     """Returns the head of a policy in the environment's unit as one in [-1, 1]: as far as actions are bounded."""
     low, high = space.low.ravel().astype(np.float64), space.high.ravel().astype(np.float64)
     is_bounded = bounded(space)
     with np.errstate(invalid="ignore"):
         half, middle = np.where(is_bounded, 0.5 * (high - low), 1.0), np.where(is_bounded, 0.5 * (high + low), 0.0)
-    return {
-        "weight": lambda view: view.scaled(view.get("action_net.weight").T, 1.0 / half),
-        "bias": lambda view: view.scaled(view.shifted(view.get("action_net.bias"), -middle), 1.0 / half),
-        "log_std": lambda view: view.shifted(view.get("log_std"), -np.log(half)),
+    weight, bias = head["weight"], head["bias"]
+    made: Network = {
+        "weight": lambda view: view.scaled(weight(view), 1.0 / half),
+        "bias": lambda view: view.scaled(view.shifted(bias(view), -middle), 1.0 / half),
     }
+    return made | ({"log_std": lambda view: view.shifted(view.get(log_std), -np.log(half))} if log_std else {})
 
 
 def encoders(policy: Policy) -> Network:
@@ -318,6 +343,8 @@ def parts_of(algorithm: str, policy: Policy, n_quantiles: int) -> list[Part]:
             Part("target_actor", actor(policy, "actor_target")),
             Part(f"target_{name}", gather(critics(policy, "critic_target"))),
         ]
+    if algorithm == "ARS":
+        return [Part("actor.network", searched(policy))]
     if algorithm == "RecurrentPPO":
         network = under("readers", actor_critic(policy, latent=True)) | encoders(policy)
         names = ["lstm_actor", *(["lstm_critic"] if policy.has("lstm_critic") else [])]
@@ -374,7 +401,9 @@ def moments_of(optimizer: Any, policy: Policy, prefix: str) -> tuple[int, dict[s
     state = optimizer.get("state") if isinstance(optimizer, dict) else None
     if not isinstance(state, dict) or not state:
         return 0, {}
-    n_params = len(optimizer["param_groups"][0]["params"])
+    params = {name: i for i, name in enumerate(optimizer["param_groups"][0]["params"])}
+    n_params = len(params)
+    state = {params[name]: one for name, one in state.items()}
     keys = {key for one in state.values() for key in one}
     kinds = sorted(keys & {"exp_avg", "exp_avg_sq", "square_avg"})
     # An extractor that actor and critic share is the actor's, and older versions of DQN number the target's parameters too.

@@ -6,7 +6,7 @@ holds the arguments; names of packages other than :data:`PACKAGES` are refused. 
 library's ``pickletools``, which disassembles pickles and executes none.
 
 A file of PyTorch is a zip file with the pickle of a structure, ``data.pkl``, and the bytes of each storage, to which the
-structure refers by name.
+structure refers by name. Before PyTorch 1.6 it was one pickle after another, followed by the bytes of the storages.
 """
 
 from __future__ import annotations
@@ -19,11 +19,13 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
-from rejeu.io.records import WRONG, Malformed, shown
+from rejeu.errors import CheckpointError
+from rejeu.io.records import WRONG, Malformed, brief, shown
 
 PACKAGES = {"collections", "copyreg", "gym", "gymnasium", "numpy", "sb3_contrib", "stable_baselines3", "torch"}
 """Packages whose names a pickle may mention."""
@@ -33,9 +35,17 @@ MOST_DIRECTORY = 2**20
 """Upper limit on the bytes of a zip file's table of contents."""
 MOST_TEXT = 4 * 2**20
 """Upper limit on the bytes of a pickle without the arrays."""
+MOST_FIELD = 4 * 2**20
+"""Upper limit on the bytes of one of its values, and of a ``VecNormalize`` file."""
+MOST_WRITTEN = 32 * 2**20
+"""Upper limit on the size of a value when each part counts as often as it occurs: 64 bytes, and those of texts and arrays. A
+part that is shared many times takes little memory, and endless time to print, hash or convert."""
+OLD_MAGIC, OLD_PROTOCOL = 0x1950A86A20F9469CFC6C, 1001
+"""The first two values of a file of PyTorch before 1.6."""
 STORAGES = {"Float": "f4", "Double": "f8", "Half": "f2", "Long": "i8", "Int": "i4", "Short": "i2", "Char": "i1"}
 STORAGES |= {"Byte": "u1", "Bool": "b1"}
 """The dtypes of PyTorch's storages, by the first word of their names."""
+SETS = {("builtins", "set"), ("builtins", "frozenset"), ("__builtin__", "set"), ("__builtin__", "frozenset")}
 CONSTANTS = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False}
 VALUES = {"BININT", "BININT1", "BININT2", "LONG1", "BINFLOAT", "BINUNICODE", "SHORT_BINUNICODE", "BINUNICODE8"}
 VALUES |= {"BINBYTES", "SHORT_BINBYTES", "BINBYTES8", "BYTEARRAY8"}
@@ -62,16 +72,22 @@ class Record:
         self.state: Any = None
 
 
-def parse(data: bytes, call: Callable[[Any, tuple[Any, ...]], Any] = Record, storage: Any = None) -> Any:
-    """Returns the value of a pickle.
+def parse(
+    data: bytes | BinaryIO,
+    call: Callable[[Any, tuple[Any, ...]], Any] = Record,
+    storage: Any = None,
+    most: int = MOST_WRITTEN,
+) -> Any:
+    """Returns the value of a pickle. A set becomes a list.
 
     Args:
-        data: the pickle.
+        data: the pickle, or a file that is read to its end.
         call: returns the value that stands for a call of a name with arguments.
         storage: returns the value that stands for a reference to something outside of the pickle.
+        most: upper limit on the size of the value; see :data:`MOST_WRITTEN`.
 
     Raises:
-        Malformed: for an opcode or a name that is not known, or a damaged pickle.
+        Malformed: for an opcode or a name that is not known, a damaged pickle, or a value that is too large.
     """
     stack: list[Any] = []
     marks: list[list[Any]] = []
@@ -89,14 +105,14 @@ def parse(data: bytes, call: Callable[[Any, tuple[Any, ...]], Any] = Record, sto
             stack.append(memo[value])
         elif code in ("MEMOIZE", "BINPUT", "LONG_BINPUT"):
             memo[len(memo) if code == "MEMOIZE" else value] = stack[-1]
-        elif code in ("EMPTY_TUPLE", "EMPTY_LIST", "EMPTY_DICT"):
-            stack.append({"EMPTY_TUPLE": (), "EMPTY_LIST": [], "EMPTY_DICT": {}}[code])
+        elif code in ("EMPTY_TUPLE", "EMPTY_LIST", "EMPTY_DICT", "EMPTY_SET"):
+            stack.append({"EMPTY_TUPLE": (), "EMPTY_DICT": {}}.get(code, []))
         elif code == "MARK":
             marks.append(stack)
             stack = []
-        elif code in ("TUPLE", "APPENDS", "SETITEMS"):
+        elif code in ("TUPLE", "FROZENSET", "APPENDS", "ADDITEMS", "SETITEMS"):
             items, stack = stack, marks.pop()
-            if code == "TUPLE":
+            if code in ("TUPLE", "FROZENSET"):
                 stack.append(tuple(items))
             else:
                 add(stack[-1], items, code == "SETITEMS")
@@ -107,13 +123,17 @@ def parse(data: bytes, call: Callable[[Any, tuple[Any, ...]], Any] = Record, sto
             add(stack[-1], items, code == "SETITEM")
         elif code in ("GLOBAL", "STACK_GLOBAL"):
             module, name = value.split(" ") if code == "GLOBAL" else popped(stack, 2)
-            if not (isinstance(module, str) and isinstance(name, str)) or module.split(".")[0] not in PACKAGES:
+            is_known = isinstance(module, str) and isinstance(name, str) and module.split(".")[0] in PACKAGES
+            if not is_known and (module, name) not in SETS:
                 raise Malformed(f"it names {named(module)}.{named(name)}, which has no place in such a file")
             stack.append(Name(module, name))
         elif code in ("REDUCE", "NEWOBJ"):
             function, arguments = popped(stack, 2)
             if not isinstance(arguments, tuple):
                 raise Malformed("it calls something without arguments")
+            if isinstance(function, Name) and function in SETS:
+                stack.append([*arguments[0]] if arguments else [])
+                continue
             stack.append(
                 {} if function == ("collections", "OrderedDict") and not arguments else call(function, arguments)
             )
@@ -125,10 +145,26 @@ def parse(data: bytes, call: Callable[[Any, tuple[Any, ...]], Any] = Record, sto
             stack.append(storage(stack.pop()))
         elif code == "STOP":
             (result,) = stack
+            check_size(result, most)
             return result
         elif code not in ("PROTO", "FRAME"):
             raise Malformed(f"it has the opcode {code}, which such files do not use")
     raise Malformed("it is cut short")
+
+
+def check_size(value: Any, most: int) -> None:
+    """Raises ``Malformed`` if a value is larger than ``most``; see :data:`MOST_WRITTEN`."""
+    parts = [value]
+    while parts:
+        one = parts.pop()
+        if isinstance(one, Record):
+            inside: Any = [one.arguments, one.state]
+        else:
+            inside = [*one.values()] if isinstance(one, dict) else one if isinstance(one, list | tuple) else []
+        most -= 64 * len(inside) + (len(one) if isinstance(one, str | bytes | bytearray) else getattr(one, "nbytes", 0))
+        if most < 0:
+            raise Malformed("its parts are shared so often that they have no end, or are larger than the file")
+        parts += inside
 
 
 def popped(stack: list[Any], n: int) -> list[Any]:
@@ -176,7 +212,10 @@ def array_of(value: Any) -> np.ndarray:
         (dtype, content), shape, order = value.arguments, (), "C"
     else:
         raise Malformed(f"it has {named(value.name)} where an array is expected")
-    return np.frombuffer(content, dtype_of(dtype)).reshape(shape, order="F" if order == "F" else "C")
+    array = np.frombuffer(content, dtype_of(dtype))
+    if array.size == 0:  # of which one axis may be endless
+        raise Malformed("it has an array without numbers")
+    return array.reshape(shape, order="F" if order == "F" else "C")
 
 
 def dtype_of(value: Any) -> np.dtype:
@@ -202,31 +241,69 @@ def tensors_of(data: bytes) -> Any:
     Raises:
         Malformed: unless it is a complete file of tensors, dicts, lists and numbers.
     """
+    if not data.startswith(b"PK"):
+        return old_tensors(data)
     with opened(io.BytesIO(data)) as archive:
         found = {info.filename.partition("/")[2]: info for info in archive.infolist()}
-        storages: dict[str, np.ndarray] = {}
 
         def member(name: str) -> bytes:
             if name not in found:
-                raise Malformed(f"it has no {shown(name, 40)}: a file of PyTorch before 1.6, or of another program")
+                raise Malformed(f"it has no {shown(name, 40)}: it is a file of another program")
             return archive.read(found[name])
-
-        def storage(reference: Any) -> np.ndarray:
-            _, kind, key, _, n = reference
-            code = STORAGES.get(kind.name.removesuffix("Storage")) if isinstance(kind, Name) else None
-            if code is None or type(n) is not int:
-                raise Malformed(f"it has a tensor of {named(kind)}, expected one of {', '.join(STORAGES)}")
-            if key not in storages:
-                storages[key] = np.frombuffer(member(f"data/{key}"), np.dtype(code).newbyteorder("<"))
-            if storages[key].size != n or storages[key].dtype != np.dtype(code):
-                raise Malformed(f"the tensor {shown(key, 40)} has {storages[key].nbytes} bytes, expected {n} numbers")
-            return storages[key]
 
         if "byteorder" in found and member("byteorder") != b"little":
             raise Malformed("its numbers are big-endian, which is not supported")
         if found.get("data.pkl", zipfile.ZipInfo()).file_size > MOST_TEXT:
             raise Malformed(f"its structure has more than {MOST_TEXT:,} bytes")
-        return parse(member("data.pkl"), tensor, storage)
+        return structure(member("data.pkl"), lambda key: member(f"data/{key}"), len(data))
+
+
+def old_tensors(data: bytes) -> Any:
+    """Returns the structure that a file of PyTorch before 1.6 holds."""
+    file = io.BytesIO(data)
+    if (parse(file), parse(file)) != (OLD_MAGIC, OLD_PROTOCOL) or parse(file).get("little_endian") is not True:
+        raise Malformed("it is no file of PyTorch, or its numbers are big-endian")
+    start, sizes, contents = file.tell(), {}, {}
+
+    def storage(reference: Any) -> None:
+        sizes[named(reference[2])] = kind_of(reference)[1].itemsize
+
+    parse(file, storage=storage)  # once for what comes after it, and then with that
+    for key in parse(file):
+        contents[key] = file.read(struct.unpack("<q", file.read(8))[0] * sizes[key])
+    return structure(data[start:], contents.__getitem__, len(data))
+
+
+def structure(data: bytes, content: Callable[[str], bytes], room: int) -> Any:
+    """Returns the structure of a pickle, with arrays in place of tensors.
+
+    Args:
+        data: the pickle.
+        content: returns the bytes of a storage.
+        room: bytes of the file; all arrays together may have four times as many, since some have several names.
+    """
+    storages: dict[str, np.ndarray] = {}
+
+    def storage(reference: Any) -> np.ndarray:
+        key, dtype, n = kind_of(reference)
+        if key not in storages:
+            storages[key] = np.frombuffer(content(key), dtype.newbyteorder("<"))
+        if storages[key].size != n or storages[key].dtype != dtype:
+            raise Malformed(f"the tensor {shown(key, 40)} has {storages[key].nbytes} bytes, expected {n} numbers")
+        return storages[key]
+
+    return parse(data, tensor, storage, MOST_WRITTEN + 4 * room)
+
+
+def kind_of(reference: Any) -> tuple[str, np.dtype, int]:
+    """Returns name, dtype and number of values of the storage to which a structure refers."""
+    _, kind, key, _, n, *view = reference
+    code = STORAGES.get(kind.name.removesuffix("Storage")) if isinstance(kind, Name) else None
+    if code is None:
+        raise Malformed(f"it has a tensor of {named(kind)}, expected one of {', '.join(STORAGES)}")
+    if type(n) is not int or not isinstance(key, str) or view not in ([], [None]):
+        raise Malformed("it has a tensor whose storage is not named by a text and a size")
+    return key, np.dtype(code), n
 
 
 def tensor(function: Any, arguments: tuple[Any, ...]) -> Any:
@@ -238,9 +315,11 @@ def tensor(function: Any, arguments: tuple[Any, ...]) -> Any:
     storage, first, shape, strides = arguments[:4]
     if not isinstance(storage, np.ndarray) or not all(type(n) is int and n >= 0 for n in (first, *shape, *strides)):
         raise Malformed("it has a tensor whose shape is not valid")
+    if len(shape) > 8:
+        raise Malformed(f"it has a tensor with {len(shape)} axes, expected at most 8")
     n = math.prod(shape)
     last = first + sum((size - 1) * stride for size, stride in zip(shape, strides, strict=True))
-    if n > storage.size or len(shape) > 8 or (n and last >= storage.size):
+    if n > storage.size or (n and last >= storage.size):
         raise Malformed(f"it has a tensor of the shape {shown(shape, 40)} in {storage.size} numbers")
     if n == 0:
         return np.zeros(shape, storage.dtype)
@@ -276,6 +355,41 @@ def opened(file: BinaryIO, room: int = 0) -> Iterator[zipfile.ZipFile]:
         infos = archive.infolist()
         if not room and any(info.compress_type or info.file_size != info.compress_size for info in infos):
             raise Malformed("it is compressed, as PyTorch's files are not")
+        if any(info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) for info in infos):
+            raise Malformed("it has a member that is neither stored nor deflated")
         if (total := sum(info.file_size for info in infos)) > (room or size):
             raise Malformed(f"its members have {total:,} bytes, expected at most {room or size:,}")
         yield archive
+
+
+def content_of(archive: zipfile.ZipFile, name: str) -> bytes:
+    """Returns a member of a zip file; of one that unpacks to more than its declared size, no more is unpacked than that."""
+    with archive.open(name) as file:
+        return b"".join(iter(lambda: file.read(2**20), b""))
+
+
+@contextlib.contextmanager
+def explained(path: Path) -> Iterator[None]:
+    """Turns errors of a damaged file into ``CheckpointError`` with its path."""
+    try:
+        yield
+    except (FileNotFoundError, CheckpointError):
+        raise
+    except UNREADABLE as error:
+        raise CheckpointError(f"{path} cannot be read as a file of Stable-Baselines3: {brief(error)}") from None
+
+
+def read_normalization(path: Path) -> dict[str, Any]:
+    """Returns the attributes of a ``VecNormalize`` file.
+
+    Raises:
+        Malformed: if it is none, or damaged.
+    """
+    with path.open("rb") as file:
+        data = file.read(MOST_FIELD + 1)
+    if len(data) > MOST_FIELD:
+        raise Malformed(f"it has more than {MOST_FIELD:,} bytes")
+    found = parse(data)
+    if not isinstance(found, Record) or not found.name.endswith("VecNormalize") or not isinstance(found.state, dict):
+        raise Malformed("it holds no VecNormalize")
+    return found.state

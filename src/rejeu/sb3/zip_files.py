@@ -9,9 +9,9 @@ from __future__ import annotations
 import base64
 import contextlib
 import dataclasses
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import gymnasium as gym
 import jax
@@ -25,17 +25,30 @@ from rejeu.agents.model_files import check_depths
 from rejeu.errors import CheckpointError
 from rejeu.io import checkpoint
 from rejeu.io.records import Malformed, brief, shown
-from rejeu.sb3.conversion import EXTRACTORS, Policy, converted, parts_of, shares_extractor
-from rejeu.sb3.pickled import UNREADABLE, Name, Record, array_of, opened, parse, tensors_of
+from rejeu.sb3 import zoo
+from rejeu.sb3.conversion import EXTRACTORS, Policy, action_layers, converted, parts_of, shares_extractor
+from rejeu.sb3.pickled import (
+    MOST_FIELD,
+    UNREADABLE,
+    Name,
+    Record,
+    array_of,
+    content_of,
+    explained,
+    opened,
+    parse,
+    read_normalization,
+    tensors_of,
+)
 
 MOST_DATA = 16 * 2**20
 """Upper limit on the bytes of ``data``."""
-MOST_FIELD = 4 * 2**20
-"""Upper limit on the bytes of one of its values, and of a ``VecNormalize`` file."""
 EXPANSION = 16
 """Upper limit on the size of the unpacked content relative to that of the file: weights can hardly be compressed."""
+OLD_HER = "goal_selection_strategy"
+"""A setting that is among those of the agent where HER was an algorithm, in versions before 1.1."""
 ON_POLICY = ("PPO", "A2C", "TRPO", "MaskablePPO", "RecurrentPPO")
-SCHEDULES = ("learning_rate", "clip_range", "clip_range_vf")
+SCHEDULES = ("learning_rate", "clip_range", "clip_range_vf", "delta_std")
 """Hyperparameters that are numbers here and may be code in a file."""
 IGNORED: tuple[str, ...] = (
     "action_noise",
@@ -104,17 +117,6 @@ def part_of(name: str) -> Iterator[None]:
         raise Malformed(f"{name}: {brief(error)}") from None
 
 
-@contextlib.contextmanager
-def explained(path: Path) -> Iterator[None]:
-    """Turns errors of a damaged file into ``CheckpointError`` with its path."""
-    try:
-        yield
-    except (FileNotFoundError, CheckpointError):
-        raise
-    except UNREADABLE as error:
-        raise CheckpointError(f"{path} cannot be read as a file of Stable-Baselines3: {brief(error)}") from None
-
-
 def read(path: Path) -> Model:
     """Returns the content of a zip file.
 
@@ -127,12 +129,12 @@ def read(path: Path) -> Model:
         sizes = {info.filename: info.file_size for info in archive.infolist()}
         if not {"data", "policy.pth"} <= sizes.keys() or sizes["data"] > MOST_DATA:
             raise Malformed("it has no data and policy.pth, or too much data")
-        fields = msgspec.json.decode(archive.read("data"), type=dict[str, msgspec.Raw])
+        fields = msgspec.json.decode(content_of(archive, "data"), type=dict[str, msgspec.Raw])
         tensors = {}
         for name in sizes:
             if name.endswith(".pth"):
                 with part_of(name):
-                    tensors[name.removesuffix(".pth")] = tensors_of(archive.read(name))
+                    tensors[name.removesuffix(".pth")] = tensors_of(content_of(archive, name))
     weights = tensors["policy"]
     if not isinstance(weights, dict) or not all(isinstance(one, np.ndarray) for one in weights.values()):
         raise Malformed("policy.pth holds something else than tensors by name")
@@ -151,6 +153,8 @@ def algorithm_of(model: Model) -> str:
         return "QRDQN" if "quantile_net" in roots else "DQN"
     if "lstm_actor" in roots:
         return "RecurrentPPO"
+    if roots == {"action_net"} and "n_delta" in model.fields:
+        return "ARS"
     if "action_net" in roots and "value_net" in roots:
         if "clip_range" not in model.fields:
             return "TRPO" if "cg_max_steps" in model.fields else "A2C"
@@ -170,7 +174,7 @@ def unknown(roots: set[str]) -> str:
     """Raises ``Malformed`` for a policy of another algorithm."""
     raise Malformed(
         f"its policy has the parts {shown(', '.join(sorted(roots)))}, of no algorithm that rejeu has; it reads DQN, QRDQN, "
-        "PPO, A2C, TRPO, SAC, TD3, DDPG, TQC, CrossQ, RecurrentPPO and MaskablePPO"
+        "PPO, A2C, TRPO, ARS, SAC, TD3, DDPG, TQC, CrossQ, RecurrentPPO and MaskablePPO"
     )
 
 
@@ -212,6 +216,28 @@ def space_of(model: Model, key: str) -> tuple[gym.Space, list[str]]:
         return spaces.rebuild(description, max(spaces.MAX_NUMBERS, model.room)), [*description.get("Dict", ())]
 
 
+def with_goals(model: Model, space: gym.Space) -> tuple[gym.Space, list[str], dict[str, np.ndarray]]:
+    """Returns the Dict of observations, its keys, and weights for it, of a policy that took observation and goal in one array.
+
+    The achieved goal, which it did not take, has weights of 0.
+
+    Raises:
+        Malformed: if the file does not tell the sizes of observation and goals.
+    """
+    last = model.readable("_last_obs")
+    keys = ["observation", "desired_goal", "achieved_goal"]
+    n_obs, n_goal, n_achieved = (array_of(last[key]).shape[-1] for key in keys)
+    if space.shape != (n_obs + n_goal,) or n_achieved != n_goal:
+        raise Malformed("its observation space is not made of the observation and the desired goal of the last step")
+    parts = zip(keys, (n_obs, n_goal, n_goal), strict=True)
+    whole = gym.spaces.Dict({key: gym.spaces.Box(-np.inf, np.inf, (n,), np.float32) for key, n in parts})
+    weights = dict(model.tensors["policy"])
+    for name, array in weights.items():
+        if name.endswith(".0.weight") and array.ndim == 2 and not name.endswith(".mu.0.weight"):
+            weights[name] = np.insert(array, [n_obs + n_goal] * n_goal, 0.0, axis=1)
+    return whole, keys, weights
+
+
 def observation_space_of(own: gym.Space, given: gym.Space | None) -> gym.Space:
     """Returns the observation space of an agent: that of the environment, if it is given.
 
@@ -223,7 +249,10 @@ def observation_space_of(own: gym.Space, given: gym.Space | None) -> gym.Space:
         return own
     plain = lambda leaf: leaf if leaf.kind != "image" else dataclasses.replace(leaf, shape=tuple(sorted(leaf.shape)))  # noqa: E731
     if [*map(plain, spaces.leaves(own))] != [*map(plain, spaces.leaves(given))]:
-        raise Malformed(f"its observation space is {own}, and the environment's is {given}")
+        longer = 1 + given.shape[0] if isinstance(given, gym.spaces.Box) and len(given.shape) == 1 else 0
+        missing = own.shape == (longer,) and isinstance(own, gym.spaces.Box) and (own.low[-1], own.high[-1]) == (0, 1)
+        hint = f"; wrap it as the policy was trained, --wrapper {zoo.TIME_FEATURE}" if missing else ""
+        raise Malformed(f"its observation space is {own}, and the environment's is {given}{hint}")
     return given
 
 
@@ -234,30 +263,35 @@ def number_of(value: Any) -> Any:
     return array_of(value).item() if isinstance(value, Record) and value.name.endswith(".scalar") else value
 
 
-def settings_of(kind: Any, model: Model, notes: list[str]) -> dict[str, Any]:
-    """Returns the hyperparameters of a file that rejeu has too; what is left out goes to ``notes``."""
+def settings_of(kind: Any, model: Model, notes: list[str], changed: Collection[str] = ()) -> dict[str, Any]:
+    """Returns the hyperparameters of a file that rejeu has too, but for those ``changed``; what is left out is noted."""
     names = {field.name for field in dataclasses.fields(kind)}
     found: dict[str, Any] = {}
     names -= {"max_grad_norm"} if number_of(model.readable("max_grad_norm")) == 0 else set()  # of TRPO, without effect
-    for name in sorted(names & model.fields.keys() - {*IGNORED}):
-        value = number_of(model.readable(name))
-        if name in SCHEDULES and not isinstance(value, int | float | None):
+    stored = {name: f"{name}_schedule" if name == "delta_std" else name for name in names - {*IGNORED}}
+    for name in sorted(name for name, key in stored.items() if key in model.fields and name not in changed):
+        value = number_of(model.readable(stored[name]))
+        is_code = name in SCHEDULES and not isinstance(value, int | float | None)
+        if is_code:
             value = model.group.get("lr") if name == "learning_rate" else None
-            notes.append(f"{name} is code in the file; " + (f"{value:g} is used" if value else "the default is used"))
+        if name == "learning_rate" and isinstance(value, int | float) and value <= 0:  # a schedule may end below 0
+            value = 0.0
+            notes.append("learning_rate had ended at 0, which is used; to train on, give another: learning_rate=3e-4")
+        elif is_code:
+            used = f"{value:g}" if isinstance(value, int | float) else "the default"
+            notes.append(f"{name} is code in the file; {used} is used")
         if isinstance(value, bool | int | float | str) or name not in SCHEDULES:
             found[name] = value
     if "train_freq" in names and isinstance(value := model.readable("train_freq"), Record | int):
         n, unit = value.arguments if isinstance(value, Record) else (value, "step")
+        n, unit = (n, unit) if n != -1 else (model.readable("n_episodes_rollout"), "episode")  # of versions before 1.0
         unit = unit.arguments[0] if isinstance(unit, Record) else unit
         found["train_freq"] = n if unit == "step" else (n, unit)
     if isinstance(buffer := model.readable("replay_buffer_class"), Name) and buffer.name == "HerReplayBuffer":
         settings = model.readable("replay_buffer_kwargs")
-        known = [
-            key
-            for key in ("n_sampled_goal", "goal_selection_strategy")
-            if isinstance(settings, dict) and key in settings
-        ]
-        found |= {"replay_buffer_class": buffer.name, "replay_buffer_kwargs": {key: settings[key] for key in known}}
+        found |= hindsight(settings.get if isinstance(settings, dict) else {}.get)
+    elif OLD_HER in model.fields:
+        found |= hindsight(model.readable)
     if "action_noise" in names and (noise := model.readable("action_noise")) is not None:
         state = noise.state if isinstance(noise, Record) and isinstance(noise.state, dict) else {}
         sigma = np.unique(array_of(state["_sigma"])) if "_sigma" in state and "_theta" not in state else np.zeros(2)
@@ -268,6 +302,14 @@ def settings_of(kind: Any, model: Model, notes: list[str]) -> dict[str, Any]:
     if "rms_prop_eps" in names:
         found |= {"rms_prop_eps": model.group.get("eps", 1e-5), "use_rms_prop": "alpha" in model.group}
     return found
+
+
+def hindsight(setting: Callable[[str], Any]) -> dict[str, Any]:
+    """Returns the hyperparameters of hindsight replay, from a function that returns a setting by its name."""
+    known = {key: value for key in ("n_sampled_goal", OLD_HER) if (value := setting(key)) is not None}
+    if isinstance(strategy := known.get(OLD_HER), Record):
+        known[OLD_HER] = ("future", "final", "episode")[strategy.arguments[0]]
+    return {"replay_buffer_class": "HerReplayBuffer", "replay_buffer_kwargs": known}
 
 
 def policy_settings(model: Model, policy: Policy, algorithm: str) -> dict[str, Any]:
@@ -311,6 +353,12 @@ def policy_settings(model: Model, policy: Policy, algorithm: str) -> dict[str, A
             shape["lstm_hidden_size"] = int(policy.weights["lstm_actor.weight_hh_l0"].shape[1])
             shape["shared_lstm"] = not policy.has("lstm_critic")
         return changes
+    if algorithm == "ARS":
+        *shape["net_arch"], _ = (len(policy.weights[f"{name}.weight"]) for name in action_layers(policy))
+        squashes = given.get("squash_output", bool(shape["net_arch"]))
+        if isinstance(policy.action_space, gym.spaces.Box) and squashes is not bool(shape["net_arch"]):
+            raise Malformed("its actions are squashed behind a linear policy, or clipped behind hidden layers")
+        return changes
     if "actor.log_std" in policy.weights and algorithm == "CrossQ":
         raise Malformed("it explores by state-dependent noise (use_sde=True), which CrossQ does not have in rejeu")
     if algorithm in ("DQN", "QRDQN"):
@@ -326,33 +374,33 @@ def policy_settings(model: Model, policy: Policy, algorithm: str) -> dict[str, A
     return changes | ({"n_quantiles": n_outputs} if algorithm == "TQC" else {})
 
 
-def read_normalization(path: Path) -> dict[str, Any]:
-    """Returns the attributes of a ``VecNormalize`` file.
-
-    Raises:
-        Malformed: if it is none, or damaged.
-    """
-    with path.open("rb") as file:
-        data = file.read(MOST_FIELD + 1)
-    if len(data) > MOST_FIELD:
-        raise Malformed(f"it has more than {MOST_FIELD:,} bytes")
-    found = parse(data)
-    if not isinstance(found, Record) or not found.name.endswith("VecNormalize") or not isinstance(found.state, dict):
-        raise Malformed("it holds no VecNormalize")
-    return found.state
-
-
 def moments(field: str, value: Any) -> dict[str, np.ndarray]:
     """Returns the arrays of a running mean and variance."""
     if not isinstance(value, Record) or not isinstance(value.state, dict):
         raise Malformed(f"it has no running statistics for {field}")
     mean, variance, count = (array_of(value.state[key]) for key in ("mean", "var", "count"))
     seen = min(float(count), normalization.MAX_COUNT)
+    if not (np.isfinite(mean).all() and np.isfinite(variance).all() and (variance >= 0).all() and seen >= 0):
+        raise Malformed("its statistics have negative variances or counts, or values that are not finite")
+    if max(np.abs(mean).max(), variance.max()) > np.finfo(np.float32).max:
+        raise Malformed("its statistics are larger than float32 can hold")
     return {f"{field}.mean": mean, f"{field}.variance": variance, f"{field}.n_seen": np.asarray(seen)}
 
 
+def equal(one: Mapping[str, np.ndarray], other: Mapping[str, np.ndarray]) -> bool:
+    """Returns whether two collections of arrays are the same."""
+    return all(np.array_equal(one[key], other[key]) for key in one)
+
+
+def unresolved(value: Any) -> int:
+    """Returns how many components have a deviation that is no more than 400 steps of float32 at their mean, but for 0."""
+    mean, variance = (array_of(value.state[key]) for key in ("mean", "var"))
+    steps = np.spacing(np.abs(mean).astype(np.float32))
+    return int(((mean != 0) & (np.sqrt(variance + 1e-8) < 400 * steps)).sum())
+
+
 def statistics_of(
-    state: Mapping[str, Any], leaves: tuple[spaces.Leaf, ...]
+    state: Mapping[str, Any], leaves: tuple[spaces.Leaf, ...], notes: list[str]
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Returns the setting ``normalize`` and the statistics of a ``VecNormalize`` as those of an agent.
 
@@ -363,7 +411,12 @@ def statistics_of(
     settings = {key: state[key] for key in keys}
     arrays = moments("statistics.returns", state["ret_rms"])
     obs = state["obs_rms"] if state["norm_obs"] else None
-    for leaf, group in zip(leaves, spaces.groups(leaves), strict=True):
+    goals = (
+        [obs[key] for key in spaces.GOAL_KEYS[1:]] if isinstance(obs, dict) and {*spaces.GOAL_KEYS} <= {*obs} else []
+    )
+    if goals and not equal(*(moments("", one) for one in goals)):
+        settings["share_goals"] = False
+    for leaf, group in zip(leaves, spaces.groups(leaves, settings.get("share_goals", True)), strict=True):
         if obs is None or (group is None and not isinstance(obs, dict)):
             continue
         one = obs.get(leaf.path) if isinstance(obs, dict) else obs
@@ -371,18 +424,21 @@ def statistics_of(
             raise Malformed(f"it normalizes other parts of observations than an agent does: {leaf.path}")
         if group is not None:
             field = f"statistics.obs.{group}"
-            made = moments(field, one)
-            if any(not np.array_equal(made[key], arrays.get(key, made[key])) for key in made):
-                raise Malformed("achieved_goal and desired_goal have statistics of their own, and share them in rejeu")
-            arrays |= made
+            arrays |= moments(field, one)
+    if moving := sum(map(unresolved, obs.values() if isinstance(obs, dict) else [obs] if obs else [])):
+        notes.append(
+            f"{moving} numbers of the observations vary by less than float32, in which rejeu holds them, tells apart: "
+            "actions differ by more than rounding"
+        )
     return settings, arrays
 
 
 def load_zip(
     path: str | Path,
     env: Any = None,
-    vecnormalize: str | Path | None = None,
+    vecnormalize: str | Path | Literal[False] | None = None,
     kind: type[Agent] | None = None,
+    which: Literal["best", "last"] = "last",
     **changes: Any,
 ) -> Agent:
     """Returns the agent of a zip file that Stable-Baselines3 or its Contrib package saved. No code from the file is run.
@@ -392,11 +448,12 @@ def load_zip(
     in its attribute ``notes``. See ``docs/sb3-models.md``.
 
     Args:
-        path: of the file; ``.zip`` is added if it has no suffix.
+        path: of the file, ``.zip`` is added if it has no suffix; or a folder of RL Zoo.
         env: environments to continue training in, as for ``load`` of its class; None for an agent that only predicts.
         vecnormalize: the file of the ``VecNormalize`` that the policy was trained behind. The agent normalizes by its
-            statistics and takes raw observations.
+            statistics and takes raw observations. None: the one that lies beside the zip file; False: none.
         kind: class of the agent, whose algorithm must be that of the file; None for the one in :mod:`rejeu`.
+        which: in a folder, ``"best"`` for ``best_model.zip`` or ``"last"`` for the model at the end of training.
         changes: constructor arguments and hyperparameters that replace those of the file.
 
     Raises:
@@ -404,7 +461,8 @@ def load_zip(
         CheckpointError: if the file is damaged, names code, or its policy cannot be expressed; the message says which part.
     """
     path = Path(path)
-    path = path if path.suffix else path.with_name(f"{path.name}.zip")
+    path = path if path.suffix or path.is_dir() else path.with_name(f"{path.name}.zip")
+    path = zoo.model_in(path, which) if path.is_dir() else path
     with explained(path):
         model = read(path)
         algorithm = algorithm_of(model)
@@ -412,8 +470,13 @@ def load_zip(
             raise Malformed(
                 f"it is a model of {algorithm}, not of {kind.algorithm.Config.name}; load it with {algorithm}.load"
             )
+    notes: list[str] = []
+    if vecnormalize is None and (beside := zoo.statistics_beside(path)) is not None:
+        vecnormalize = beside
+        notes.append(f"observations are normalized by {beside}, which lies beside it; vecnormalize=False leaves it out")
+    notes += zoo.notes_beside(path, vecnormalize or None)
     state = None
-    if vecnormalize is not None:
+    if vecnormalize:
         with explained(Path(vecnormalize)):
             state = read_normalization(Path(vecnormalize))
     cls = kind or BUILT_IN[algorithm]
@@ -425,18 +488,20 @@ def load_zip(
     with explained(path):
         seed = model.value("seed")
         own.setdefault("seed", seed if isinstance(seed, int) and 0 <= seed < 2**32 else None)
-        notes: list[str] = []
         file_space, keys = space_of(model, "observation_space")
         action_space, _ = space_of(model, "action_space")
         kwargs = model.readable("policy_kwargs")
         squashes = algorithm in ON_POLICY and isinstance(kwargs, dict) and kwargs.get("squash_output") is True
-        policy = Policy(model.tensors["policy"], spaces.leaves(file_space), keys, action_space, squashes)
-        settings = settings_of(cls.algorithm.Config, model, notes)
+        weights = model.tensors["policy"]
+        if OLD_HER in model.fields and not keys:
+            file_space, keys, weights = with_goals(model, file_space)
+        policy = Policy(weights, spaces.leaves(file_space), keys, action_space, squashes)
+        settings = settings_of(cls.algorithm.Config, model, notes, changes)
         settings |= policy_settings(model, policy, algorithm)
         arrays: dict[str, np.ndarray] = {}
     if state is not None:
         with explained(Path(vecnormalize or path)):
-            settings["normalize"], arrays = statistics_of(state, policy.leaves)
+            settings["normalize"], arrays = statistics_of(state, policy.leaves, notes)
     with explained(path):
         config = cls.algorithm.Config(**settings | changes)
         check_depths(config)
@@ -467,12 +532,12 @@ def load_zip(
 
 def counts_of(algorithm: str, model: Model) -> dict[str, np.ndarray]:
     """Returns the counters and the temperature among the arrays of a state."""
-    variables = model.tensors.get("pytorch_variables")
+    variables = model.tensors.get("pytorch_variables", model.tensors.get("tensors"))
     found: dict[str, Any] = {}
     if isinstance(variables, dict) and isinstance(log_alpha := variables.get("log_ent_coef"), np.ndarray):
         found["log_alpha"] = log_alpha.reshape(())
         optimizer = model.tensors.get("ent_coef_optimizer")
-        moments = optimizer["state"].get(0) if isinstance(optimizer, dict) else None
+        moments = next(iter(optimizer["state"].values()), None) if isinstance(optimizer, dict) else None
         if moments:
             found |= {"alpha_optimizer.count": np.asarray(int(moments["step"]))}
             for ours, theirs in (("mu", "exp_avg"), ("nu", "exp_avg_sq")):

@@ -30,11 +30,14 @@ from rejeu.sb3.common.vec_env.base_vec_env import (
     unwrap_vec_wrapper,
 )
 from rejeu.sb3.common.vec_env.vec_transpose import VecTransposeImage
+from rejeu.sb3.pickled import array_of, explained, read_normalization
 
 __all__ = ["VecNormalize", "sync_envs_normalization", "unwrap_vec_normalize"]
 
 KIND = "vec_normalize"
 """Kind of its files."""
+PICKLES = (b"\x80\x02c", b"\x80\x03c", b"\x80\x04\x95", b"\x80\x05\x95")
+"""How the files of Stable-Baselines3 begin."""
 BOUNDS = ("clip_obs", "clip_reward")
 """Settings that may be infinite, for no clipping. A file then has null, since JSON has no infinity."""
 NonNegative = Annotated[float, Meta(ge=0, le=1e300)]
@@ -268,10 +271,15 @@ class VecNormalize(VecEnvWrapper):
     def load(load_path: str | Path, venv: VecEnv) -> VecNormalize:
         """Returns ``venv`` wrapped with the statistics and settings of a file written by :meth:`save`.
 
+        A file of Stable-Baselines3 itself is read too, without executing its code.
+
         Raises:
             FileNotFoundError: if there is no such file.
             CheckpointError: if the file is damaged or belongs to other observations.
         """
+        with Path(load_path).open("rb") as found:
+            if found.read(3) in PICKLES:
+                return of_original(Path(load_path), venv)
         with checkpoint.opened(load_path, KIND) as file:
             try:
                 header = convert(file.header, Header)
@@ -284,6 +292,21 @@ class VecNormalize(VecEnvWrapper):
             _check_specs(file.specs, new.statistics(), load_path)
             new.put_statistics(file.read(), load_path)
         return new
+
+
+def of_original(path: Path, venv: VecEnv) -> VecNormalize:
+    """Returns ``venv`` wrapped with the statistics and settings of a file of Stable-Baselines3 itself."""
+    with explained(path):
+        state = read_normalization(path)
+        settings = {key: state[key] for key in Settings.__struct_fields__}
+        new, arrays = VecNormalize(venv, **settings, norm_obs_keys=state.get("norm_obs_keys")), {}
+        for name in new.statistics():
+            kind, *index, part = name.split(".")
+            moments = state["ret_rms" if kind == "returns" else "obs_rms"]
+            moments = moments[[*new.obs_rms][int(index[0])]] if index else moments
+            arrays[name] = np.asarray(array_of(moments.state[part]), np.float64)
+        new.put_statistics(arrays, path)
+    return new
 
 
 def unwrap_vec_normalize(env: VecEnv) -> VecNormalize | None:
