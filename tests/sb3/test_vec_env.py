@@ -335,8 +335,9 @@ def test_pictures_are_shown_in_a_window(monkeypatch):
     shown = pygame.surfarray.array3d(pygame.display.get_surface()).swapaxes(0, 1)
     np.testing.assert_array_equal(shown, picture)
     pygame.display.quit()
-    with pytest.raises(ValueError, match=r"render_mode=None; make them with render_mode='rgb_array'"):
-        walks().render("human")
+    for mode in ("human", "rgb_array", None):
+        with pytest.warns(UserWarning, match=r"render_mode=None; make them with render_mode='rgb_array'"):
+            assert walks().render(mode) is None
     with pytest.raises(NotImplementedError, match="Batch does not define get_images"):
         Batch().get_images()
 

@@ -153,10 +153,7 @@ class VecEnv(ABC):
 
         Args:
             mode: ``"rgb_array"`` returns the image, ``"human"`` shows it in a window; None, and with a warning any other,
-                uses the mode that the environments were made with.
-
-        Raises:
-            ValueError: if the environments were made with another render mode.
+                uses the mode that the environments were made with. If that is no mode for it, a warning says so.
         """
         if mode not in (None, "rgb_array", "human"):
             warnings.warn(f"render(mode={mode!r}): the mode is {self.render_mode!r}", UserWarning, stacklevel=2)
@@ -166,10 +163,13 @@ class VecEnv(ABC):
             self.env_method("render")
             return None
         if self.render_mode != "rgb_array":
-            raise ValueError(
-                f"render(mode={mode!r}): the environments were made with render_mode={self.render_mode!r}; "
-                "make them with render_mode='rgb_array'"
+            warnings.warn(
+                f"render(mode={mode!r}) shows nothing: the environments were made with render_mode={self.render_mode!r}; "
+                "make them with render_mode='rgb_array'",
+                UserWarning,
+                stacklevel=2,
             )
+            return None
         image = tile_images([one for one in self.get_images() if one is not None])
         if mode == "rgb_array":
             return image
