@@ -453,7 +453,7 @@ BLOCKS: dict[str, Callable[..., str]] = {
     "parking": parking,
     "speed": speed,
     "sb3-names": sb3_parity.text,
-    "sb3-examples": sb3_parity.examples,
+    "sb3-guide": sb3_parity.guide,
     "sb3-suite": sb3_parity.suite,
     "sb3-scripts": sb3_parity.same_scripts,
 }

@@ -20,6 +20,7 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA = ROOT / "tests" / "data" / "sb3" / "signatures.json"
+GUIDE = ROOT / "trials" / "results" / "sb3_guide.json"
 PACKAGES = {"stable_baselines3": "rejeu.sb3", "sb3_contrib": "rejeu.sb3_contrib"}
 """The original's packages, and where their names are here."""
 
@@ -141,22 +142,24 @@ def text() -> str:
     return "\n".join(lines)
 
 
-def examples() -> str:
-    """Returns how many examples of each page of the original's documentation run, for the documentation."""
-    from tests.sb3.examples import EXAMPLES
-
-    counts: dict[str, list[int]] = {}
-    for one in EXAMPLES:
-        row = counts.setdefault(one.page, [0, 0, 0])
-        row[2 if one.needs == "ale_py" else 1 if one.fails else 0] += 1
-    n = sum(row[0] for row in counts.values())
-    complete = ", ".join(page for page, row in counts.items() if not row[1] + row[2])
-    lines = [f"{n} of {len(EXAMPLES)} examples run. All do of {complete}. These do not:", ""]
-    lines += [f"- {one.page}, {one.run.__name__.replace('_', ' ')}: {one.fails}" for one in EXAMPLES if one.fails]
-    untried = ", ".join(page for page, row in counts.items() if row[2])
-    return "\n".join(
-        [*lines, f"- one each of {untried}: not tried, because ale-py is not installed where the tests run"]
-    )
+def guide() -> str:
+    """Returns how many blocks of code of the original's documentation run here as there, for the documentation."""
+    content = json.loads(GUIDE.read_text(encoding="utf-8"))
+    tried = [row for row in content["blocks"] if "rejeu" in row]
+    plain = [row for row in tried if not row["torch"]]
+    alike, others = (sum(not row["differs"] for row in rows) for rows in (plain, tried))
+    n, n_not_run = len(content["blocks"]), len(content.get("not_run", ()))
+    lines = [
+        f"{alike} of {len(plain)} blocks without PyTorch do the same as with the original, and {others - alike} of the "
+        f"{len(tried) - len(plain)} with it. The original does not run the other {n - len(tried)} of {n}: they are "
+        f"pseudocode, or packages or time lack{f'; {n_not_run} have not been tried' * (n_not_run > 0)}. These differ:",
+        "",
+    ]
+    for row in tried:
+        if row["differs"]:
+            text = "; ".join(row["differs"][:2]).replace("|", "/").replace("<", "").replace(">", "")
+            lines.append(f"- {row['block']}{', with PyTorch' * row['torch']}: `{text.replace(' - ', ', here ')[:150]}`")
+    return "\n".join(lines)
 
 
 def suite(length: str = "") -> str:
