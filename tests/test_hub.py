@@ -91,6 +91,9 @@ def test_refusals_are_one_line_and_leave_nothing(server, run, tmp_path, monkeypa
     server["me/bad"] = {"agent.safetensors": b"nothing"}
     with pytest.raises(CheckpointError, match="not a complete safetensors file"):
         hub.pull("me/bad", tmp_path / "bad")
+    server["me/zip"] = {"model.zip": b"PK nothing"}
+    with pytest.raises(CheckpointError, match=r"model\.zip"):
+        hub.pull("me/zip", tmp_path / "bad")
     monkeypatch.setenv("HF_TOKEN", "hf_wrong")
     with pytest.raises(OSError, match=r"the hub answered: .*401"):
         hub.push(run, "me/cart", note=lambda text: None)
@@ -110,3 +113,9 @@ def test_a_folder_with_content_is_not_replaced(server):
     Path("full/file").touch()
     with pytest.raises(FileExistsError, match="--out"):
         hub.pull("me/full")
+
+
+@pytest.mark.parametrize("name", ["a\0.zip", "\ud800.zip", "a" * 300 + ".zip", "a\n.pkl", "a/b.zip", "c:x.zip"])
+def test_a_name_that_no_file_should_have_is_not_wanted(name):
+    assert not hub.is_wanted(name)
+    assert hub.is_wanted("a b.zip")

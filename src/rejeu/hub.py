@@ -22,10 +22,13 @@ from rejeu.io.records import brief
 from rejeu.reporting import run_list, runs, statistics
 from rejeu.reporting.formatting import counted
 from rejeu.runs.folder import find_model
+from rejeu.sb3 import pickled, zip_files
 
 FILES = ("config.json", "episodes.csv", "metrics.csv", "evaluations.csv", "curve.png", "video.mp4")
 """Files of a run folder that are pushed, besides the model."""
 MODEL, ONNX, CARD = "agent.safetensors", "policy.onnx", "README.md"
+MOST_CHARACTERS = 200
+"""Upper limit on the name of a file that is downloaded."""
 WANTED = (*FILES, MODEL, ONNX, f"{ONNX}.json", CARD, "*.zip", "*.pkl", "args.yml", "config.yml", "env_kwargs.yml")
 """Files that are pulled."""
 
@@ -123,6 +126,9 @@ def pull(repo: str, out: str | Path | None = None) -> Path:
         shutil.rmtree(room / ".cache", ignore_errors=True)
         if MODEL in names:
             load(room / MODEL)
+        for path in room.glob("*.zip"):
+            with pickled.explained(path):
+                zip_files.read(path)
         if out.exists():
             out.rmdir()
         room.rename(out)
@@ -131,7 +137,8 @@ def pull(repo: str, out: str | Path | None = None) -> Path:
 
 def is_wanted(name: str) -> bool:
     """Returns whether a file of a repository is downloaded: one of :data:`WANTED`, and in no folder."""
-    return not {"/", "\\", ":"} & {*name} and any(fnmatchcase(name, pattern) for pattern in WANTED)
+    is_plain = name.isprintable() and len(name) <= MOST_CHARACTERS and not {"/", "\\", ":"} & {*name}
+    return is_plain and any(fnmatchcase(name, pattern) for pattern in WANTED)
 
 
 def card(agent: Agent, repo: str, source: Path, names: set[str]) -> str:

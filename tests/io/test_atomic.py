@@ -61,3 +61,24 @@ def test_a_curve_takes_the_place_of_a_link(link):
     pytest.importorskip("matplotlib")
     History([]).plot(link)
     assert link.read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_file_that_a_reader_holds_is_replaced_when_it_is_closed(tmp_path, monkeypatch):
+    """As on Windows, where another process that reads a file keeps it from being replaced."""
+    new, old, tries, rename = tmp_path / "new", tmp_path / "old", [], os.replace
+    new.write_text("new")
+    old.write_text("old")
+
+    def held(source, target):
+        tries.append(target)
+        if len(tries) < 3:
+            raise PermissionError
+        rename(source, target)
+
+    monkeypatch.setattr(os, "replace", held)
+    atomic.replace_patiently(new, old, (0.0, 0.0))
+    assert (old.read_text(), len(tries)) == ("new", 3)
+    new.write_text("newer")
+    tries.clear()
+    with pytest.raises(PermissionError):
+        atomic.replace_patiently(new, old, (0.0,))

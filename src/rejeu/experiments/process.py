@@ -43,6 +43,7 @@ class Process:
                 cwd=folder,
                 env={**environ, interrupt.LOCK: str(lock)},
                 process_group=0 if os.name == "posix" else None,  # Ctrl-C reaches it once, through stop
+                creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),
             )
 
     @property

@@ -303,6 +303,8 @@ def state_of(run: Run) -> State:
 def is_locked(path: Path) -> bool:
     """Returns whether another process holds the lock on a file; the file is not changed."""
     if os.name != "posix":
+        if not path.is_file():  # FileLock would create it
+            return False
         try:
             with FileLock(path).acquire(timeout=0):
                 return False

@@ -24,6 +24,7 @@ from rejeu.envs.registry import make_env, provider, register
 from rejeu.envs.rendering import check_renders, make_rendering_env, natural_fps, rgb_frame
 from rejeu.errors import MissingExtra
 from rejeu.interrupt import Interrupt
+from rejeu.io import atomic
 from rejeu.validation import number, whole
 
 HOLD_SECONDS = 0.5
@@ -97,7 +98,7 @@ class VideoFile:
         if self._process is None:
             raise ValueError(f"{self.path} has no frames")
         self._finish(self._process)
-        os.replace(self._partial, self.path)
+        atomic.replace(self._partial, self.path)
         return self.path
 
     def discard(self) -> None:
