@@ -27,8 +27,6 @@ from rejeu.sb3 import pickled, zip_files
 FILES = ("config.json", "episodes.csv", "metrics.csv", "evaluations.csv", "curve.png", "video.mp4")
 """Files of a run folder that are pushed, besides the model."""
 MODEL, ONNX, CARD = "agent.safetensors", "policy.onnx", "README.md"
-MOST_CHARACTERS = 200
-"""Upper limit on the name of a file that is downloaded."""
 WANTED = (*FILES, MODEL, ONNX, f"{ONNX}.json", CARD, "*.zip", "*.pkl", "args.yml", "config.yml", "env_kwargs.yml")
 """Files that are pulled."""
 
@@ -137,7 +135,7 @@ def pull(repo: str, out: str | Path | None = None) -> Path:
 
 def is_wanted(name: str) -> bool:
     """Returns whether a file of a repository is downloaded: one of :data:`WANTED`, and in no folder."""
-    is_plain = name.isprintable() and len(name) <= MOST_CHARACTERS and not {"/", "\\", ":"} & {*name}
+    is_plain = name.isprintable() and len(name) <= 200 and not {"/", "\\", ":"} & {*name}
     return is_plain and any(fnmatchcase(name, pattern) for pattern in WANTED)
 
 

@@ -193,7 +193,7 @@ def test_a_tracker_that_fails_does_not_end_training_and_is_warned_of_once_and_at
     agent, said = learn(monkeypatch, Fake(lambda n: True))
     assert agent.num_timesteps == 60
     assert said == [
-        "rows of the tracker: ConnectionResetError: no route to host; training continues and the write is retried",
+        "rows of the tracker: ConnectionResetError: no route to host; the rest continues and the write is retried",
         "not written (ConnectionResetError: no route to host): rows of the tracker",
     ]
 

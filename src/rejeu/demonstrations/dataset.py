@@ -38,11 +38,12 @@ that the file itself has compressed only a part counts, of general ones and of J
 class Rows:
     """Reads arrays from the files of a dataset, until more was asked for than they can hold. Mutable."""
 
-    def __init__(self, files: list[Path]) -> None:
+    def __init__(self, files: list[Path], is_jpeg: bool) -> None:
+        self.is_jpeg = is_jpeg
         found = [file.stat() for file in files]
         self.left = SLACK + ROOM * sum(min(one.st_size, 512 * getattr(one, "st_blocks", one.st_size)) for one in found)
 
-    def part(self, group: Any, path: str, space: gym.Space | None, is_jpeg: bool) -> Any:
+    def part(self, group: Any, path: str, space: gym.Space | None) -> Any:
         """Returns a part of an episode: arrays in the structure of a space, or one array."""
         import h5py
 
@@ -51,18 +52,16 @@ class Rows:
                 raise ValueError(f"{shown(path)} is missing, or a link to somewhere else")
             group = group[name]
         if isinstance(space, gym.spaces.Dict):
-            return {key: self.part(group, key, one, is_jpeg) for key, one in space.spaces.items()}
+            return {key: self.part(group, key, one) for key, one in space.spaces.items()}
         if isinstance(space, gym.spaces.Tuple):
-            return tuple(self.part(group, f"_index_{i}", one, is_jpeg) for i, one in enumerate(space.spaces))
+            return tuple(self.part(group, f"_index_{i}", one) for i, one in enumerate(space.spaces))
         if not isinstance(group, h5py.Dataset) or group.external or group.is_virtual or not group.ndim:
             raise ValueError(f"{shown(path)} is no array that the file itself holds")
         shape = () if space is None else space.shape or ()
-        if is_jpeg and len(shape) > 1 and (group.dtype.kind == "O" or group.ndim != 1 + len(shape)):
+        if self.is_jpeg and len(shape) > 1 and (group.dtype.kind == "O" or group.ndim != 1 + len(shape)):
             self._take(path, len(group) * math.prod(shape), IMAGES)
-            pictures = np.empty((len(group), *shape), np.uint8)
-            for i, row in enumerate(group):
-                pictures[i] = picture(row, shape)
-            return pictures
+            pictures = (picture(row, shape) for row in group)
+            return np.fromiter(pictures, np.dtype((np.uint8, shape)), len(group))
         if group.dtype.kind not in "biuf":
             raise ValueError(f"{shown(path)} has the dtype {group.dtype}, expected numbers")
         self._take(path, group.nbytes, PACKED if group.id.get_create_plist().get_nfilters() else 1)
@@ -86,10 +85,11 @@ def read(data: Path) -> tuple[list[tuple[Any, ...]], gym.Space, gym.Space, EnvSp
 
     files = [path for path in (data / MAIN, *parts(data)) if path.is_file()]
     try:
-        rows, metadata = Rows(files), metadata_of(data, files)
+        metadata = metadata_of(data, files)
+        rows = Rows(files, bool(metadata.get("jpeg_encoding", True)))
         if (form := metadata.get("data_format", "hdf5")) != "hdf5":
             raise ValueError(f"it is in the format {shown(form)}, and only hdf5 is read")
-        most, is_jpeg = max(spaces.MAX_NUMBERS, rows.left), bool(metadata.get("jpeg_encoding", True))
+        most = max(spaces.MAX_NUMBERS, rows.left)
         both = [spaces.rebuild(described(json.loads(metadata[name])), most) for name in SPACES]
         keys = dict(zip(("observations", "actions", "rewards", "terminations"), (*both, None, None), strict=True))
         found: dict[int, tuple[Any, ...]] = {}
@@ -97,9 +97,7 @@ def read(data: Path) -> tuple[list[tuple[Any, ...]], gym.Space, gym.Space, EnvSp
             with h5py.File(path, "r") as file:
                 for name in file:
                     if (match := EPISODE.fullmatch(name)) and (i := int(match[1])) not in found:
-                        found[i] = tuple(
-                            rows.part(file, f"{name}/{key}", space, is_jpeg) for key, space in keys.items()
-                        )
+                        found[i] = tuple(rows.part(file, f"{name}/{key}", space) for key, space in keys.items())
         return [found[i] for i in sorted(found)], both[0], both[1], spec_of(metadata.get("env_spec"))
     except (*WRONG, OSError, RuntimeError) as error:
         problem = f"{atomic.shortened(data)} is damaged or of another kind ({brief(error)})"
@@ -231,8 +229,8 @@ def merge(data: Path) -> None:
         if sink.error is not None:
             raise sink.error
     metadata = json.loads((data / METADATA).read_text(encoding="utf-8"))
-    metadata |= {"total_episodes": len(steps), "total_steps": sum(steps)}
-    metadata["dataset_size"] = round((data / MAIN).stat().st_size / 1e6, 1)
+    size = round((data / MAIN).stat().st_size / 1e6, 1)
+    metadata |= {"total_episodes": len(steps), "total_steps": sum(steps), "dataset_size": size}
     atomic.write(data / METADATA, json.dumps(metadata))
     for path in waiting:
         path.unlink()

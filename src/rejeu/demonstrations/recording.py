@@ -6,7 +6,6 @@ import copy
 import json
 import re
 import warnings
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -73,7 +72,7 @@ class Recording:
             "description": "Played by hand with rejeu play" if by == "human" else "Played by an agent",
             **({} if spec is None else dict.fromkeys(("env_spec", "eval_env_spec"), spec.to_json())),
         }
-        self._writes = FailedWrites("playing" if by == "human" else "the run")
+        self._writes = FailedWrites()
         self._video = None if fps is None else VideoFile(self.folder / VIDEO_NAME, fps)
         self._seed: int | None = None
         self._steps: list[tuple[Any, ...]] = []
@@ -95,13 +94,7 @@ class Recording:
         self._frame = frame
 
     def step(
-        self,
-        obs: Any,
-        action: Any,
-        reward: float,
-        terminated: bool,
-        truncated: bool,
-        frame: np.ndarray | None = None,
+        self, obs: Any, action: Any, reward: float, terminated: bool, truncated: bool, frame: np.ndarray | None = None
     ) -> None:
         """Adds a step."""
         if frame is not None:
@@ -121,8 +114,7 @@ class Recording:
             if self._video is not None:
                 self._video.discard()
             raise
-        if self._video is not None and self._video.n_frames:
-            self._filmed(self._video.close)
+        self._show(last=True)
 
     def _end(self) -> None:
         steps, self._steps = self._steps, []
@@ -142,15 +134,15 @@ class Recording:
             atomic.write(self._data / dataset.METADATA, text)
         atomic.write(self._data / f"episode_{i}.hdf5", content)
 
-    def _show(self, *frames: np.ndarray) -> None:
-        for frame in frames:
-            if self._video is not None:
-                self._filmed(self._video.write, frame)
-
-    def _filmed(self, write: Callable[..., object], *frame: np.ndarray) -> None:
-        """Calls a method of the video; what cannot be written ends it, with a warning, and the dataset goes on."""
+    def _show(self, *frames: np.ndarray, last: bool = False) -> None:
+        """Adds frames to the video, and completes it after the last. If it cannot be written, the game goes on with a warning."""
+        if self._video is None:
+            return
         try:
-            write(*frame)
+            for frame in frames:
+                self._video.write(frame)
+            if last and self._video.n_frames:
+                self._video.close()
         except OSError as error:
             warnings.warn(f"{error}; the game and its dataset go on without a video", UserWarning, stacklevel=3)
             self._video = None

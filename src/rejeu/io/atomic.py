@@ -36,10 +36,9 @@ ADVICE = {
 def replace_patiently(source: Path, target: Path, waits: Iterable[float] = (0.01, 0.04, 0.2, 0.75)) -> None:
     """Renames a file over another one, which on Windows fails while a reader holds it: waits up to a second for that."""
     for seconds in waits:
-        try:
+        with contextlib.suppress(PermissionError):
             return os.replace(source, target)
-        except PermissionError:
-            time.sleep(seconds)
+        time.sleep(seconds)
     return os.replace(source, target)
 
 

@@ -44,9 +44,7 @@ class FailedWrites:
     'not written (No space left on device): the table'
     """
 
-    def __init__(self, work: str = "training") -> None:
-        self._work = work
-        """What continues."""
+    def __init__(self) -> None:
         self.failures: dict[str, Failure] = {}
         """Failures of the last ``learn``, by name."""
         self._retries: dict[str, Callable[[], object]] = {}
@@ -75,7 +73,7 @@ class FailedWrites:
                 what,
                 write if retry else None,
                 os.strerror(error.errno) if error.errno else text,
-                f"{what}: {text}; {self._work} continues and the write is retried",
+                f"{what}: {text}; the rest continues and the write is retried",
             )
             return False
         self._retries.pop(what, None)
