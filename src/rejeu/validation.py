@@ -134,11 +134,11 @@ def build(kind: type[C], given: Mapping[str, Any], context: str = "") -> C:
     return kind(**given)
 
 
-def check_names(given: Iterable[str], known: Sequence[str], owner: str) -> None:
-    """Raises ``TypeError`` for a name that ``owner`` does not know, suggesting the nearest that it does."""
+def check_names(given: Iterable[str], known: Sequence[str], owner: str, shape: Sequence[str] = ()) -> None:
+    """Raises ``TypeError`` for a name that ``owner`` does not know, suggesting the nearest, or where ``shape`` goes."""
     for key in given:
         if key not in known:
-            raise TypeError(unknown_name(key, known, owner))
+            raise TypeError(unknown_name(key, known, owner, shape))
 
 
 def with_value(mapping: Mapping[str, Any], path: Sequence[str], value: Any, name: str) -> dict[str, Any]:
@@ -176,10 +176,12 @@ ELSEWHERE = {
 """Where to find what goes by another name elsewhere; only asked for names that are unknown."""
 
 
-def unknown_name(key: str, names: Iterable[str], owner: str) -> str:
+def unknown_name(key: str, names: Iterable[str], owner: str, shape: Sequence[str] = ()) -> str:
     """Returns the sentence for a misspelt name, with the nearest known one."""
     if key in ELSEWHERE:
         return f"{owner} has no setting {key!r}; {ELSEWHERE[key]}"
+    if key in shape:
+        return f"{owner} takes {key} in policy_kwargs: policy_kwargs={{{key!r}: ...}}"
     near = difflib.get_close_matches(key, list(names), n=1, cutoff=0.5)
     hint = f"did you mean {near[0]}?" if near else f"known: {', '.join(names)}"
     return f"{owner} has no setting {key!r}; {hint}"

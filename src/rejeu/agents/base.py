@@ -189,10 +189,8 @@ class BaseAgent(ABC):
     ) -> None:
         hyperparameters = self.converted(hyperparameters)
         known = [*validation.field_names(self.algorithm.Config), *AGENT_ARGUMENTS]
-        shape = {*validation.field_names(self.algorithm.Config.policy_kwargs_class)} - {*known}
-        if inside := [key for key in hyperparameters if key in shape - {*validation.ELSEWHERE}]:
-            raise TypeError(f"{self.name} takes {inside[0]} in policy_kwargs: policy_kwargs={{{inside[0]!r}: ...}}")
-        validation.check_names(hyperparameters, known, self.name)
+        shape = validation.field_names(self.algorithm.Config.policy_kwargs_class)
+        validation.check_names(hyperparameters, known, self.name, shape)
         config = self.algorithm.Config(**hyperparameters)
         self.configure(policy, config, seed, stats_window_size, success_threshold, best_window, device)
         self.set_outputs(verbose, log, tensorboard_log)
