@@ -63,6 +63,30 @@ def try_out(wheel: Path, folder: Path) -> None:
     print(run(python, "-c", SCRIPT, cwd=folder))
 
 
+def try_without_jax(wheel: Path, folder: Path) -> None:
+    """Does what docs/deployment.md says under "Python without JAX", with a model that the full installation saved."""
+    venv.create(folder / "light", with_pip=True)
+    python = folder / "light" / ("Scripts" if os.name == "nt" else "bin") / "python"
+    run(python, "-m", "pip", "install", "-q", "--no-deps", wheel)
+    run(
+        python,
+        "-m",
+        "pip",
+        "install",
+        "-q",
+        "-c",
+        ROOT / "constraints.txt",
+        "gymnasium",
+        "msgspec",
+        "numpy",
+        "safetensors",
+    )
+    use = (
+        "import rejeu; policy = rejeu.load_policy('cartpole'); print(policy.predict(policy.observation_space.sample()))"
+    )
+    print(run(python, "-c", use, cwd=folder))
+
+
 def main() -> None:
     """Builds, checks and tests the wheel."""
     with tempfile.TemporaryDirectory() as name:
@@ -71,6 +95,7 @@ def main() -> None:
         wheel = build(wheels)
         check_contents(wheel)
         try_out(wheel, folder)
+        try_without_jax(wheel, folder)
     print(f"{wheel.name} installs and runs")
 
 

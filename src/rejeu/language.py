@@ -14,24 +14,16 @@ SETTING = "REJEU_LANGUAGE"
 """Environment variable with the language, English by default; ``speak`` in the notebooks of the courses sets it."""
 
 
-def checked(language: str) -> Language:
-    """Returns a language.
+def chosen(language: str | None = None) -> Language:
+    """Returns a language, by default that of :data:`SETTING`.
 
     Raises:
         ValueError: for an unknown one.
     """
+    language = language or os.environ.get(SETTING) or "en"
     if language not in LANGUAGES:
         raise ValueError(f"language {language!r} must be one of {', '.join(LANGUAGES)}")
     return language
-
-
-def chosen() -> Language:
-    """Returns the language of :data:`SETTING`.
-
-    Raises:
-        ValueError: for an unknown one.
-    """
-    return checked(os.environ.get(SETTING) or "en")
 
 
 @cache
@@ -46,5 +38,5 @@ def said(text: str, *values: Any, language: Language | None = None) -> str:
     >>> said("step {}", 3, language="fr"), said("a text without a translation", language="fr")
     ('pas 3', 'a text without a translation')
     """
-    text = french().get(text, text) if (language or chosen()) == "fr" else text
+    text = french().get(text, text) if chosen(language) == "fr" else text
     return text.format(*values) if values else text

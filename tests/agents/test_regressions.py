@@ -6,6 +6,7 @@ import gc
 import json
 import time
 import tracemalloc
+from types import SimpleNamespace
 
 import gymnasium as gym
 import jax
@@ -16,7 +17,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import rejeu
 from rejeu import core, spaces
-from rejeu.agents import AGENTS
+from rejeu.agents import AGENTS, training
 from rejeu.algorithms import config as configs
 from rejeu.buffers.ring import Ring
 from rejeu.buffers.uniform import ReplayBuffer
@@ -395,3 +396,26 @@ def test_every_kind_of_noise_survives_saving(noise, tmp_path):
     actions = [run.replay_buffer.arrays()["action"] for run in runs]
     np.testing.assert_array_equal(*actions)
     assert len(np.unique(actions[0])) > 5
+
+
+@pytest.mark.parametrize(
+    ("env_id", "n_envs", "share", "hints"),
+    [
+        ("CartPole-v1", 1, 0.96, True),
+        ("CartPole-v1", 4, 0.96, False),
+        ("CartPole-v1", 1, 0.5, False),
+        ("Own", 1, 0.96, False),
+    ],
+)
+def test_a_run_that_waits_for_one_environment_names_the_call_that_makes_eight(env_id, n_envs, share, hints, recwarn):
+    seconds = {"env": 20 * share, "replay": 0.0, "update": 20 * (1 - share), "total": 20.0}
+    run = SimpleNamespace(env=SimpleNamespace(env_id=env_id, n_envs=n_envs), seconds=seconds)
+    training.hint_at_more_environments(SimpleNamespace(run=run, steps_per_second=37.0))
+    assert ["rejeu.make_vector('CartPole-v1', n_envs=8)" in str(one.message) for one in recwarn] == [True] * hints
+
+
+def test_the_hint_comes_with_a_row_of_statistics(monkeypatch):
+    given = []
+    monkeypatch.setattr(training, "hint_at_more_environments", given.append)
+    agent = small_sac(Counter(lengths=(2,)), learning_starts=99, verbose=1).learn(9, log_interval=4)
+    assert given == [agent]

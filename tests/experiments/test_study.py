@@ -6,6 +6,7 @@ import math
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -324,3 +325,18 @@ def test_a_study_with_fewer_final_seeds_than_are_compared_today_gets_more(tmp_pa
     old = dataclasses.replace(make_plan(), final_seeds=3)  # of an earlier version
     assert old.fresh_seeds() == make_plan().fresh_seeds()
     assert dataclasses.replace(old, final_seeds=0).fresh_seeds() == []
+
+
+def test_trainings_of_the_final_comparison_that_were_stopped_have_not_ended(monkeypatch):
+    class Stopping:
+        def __init__(self, launcher, stop, say, waits):
+            self.say, self.waiting = say, []
+
+        def run(self):
+            self.say("stopped")
+
+    said = []
+    monkeypatch.setattr(search, "Scheduler", Stopping)
+    tasks = [SimpleNamespace(name=one, ending=one, reason="") for one in ("done", "failed", "stopped", "stopped")]
+    search.train_final(tasks, 1, Interrupt(), said.append)
+    assert said == ["final comparison: 2 of 4 trainings have ended; stopped"]

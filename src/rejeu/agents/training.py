@@ -10,6 +10,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 
 from rejeu import schedules, xla
@@ -30,6 +31,8 @@ from rejeu.reporting.tables import Table
 
 TABLE_SECONDS = 2.0
 """Least time between two tables that ``verbose=1`` prints; other outputs get every row."""
+HINT_SECONDS, HINT_RATE = 10.0, 200.0
+"""After so many seconds of training, at fewer steps a second, a run may get a hint."""
 LOG_FOLDER = "logs"
 """Folder of the folders of logs, in the current folder."""
 LOGGED_AS = {"exploration_rate": "rollout/exploration_rate"}
@@ -268,6 +271,24 @@ def session(
         yield record
 
 
+def hint_at_more_environments(agent: BaseAgent) -> None:
+    """Warns if a run waits for a single registered environment, and names the call that makes eight; Python shows it once."""
+    env, seconds = agent.run.env, agent.run.seconds
+    is_slow = seconds["total"] > HINT_SECONDS and agent.steps_per_second < HINT_RATE
+    if (
+        is_slow
+        and env is not None
+        and env.n_envs == 1
+        and env.env_id in gym.registry
+        and time_shares(seconds)["env"] > 0.75
+    ):
+        call = f"rejeu.make_vector({env.env_id!r}, n_envs=8)"
+        hint = (
+            f"most of the time goes into the only environment; {call} steps eight, on EnvPool where it has {env.env_id}"
+        )
+        warnings.warn(hint, UserWarning, stacklevel=2)
+
+
 def horizon(agent: BaseAgent, call: TrainingCall) -> tuple[int | None, Callable[[int], float]]:
     """Returns the number of steps that are left to take, and the progress of schedules after a number of them."""
     run, first = agent.run, agent.run.step
@@ -297,6 +318,7 @@ def record_turn(agent: BaseAgent, call: TrainingCall, turn: Progress, outputs: S
         row = statistics_row(agent) | agent.logger.take()
         for output in outputs:
             output.write(agent.num_timesteps, row)
+        hint_at_more_environments(agent)
     if ended := device.episodes_to_judge(agent, call, turn):
         note_training_return(agent, ended)
 

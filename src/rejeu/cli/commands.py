@@ -69,8 +69,8 @@ class Train(RunConfig):
     pause: Count = None
     """Pause after so many environment steps; rejeu resume continues to the goal."""
     seeds: Several = None
-    """Train this many seeds, from --seed on, each in a folder of its own, and compare them at the end. In JAX environments one
-    program trains all of them; elsewhere, and with --jobs, each has a process of its own."""
+    """Train this many seeds, from --seed or 0 on, each in a folder of its own, and compare them in the end. In JAX
+    environments one program trains all of them; elsewhere, and with --jobs, each has a process of its own."""
     jobs: Several = None
     """With --seeds: how many are trained at once; by default half as many as there are cores."""
     out: Folder = None

@@ -50,11 +50,15 @@ def grade(arguments: Course) -> tuple[int, dict[str, Any]]:
 def run_class(arguments: Class) -> tuple[int, dict[str, Any]]:
     """Evaluates the models in a folder, prints a line for each, and writes the leaderboard."""
     episodes = whole("--episodes", arguments.episodes, 1, MAX_EPISODES)
-    formats = {".html": leaderboard.page, ".md": leaderboard.markdown, ".json": as_json}
+    formats = {
+        ".html": leaderboard.page,
+        ".md": leaderboard.markdown,
+        ".json": lambda board: dumps(leaderboard.to_dict(board)) + "\n",
+    }
     out = arguments.out
     if out.suffix not in formats:
         raise ValueError(f"--out {out} must end in {', '.join(formats)}")
-    paths, language = leaderboard.models(arguments.folder), arguments.language or chosen()
+    paths, language = leaderboard.models(arguments.folder), chosen(arguments.language)
     if out.suffix == ".html":
         leaderboard.template()  # a missing package is named before the evaluations
     made = environment.from_arguments(arguments.env or leaderboard.usual_env_id(paths), arguments)
@@ -73,8 +77,3 @@ def run_class(arguments: Class) -> tuple[int, dict[str, Any]]:
     )
     echo(atomic.write(out, formats[out.suffix](board)))
     return 0, {**leaderboard.to_dict(board), "file": out}
-
-
-def as_json(board: leaderboard.Leaderboard) -> str:
-    """Returns a leaderboard as JSON text."""
-    return dumps(leaderboard.to_dict(board)) + "\n"

@@ -11,8 +11,6 @@ from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from rejeu import devices
 from rejeu.agents import find_agent, training
 from rejeu.agents.device import reason_against, require_memory
@@ -145,7 +143,7 @@ def make_jobs(arguments: Train) -> tuple[Job, ...]:
         MissingExtra: if what ``--log`` or ``--video-every`` need is not installed.
     """
     assert arguments.seeds is not None
-    first = int(np.random.default_rng().integers(10_000)) if arguments.seed is None else arguments.seed
+    first = arguments.seed or 0
     given = {one.name: getattr(arguments, one.name) for one in dataclasses.fields(RunConfig)}
     installed_logs(arguments)
     devices.named(arguments.device, "--device")

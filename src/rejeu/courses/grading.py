@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 from rejeu.courses import checks
 from rejeu.courses.notebooks import jupytext
-from rejeu.language import Language, checked, chosen, said
+from rejeu.language import Language, chosen, said
 
 SECONDS = 120.0
 """Time limit of a notebook."""
@@ -65,7 +65,7 @@ def grade(path: Path, seconds: float = SECONDS) -> Grade:
     if not names:
         return Grade(path, {}, said("it has no checks of a course"))
     spoken = SPEAK.search("\n".join(cells))
-    language = chosen() if spoken is None else checked(spoken[1])
+    language = chosen(spoken and spoken[1])
     command = [sys.executable, "-c", "from rejeu.courses.grading import main; main()"]
     quiet = {"MPLBACKEND": "agg", "PYTHONIOENCODING": "utf-8"}
     try:

@@ -129,8 +129,7 @@ def equal_files(paths: Sequence[Path]) -> list[list[Path]]:
     for path in paths:
         with suppress(OSError):
             if 0 < path.stat().st_size <= MAX_BYTES:
-                with path.open("rb") as file:
-                    groups.setdefault(hashlib.file_digest(file, "sha256").digest(), []).append(path)
+                groups.setdefault(hashlib.sha256(path.read_bytes()).digest(), []).append(path)
     return [group for group in groups.values() if len(group) > 1]
 
 

@@ -268,7 +268,7 @@ def train_final(tasks: Sequence[Training], workers: int, stop: Interrupt, echo: 
     """
 
     def say(text: str) -> None:
-        n = sum(task.ending is not None for task in tasks)
+        n = sum(task.ending not in (None, "stopped") for task in tasks)
         echo(f"final comparison: {n} of {len(tasks)} trainings have ended; {text}")
 
     scheduler = Scheduler(LocalLauncher(workers), stop, say, waits=True)

@@ -80,7 +80,7 @@ class Window:
         ):
             pygame.display.quit()
             raise OSError(
-                f"cannot open a window: SDL finds no display ({driver}); rejeu record RUN writes a video without a display"
+                f"cannot open a window: SDL finds no display ({driver}); rejeu record RUN films a trained agent without one"
             )
         pygame.font.init()
         self.clock = pygame.time.Clock()

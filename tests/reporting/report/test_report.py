@@ -1,5 +1,6 @@
 """Pages about runs: their content, and everything that can be wrong with a run folder. No browser; see test_browser.py."""
 
+import dataclasses
 import json
 import re
 import shutil
@@ -14,9 +15,9 @@ from rejeu.agents.training import record
 from rejeu.cli import main
 from rejeu.errors import MissingExtra
 from rejeu.loops.run import Episode
-from rejeu.reporting import charts
+from rejeu.reporting import charts, runs
 from rejeu.reporting.evaluation import Evaluation
-from rejeu.reporting.report import page, write_report
+from rejeu.reporting.report import page, sections, write_report
 from rejeu.reporting.runs import Episodes
 from rejeu.reporting.tables import EMPTY
 from tests.reporting.report.folders import CONFIG, EVIL, MP4, write, write_hostile
@@ -53,6 +54,14 @@ def test_page_of_a_run(tmp_path):
     data = data_of(text)
     assert {"run0-return", "run0-success", "run0-length", "run0-time"} < set(data["charts"])
     assert sum(data["histograms"]["run0-episodes"]["counts"]) == 60
+
+
+def test_the_last_evaluation_of_a_running_run_is_not_called_final(tmp_path):
+    run = dataclasses.replace(runs.read_run(write(tmp_path / "run")), state="running")
+    assert [one.title for one in sections.tiles(run)][:2] == [
+        "Best evaluation, step 2,000",
+        "Newest evaluation, step 3,000",
+    ]
 
 
 def test_charts_of_metrics_are_grouped(tmp_path):

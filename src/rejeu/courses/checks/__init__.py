@@ -48,7 +48,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rejeu.language import SETTING, Language, checked, chosen
+from rejeu.language import SETTING, Language, chosen
 
 NOT_STUDENTS = (Path(__file__).parents[2], Path(sysconfig.get_paths()["stdlib"]))
 """Folders whose code the student did not write, besides ``site-packages``."""
@@ -118,7 +118,7 @@ def speak(language: Language) -> None:
     Raises:
         ValueError: for an unknown language.
     """
-    os.environ[SETTING] = checked(language)
+    os.environ[SETTING] = chosen(language)
     SESSION.found.clear()
 
 

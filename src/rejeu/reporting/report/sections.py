@@ -194,7 +194,8 @@ def tiles(run: Run) -> list[Tile]:
     best = best_row(run.evaluations)
     if best is not None:
         found += evaluation_tiles(run, "Best evaluation", best)
-        found += evaluation_tiles(run, "Final evaluation", int(np.flatnonzero(np.isfinite(mean))[-1]))
+        newest = "Newest evaluation" if run.state == "running" else "Final evaluation"
+        found += evaluation_tiles(run, newest, int(np.flatnonzero(np.isfinite(mean))[-1]))
     else:
         found += training_tiles(run)
     done = f"of {run.steps_asked:,}" if run.steps_asked else ""
