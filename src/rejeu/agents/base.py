@@ -5,6 +5,8 @@ The functions of this package work on a :class:`BaseAgent`. :class:`rejeu.agents
 
 from __future__ import annotations
 
+import dataclasses
+import difflib
 import inspect
 import math
 import secrets
@@ -58,6 +60,9 @@ AGENT_ARGUMENTS = {
     "contain it.",
 }
 """Arguments of every agent in addition to its hyperparameters, with their meanings."""
+
+READ_ONCE = ("seed", "stats_window_size", "device")
+"""Arguments that cannot be set later."""
 
 
 class Best(NamedTuple):
@@ -241,6 +246,39 @@ class BaseAgent(ABC):
         if noise is not None:
             check_fits(noise, action_space)
         self.learner = Learner(self.algorithm_of(self.config), noise, self.config.nonfinite == "skip")
+
+    def __getattr__(self, name: str) -> Any:
+        """Returns a hyperparameter."""
+        known = validation.field_names(type(self).algorithm.Config)
+        if name in known and "config" in self.__dict__:
+            return getattr(self.config, name)
+        public = [one for one in dir(type(self)) if not one.startswith("_")]
+        near = difflib.get_close_matches(name, [*known, *public], 1)
+        hint = f"; did you mean {near[0]}?" if near else ""
+        raise AttributeError(f"{type(self).__name__} has no attribute {name!r}{hint}")
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Sets an attribute; one that agents do not have by :meth:`assign`."""
+        has_it = name not in READ_ONCE and (name in self.__dict__ or hasattr(type(self), name))
+        (object.__setattr__ if has_it or "run" not in self.__dict__ else BaseAgent.assign)(self, name, value)
+
+    def assign(self, name: str, value: Any) -> None:
+        """Sets a hyperparameter, which counts from the next update on, or an attribute of a class of your own.
+
+        Raises:
+            AttributeError: for a name that agents do not have, or that only the constructor takes.
+            ValueError: for a hyperparameter that networks or buffer depend on.
+        """
+        if name in READ_ONCE:
+            raise AttributeError(
+                f"{name} of {self.name} is read when it is made; give it to the constructor or to load"
+            )
+        if name in validation.field_names(self.algorithm.Config):
+            self.change(dataclasses.replace(self.config, **self.converted({name: value})))
+        elif type(self).__module__.startswith("rejeu."):
+            getattr(self, name)  # raises
+        else:
+            object.__setattr__(self, name, value)
 
     def change(self, new: Any) -> None:
         """Replaces the hyperparameters; the new ones count from the next update on, also within ``learn``, and are compiled.

@@ -239,7 +239,7 @@ def record(
             if vector is None and stack is not None:
                 obs = _restacked(agent, stack, obs, rows[-1] if rows else None, bool(ended[0]))
             arrays = [np.array(array[0]) for array in jax.tree.leaves(obs)]
-            action, memory = agent.predict(obs, memory, ended, deterministic=True)  # type: ignore[attr-defined]
+            action, memory = agent.predict(obs, memory, ended, deterministic=True)
             rows.append(arrays)
             actions.append(action[0])
             starts.append(bool(ended[0]))

@@ -169,9 +169,9 @@ def run_import(arguments: Import) -> tuple[int, dict[str, Any]]:
         agent = load_zip(model, made, statistics, **arguments.hyperparameters)
         path = agent.save(out)
     echo(f"{path}: {agent.name}, {counted(agent.num_timesteps, 'step')}, {counted(agent.n_updates, 'update')}")
-    for note in agent.notes:  # type: ignore[attr-defined]
+    for note in agent.notes:
         echo(f"note: {note}")
-    return 0, {"model": path, "algorithm": agent.name, "notes": agent.notes}  # type: ignore[attr-defined]
+    return 0, {"model": path, "algorithm": agent.name, "notes": agent.notes}
 
 
 def run_push(arguments: Push) -> tuple[int, dict[str, Any]]:

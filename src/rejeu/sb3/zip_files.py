@@ -526,7 +526,7 @@ def load_zip(
     if vector is not None:
         agent.set_env(vector)
         agent.made_from_id = isinstance(env, str)
-    agent.notes = notes  # type: ignore[attr-defined]
+    agent.notes = notes
     return agent
 
 

@@ -8,6 +8,7 @@ To port a script, replace ``sb3_contrib`` by ``rejeu.sb3_contrib`` in its import
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -37,14 +38,13 @@ class ActionMasker(gym.Wrapper):
 
     Args:
         env: the environment.
-        action_mask_fn: function of the environment that returns the mask, or the name of a method.
+        action_mask_fn: function of the environment that returns the mask, or the name of a method that takes it, or nothing.
     """
 
     def __init__(self, env: gym.Env, action_mask_fn: str | Callable[[Any], Any]) -> None:
         super().__init__(env)
-        self._mask = (
-            env.get_wrapper_attr(action_mask_fn) if isinstance(action_mask_fn, str) else lambda: action_mask_fn(env)
-        )
+        found: Any = env.get_wrapper_attr(action_mask_fn) if isinstance(action_mask_fn, str) else action_mask_fn
+        self._mask = partial(found, env) if inspect.signature(found).parameters else found
 
     def action_masks(self) -> np.ndarray:
         """Returns which actions are allowed, ``bool (n,)``."""

@@ -51,7 +51,7 @@ def evaluate_policy(
         warn: accepted and ignored. Episodes are counted here, so a missing ``Monitor`` does not affect the result.
 
     Raises:
-        ValueError: if the mean return is below ``reward_threshold``.
+        AssertionError: if the mean return is not above ``reward_threshold``.
         TypeError: if the model uses action masks and those of the environment cannot be accessed.
     """
     agent = model if isinstance(model, Agent) else None
@@ -104,5 +104,5 @@ def evaluate_policy(
         cut_off(cut)
     mean, std = float(np.mean(episode_rewards)), float(np.std(episode_rewards))
     if reward_threshold is not None and not mean > reward_threshold:
-        raise ValueError(f"the mean return {mean:.2f} is not above reward_threshold={reward_threshold:.2f}")
+        raise AssertionError(f"the mean return {mean:.2f} is not above reward_threshold={reward_threshold:.2f}")
     return (episode_rewards, episode_lengths) if return_episode_rewards else (mean, std)
