@@ -367,3 +367,11 @@ def test_a_name_that_no_include_can_hold_is_refused(name, tmp_path):
     with pytest.raises(ValueError, match="cannot be included by a C program"):
         agent.export(tmp_path / name)
     assert not [*tmp_path.iterdir()]
+
+
+def test_observations_with_practically_infinite_bounds_are_sampled_near_0():
+    """The space of CartPole had float32's largest number as a bound, and values were infinite for samples of it."""
+    most = np.finfo(np.float32).max
+    x = exporting.moderate(np.array([[0.9 * most, -most, 3.0, 0.0]], np.float32), np.random.default_rng(0))
+    assert np.abs(x).max() < 10
+    assert x[0, 2:].tolist() == [3.0, 0.0]

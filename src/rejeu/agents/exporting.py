@@ -306,10 +306,16 @@ def _restacked(agent: BaseAgent, stack: FrameStack, obs: Any, before: list[np.nd
     return found if masked is None else masked._replace(obs=found)
 
 
+def moderate(x: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Returns a sample with numbers from a standard normal where bounds are practically infinite."""
+    return np.where(np.abs(x) < 1e6, x, rng.normal(size=x.shape)).astype(x.dtype) if x.dtype.kind == "f" else x
+
+
 def _sample(agent: BaseAgent, one: Policy, rng: np.random.Generator) -> Any:
     """Returns a batch of one sample of the observation space, with a mask if the agent takes masks."""
     obs = jax.tree.map(
-        lambda part: np.asarray(part)[None], spaces.plain(agent.observation_space, agent.observation_space.sample())
+        lambda part: moderate(np.asarray(part)[None], rng),
+        spaces.plain(agent.observation_space, agent.observation_space.sample()),
     )
     masks = one.of("action_mask")
     if not masks:

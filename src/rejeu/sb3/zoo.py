@@ -118,7 +118,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
     try:
         import yaml  # noqa: TID251 - of which only the loader of plain values is used
     except ImportError:
-        raise ImportError("PyYAML is not installed; pip install pyyaml") from None
+        raise ImportError('PyYAML is not installed; pip install "rejeu[zoo]"') from None
 
     class Reader(yaml.SafeLoader):
         """Creates numbers, texts, lists and dicts only."""
