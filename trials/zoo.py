@@ -29,18 +29,22 @@ from unittest import mock
 import gymnasium as gym
 import numpy as np
 
-from rejeu.cli import environment
+from rejeu.envs.make import make_vector
 from rejeu.sb3 import load_zip
 from rejeu.sb3.zoo import statistics_beside
+from rejeu.sb3_contrib.common.wrappers import TimeFeatureWrapper
 
 N = 500
 RESULTS = Path(__file__).parent / "results" / "zoo.json"
 PROXIES = {
-    "-v3": "-v5",
     "LunarLander-v2": "LunarLander-v3",
     "LunarLanderContinuous-v2": "LunarLanderContinuous-v3",
-    "Fetch": "",
+    "Cheetah-v3": "Cheetah-v4",
+    "Hopper-v3": "Hopper-v4",
+    "Swimmer-v3": "Swimmer-v4",
+    "Walker2d-v3": "Walker2d-v4",
 }
+"""Environments of today in the place of those that are gone."""
 
 
 def original(path: Path) -> Any:
@@ -141,17 +145,19 @@ def played(path: Path, published: dict[tuple[str, str], str]) -> dict[str, Any] 
     """Returns the returns of 20 episodes beside the published ones; None where there is no such environment."""
     env_id = path.parent.name.rpartition("_")[0]
     proxy = next((env_id.replace(old, new) for old, new in PROXIES.items() if env_id.endswith(old)), env_id)
-    kwargs = {"use_contact_forces": True} if proxy == "Ant-v4" else {}
     agent = load_zip(path)
     try:
-        env = environment.from_arguments(proxy, environment.EnvironmentOptions(**kwargs)).vector(4, "sync", 0)
+        is_longer = agent.observation_space.shape == (gym.make(proxy).observation_space.shape[0] + 1,)
+        wrap = TimeFeatureWrapper if is_longer else lambda env: env
+        env = make_vector(lambda: wrap(gym.make(proxy)), 4, "gymnasium", seed=0)
         agent.check_spaces(env, "the environment")
-    except (gym.error.Error, ValueError, TypeError, ImportError):
+    except (gym.error.Error, ImportError, IndexError, TypeError, ValueError) as error:
+        print(error)
         return None
     with contextlib.closing(env):
         found = agent.evaluate(20, env=env)
     figure = published.get((path.parent.parent.name, env_id), "")
-    return {"env_id": proxy, "mean": found.mean, "std": found.std, "published": figure}
+    return {"env_id": proxy, "mean": found.mean_return, "std": found.std_return, "published": figure}
 
 
 def main() -> None:
@@ -172,9 +178,11 @@ def main() -> None:
         except (AssertionError, OSError, RuntimeError, TypeError, ValueError) as error:
             found = {"error": str(error)}
         if found is not None:
+            if "notes" in found:
+                found["notes"] = [note.replace(f"{root}/", "") for note in found["notes"]]
             results.setdefault(name, {})[command] = found
+        RESULTS.write_text(json.dumps(dict(sorted(results.items())), indent=1) + "\n", encoding="utf-8")
         print(name, f"{time.time() - start:.1f} s", found, flush=True)
-    RESULTS.write_text(json.dumps(dict(sorted(results.items())), indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -474,6 +474,10 @@ def load_zip(
     if vecnormalize is None and (beside := zoo.statistics_beside(path)) is not None:
         vecnormalize = beside
         notes.append(f"observations are normalized by {beside}, which lies beside it; vecnormalize=False leaves it out")
+        if path.stem == zoo.BEST:
+            notes.append(
+                "these statistics may be of the end of training, and the model is not: it can act worse than it did"
+            )
     notes += zoo.notes_beside(path, vecnormalize or None)
     state = None
     if vecnormalize:
