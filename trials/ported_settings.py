@@ -1,0 +1,1459 @@
+"""Compares every setting that is ported under the original's name with what the original does with it.
+
+    python trials/ported_settings.py --peer PYTHON
+
+PYTHON is an interpreter with stable-baselines3 and sb3-contrib. The same small programs run in both libraries, one process each;
+updates of agents begin with the original's weights, with the mean in place of samples and with all rows of replay as a batch. The
+signatures of the original's public classes and functions say which settings there are. Writes
+``trials/results/ported_settings.json``. ``--only WORD ...`` runs the cases whose names contain a word and prints them.
+"""
+
+from __future__ import annotations
+
+# ruff: noqa: E501, NPY002, B007, PERF401
+import argparse
+import contextlib
+import copy
+import importlib
+import inspect
+import io
+import json
+import math
+import os
+import pkgutil
+import subprocess
+import sys
+import tempfile
+import warnings
+from collections import Counter
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import gymnasium as gym
+import numpy as np
+from provenance import provenance, write
+
+RESULTS = Path(__file__).parent / "results" / "ported_settings.json"
+TOLERANCE = 2e-4
+"""Of numbers, relative to those above 1."""
+PACKAGES = {"stable_baselines3": "rejeu.sb3", "sb3_contrib": "rejeu.sb3_contrib"}
+TOLERANCES: dict[str, float] = {}
+CASES: dict[str, tuple[str, Callable[[Any], Any]]] = {}
+"""By name: the settings that a case compares, and the program."""
+
+
+def case(settings: str, tolerance: float = TOLERANCE) -> Callable[[Callable[[Any], Any]], Callable[[Any], Any]]:
+    """Returns a decorator that adds a program; ``settings`` are ``Class.argument``, ``Class.a,b`` for several."""
+
+    def add(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
+        CASES[function.__name__] = settings, function
+        TOLERANCES[function.__name__] = tolerance
+        return function
+
+    return add
+
+
+class Library:
+    """One of the two libraries. ``lib("common.callbacks", "EvalCallback")`` is the name in its module."""
+
+    def __init__(self, name: str, folder: Path) -> None:
+        self.name, self.folder, self.is_original = name, folder, name == "original"
+        self.case = ""
+
+    def __call__(self, module: str, *names: str) -> Any:
+        package = "sb3_contrib" if module.startswith("contrib.") else "stable_baselines3"
+        path = f"{package if self.is_original else PACKAGES[package]}.{module.removeprefix('contrib.')}"
+        found = [getattr(importlib.import_module(path.rstrip(".")), name) for name in names]
+        return found[0] if len(found) == 1 else found
+
+    def algorithm(self, name: str) -> Any:
+        own = ("A2C", "DDPG", "DQN", "PPO", "SAC", "TD3")
+        return self("" if name in own else "contrib.", name)
+
+    def tensor(self, array: Any) -> Any:
+        if not self.is_original:
+            return np.asarray(array)
+        import torch
+
+        return torch.as_tensor(array)
+
+    def make(self, name: str, policy: Any, env: Any, key: str = "", **settings: Any) -> Any:
+        """Returns an agent that has the weights of the original's first one of the same shape."""
+        model = self.algorithm(name)(policy, env, device="cpu", seed=0, **settings)
+        path = self.folder / f"{self.case}{key}.zip"
+        if self.is_original:
+            model.save(path)
+        else:
+            loaded = self.algorithm(name).load(path, device="cpu")
+            own = model.get_parameters()
+            given = loaded.get_parameters()
+            for part, arrays in own.items():
+                for field, array in arrays.items():
+                    if field in given.get(part, {}) and given[part][field].shape == array.shape:
+                        arrays[field] = given[part][field]
+            model.set_parameters(own)
+        return model
+
+
+class Line(gym.Env):
+    """Observations and rewards that do not depend on the actions: ``length`` steps, then a terminal state or a time limit."""
+
+    def __init__(
+        self,
+        action_space: gym.Space,
+        length: int = 5,
+        truncates: bool = False,
+        varies: bool = False,
+        scale: float = 1.0,
+    ) -> None:
+        self.observation_space = gym.spaces.Box(-2.0, 2.0, (3,), np.float32)
+        self.action_space, self.length, self.truncates, self.scale = action_space, length, truncates, scale
+        self.varies = varies
+        self.t, self.episode, self.actions = 0, 0, []
+
+    def look(self) -> np.ndarray:
+        return np.sin(np.array([1.0, 2.0, 3.0]) * (self.t + 1) + 0.3 * self.episode).astype(np.float32)
+
+    def reset(self, **options: Any) -> Any:
+        super().reset(**options)
+        self.t, self.episode = 0, self.episode + 1
+        return self.look(), {}
+
+    def action_masks(self) -> np.ndarray:
+        return np.arange(3) != self.t % 4
+
+    def step(self, action: Any) -> Any:
+        self.actions.append(np.array(action).tolist())
+        self.t += 1
+        over = self.t >= self.length + (self.episode % 3 if self.varies else 0)
+        reward = self.scale * math.cos(1.7 * self.t + self.episode)
+        return self.look(), reward, over and not self.truncates, over and self.truncates, {}
+
+
+BOX = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
+LOOKS = np.stack([np.sin(np.arange(1, 4) * x) for x in np.linspace(0.3, 4.0, 6)]).astype(np.float32)
+"""Observations at which agents are compared."""
+
+
+SHARE = 0.5
+"""What every standard normal number is in :func:`constant_noise`."""
+
+
+@contextlib.contextmanager
+def constant_noise(lib: Library) -> Iterator[None]:
+    """Context in which every standard normal number is ``SHARE``, and of Discrete actions the likeliest is taken."""
+    with contextlib.ExitStack() as stack:
+        if lib.is_original:
+            import torch
+            from torch.distributions import Categorical, Normal
+
+            def filled(self: Any, mean: float = 0.0, std: float = 1.0) -> Any:
+                return self.fill_(mean + SHARE * std)
+
+            def likeliest(self: Any, shape: Any = ()) -> Any:
+                return self.probs.argmax(-1)
+
+            def shifted(self: Any, shape: Any = ()) -> Any:
+                return self.mean + SHARE * self.stddev
+
+            def zeros(x: Any, **_: Any) -> Any:
+                return torch.zeros_like(x)
+
+            for one, name, value in (
+                (Categorical, "sample", likeliest),
+                (Normal, "sample", shifted),
+                (Normal, "rsample", shifted),
+                (torch.Tensor, "normal_", filled),
+                (torch, "randn_like", zeros),
+            ):
+                stack.enter_context(mock.patch.object(one, name, value))
+        else:
+            import jax
+            import jax.numpy as jnp
+
+            def constant(value: float) -> Callable[..., Any]:
+                return lambda key, shape=(), dtype=jnp.float32: jnp.full(shape, value, dtype)
+
+            stack.enter_context(mock.patch.object(jax.random, "normal", constant(SHARE)))
+            stack.enter_context(mock.patch.object(jax.random, "gumbel", constant(0.0)))
+        yield
+
+
+def whole_batches(lib: Library, model: Any) -> None:
+    """Lets an off-policy agent draw all rows that it has as each batch."""
+    if lib.is_original:
+        buffer = model.replay_buffer
+
+        def sample(batch_size: int, env: Any = None) -> Any:
+            return buffer._get_samples(np.resize(np.arange(buffer.size()), batch_size), env)
+
+        buffer.sample = sample
+    else:
+        ring = model.run.replay.ring
+
+        def draw(rng: Any, n: int) -> Any:
+            begins = ring.oldest()
+            env = np.repeat(np.arange(ring.n_envs), ring.head - begins)
+            time = np.concatenate([np.arange(*ends) for ends in zip(begins, ring.head, strict=True)])
+            steps = np.flatnonzero(ring.at(env, time).kind != LAST)
+            chosen = np.resize(steps, n)
+            return ring.at(env[chosen], time[chosen])
+
+        ring.draw = draw
+
+
+LAST = 2
+"""The kind of rows of replay that hold final observations."""
+
+
+def learned(lib: Library, name: str, space: gym.Space, total: int, settings: dict[str, Any]) -> Any:
+    """Returns what an agent says after ``total`` steps in ``Line``, from the original's weights."""
+    settings = copy.deepcopy(settings)  # the original adds to policy_kwargs
+    of_line = {key: settings.pop(key) for key in ("length", "truncates", "varies") if key in settings}
+    lines = [Line(space, **of_line) for _ in range(settings.pop("n_envs", 1))]
+    env = lib("common.vec_env", "DummyVecEnv")([partial(lambda one: one, one) for one in lines])
+    is_off = name in ("DQN", "QRDQN", "SAC", "TD3", "DDPG", "TQC", "CrossQ")
+    if is_off and not lib.is_original:
+        settings["overlap"] = False
+    model = lib.make(name, "MlpLstmPolicy" if name == "RecurrentPPO" else "MlpPolicy", env, **settings)
+    if is_off:
+        whole_batches(lib, model)
+    with constant_noise(lib):
+        model.learn(total)
+    return says(lib, name, model, space)
+
+
+def says(lib: Library, name: str, model: Any, space: gym.Space) -> list[float]:
+    """Returns actions, values and log-probabilities of an agent at ``LOOKS``."""
+    numbers = [np.asarray(model.predict(LOOKS, deterministic=True)[0], float)]
+    looks, is_box = lib.tensor(LOOKS), isinstance(space, gym.spaces.Box)
+    action = np.full((len(LOOKS), 2), 0.25, np.float32) if is_box else np.arange(len(LOOKS)) % 3
+    if name in ("PPO", "A2C", "TRPO", "MaskablePPO"):
+        numbers += [plain(one) for one in model.policy.evaluate_actions(looks, lib.tensor(action))[:2]]
+    elif name in ("DQN", "QRDQN"):
+        if lib.is_original:
+            net = model.policy.q_net if name == "DQN" else model.policy.quantile_net
+            values = plain(net(looks))
+            numbers.append(values if name == "DQN" else values.mean(axis=1))
+        else:
+            numbers.append(model.q_values(LOOKS))
+    elif is_box and name not in ("ARS", "RecurrentPPO"):
+        if lib.is_original:
+            model.policy.set_training_mode(False)
+            found = model.critic(looks, lib.tensor(action))
+            values = plain(found).mean(axis=2).T if name == "TQC" else np.stack([plain(q)[:, 0] for q in found])
+        else:
+            values = model.q_values(LOOKS, action, critics="all")
+        numbers.append(values)
+    return np.concatenate([np.ravel(one) for one in numbers]).tolist()
+
+
+def plain(value: Any) -> np.ndarray:
+    """Returns a tensor of either library as an array."""
+    return np.asarray(value.detach() if hasattr(value, "detach") else value, float)
+
+
+THREE = gym.spaces.Discrete(3)
+ROLLOUT = {"n_steps": 16, "learning_rate": 0.01}
+EPOCHS = {**ROLLOUT, "batch_size": 16, "n_epochs": 4, "normalize_advantage": False}
+REPLAY = {"learning_starts": 0, "train_freq": 20, "gradient_steps": 4, "batch_size": 40, "buffer_size": 500}
+REPLAY |= {"learning_rate": 0.01}
+SMALL = {"policy_kwargs": {"net_arch": [16]}}
+
+
+def half(progress: float) -> float:
+    """A schedule."""
+    return 0.01 * progress
+
+
+COMMON = {"learning_rate": [0.003, half], "gamma": [0.8]}
+ROLLOUTS = {**COMMON, "n_steps": [8], "gae_lambda": [0.5], "truncates": [True], "n_envs": [2]}
+PPO_LIKE = {
+    **ROLLOUTS,
+    "n_epochs": [2],
+    "clip_range": [0.02, half],
+    "clip_range_vf": [0.01],
+    "normalize_advantage": [True],
+    "ent_coef": [0.2],
+    "vf_coef": [0.05],
+    "max_grad_norm": [0.05],
+    "target_kl": [1e-4],
+}
+REPLAYS = {**COMMON, "n_steps": [3], "gradient_steps": [2, -1], "train_freq": [10, (4, "episode")], "truncates": [True]}
+CRITICS = {"tau": [0.3], "policy_kwargs": [{"net_arch": {"pi": [8], "qf": [16, 8]}}, {"net_arch": [8], "n_critics": 3}]}
+KWARGS = [{"net_arch": [8, 8]}, {"net_arch": [8], "optimizer_kwargs": {"eps": 0.1}}]
+UPDATES: list[tuple[str, gym.Space, int, dict[str, Any], dict[str, list[Any]]]] = [
+    ("PPO", THREE, 32, {**SMALL, **EPOCHS}, {**PPO_LIKE, "policy_kwargs": KWARGS}),
+    (
+        "PPO",
+        BOX,
+        32,
+        {**SMALL, **EPOCHS},
+        {
+            "ent_coef": [0.2],
+            "use_sde": [True],
+            "clip_range": [0.02],
+            "policy_kwargs": [{"net_arch": [8], "log_std_init": -1.0}, {"net_arch": {"pi": [8], "vf": [16, 8]}}],
+        },
+    ),
+    (
+        "A2C",
+        THREE,
+        32,
+        {**SMALL, **ROLLOUT},
+        {
+            **ROLLOUTS,
+            "ent_coef": [0.2],
+            "vf_coef": [0.05],
+            "max_grad_norm": [0.05],
+            "rms_prop_eps": [0.1],
+            "use_rms_prop": [False],
+            "normalize_advantage": [True],
+        },
+    ),
+    (
+        "TRPO",
+        THREE,
+        32,
+        {**SMALL, **ROLLOUT, "batch_size": 16},
+        {
+            **ROLLOUTS,
+            "cg_max_steps": [2],
+            "cg_damping": [5.0],
+            "line_search_shrinking_factor": [0.5],
+            "line_search_max_iter": [1],
+            "n_critic_updates": [2],
+            "normalize_advantage": [False],
+            "target_kl": [0.001],
+            "sub_sampling_factor": [2],
+        },
+    ),
+    ("TRPO", BOX, 16, {**SMALL, **ROLLOUT, "batch_size": 16}, {"target_kl": [0.001]}),
+    (
+        "RecurrentPPO",
+        BOX,
+        32,
+        {"policy_kwargs": {"net_arch": [16], "lstm_hidden_size": 8}, **EPOCHS},
+        {
+            **{
+                key: PPO_LIKE[key]
+                for key in ("learning_rate", "gamma", "n_steps", "gae_lambda", "n_epochs", "ent_coef")
+            },
+            **{key: PPO_LIKE[key] for key in ("clip_range", "normalize_advantage", "vf_coef", "max_grad_norm")},
+            "policy_kwargs": [
+                {"net_arch": [8], "lstm_hidden_size": 4},
+                {"net_arch": [8], "lstm_hidden_size": 4, "shared_lstm": True, "enable_critic_lstm": False},
+                {"net_arch": [8], "lstm_hidden_size": 4, "enable_critic_lstm": False},
+            ],
+        },
+    ),
+    ("MaskablePPO", THREE, 32, {**SMALL, **EPOCHS}, PPO_LIKE),
+    (
+        "DQN",
+        THREE,
+        40,
+        {**SMALL, **REPLAY, "exploration_initial_eps": 0.0, "exploration_final_eps": 0.0},
+        {
+            **REPLAYS,
+            "max_grad_norm": [0.01],
+            "target_update_interval": [15],
+            "tau": [0.3],
+            "policy_kwargs": KWARGS,
+        },
+    ),
+    (
+        "QRDQN",
+        THREE,
+        40,
+        {
+            **REPLAY,
+            "policy_kwargs": {"net_arch": [16], "n_quantiles": 7},
+            "exploration_initial_eps": 0.0,
+            "exploration_final_eps": 0.0,
+        },
+        {
+            **REPLAYS,
+            "max_grad_norm": [0.01],
+            "target_update_interval": [15],
+            "tau": [0.3],
+            "policy_kwargs": [{"net_arch": [16], "n_quantiles": 5}],
+        },
+    ),
+    (
+        "TD3",
+        BOX,
+        40,
+        {**SMALL, **REPLAY},
+        {
+            **REPLAYS,
+            **CRITICS,
+            "policy_delay": [1, 3],
+            "target_policy_noise": [0.6],
+            "target_noise_clip": [0.02],
+        },
+    ),
+    ("DDPG", BOX, 40, {**SMALL, **REPLAY}, {**REPLAYS, "tau": [0.3], "policy_kwargs": CRITICS["policy_kwargs"][:1]}),
+    (
+        "SAC",
+        BOX,
+        40,
+        {**SMALL, **REPLAY},
+        {
+            **REPLAYS,
+            **CRITICS,
+            "ent_coef": [0.5, "auto_0.2"],
+            "target_entropy": [-5.0],
+            "target_update_interval": [2],
+            "use_sde": [True],
+            "policy_kwargs": [
+                *CRITICS["policy_kwargs"],
+                {"net_arch": [8], "log_std_init": -1.0, "use_sde": True},
+                {"net_arch": [8], "optimizer_kwargs": {"eps": 0.1}},
+            ],
+        },
+    ),
+    (
+        "TQC",
+        BOX,
+        40,
+        {**SMALL, **REPLAY},
+        {
+            **REPLAYS,
+            "tau": [0.3],
+            "ent_coef": [0.5],
+            "target_entropy": [-5.0],
+            "top_quantiles_to_drop_per_net": [0, 5],
+            "policy_kwargs": [{"net_arch": [8], "n_critics": 3}, {"net_arch": [8], "n_quantiles": 7}],
+        },
+    ),
+    (
+        "CrossQ",
+        BOX,
+        40,
+        {"policy_kwargs": {"net_arch": [16]}, **REPLAY},
+        {**COMMON, "n_steps": [3], "ent_coef": [0.5], "target_entropy": [-5.0], "policy_delay": [1]},
+    ),
+]
+"""Algorithm, space of the actions, steps, settings, and for each further setting the values that replace those."""
+
+
+def update_cases() -> None:
+    """Adds a case for each value of each setting of ``UPDATES``."""
+    for name, space, total, base, variants in UPDATES:
+        kind = "Box" if isinstance(space, gym.spaces.Box) else "Discrete"
+        known = {"": [None], **variants}
+        for setting, values in known.items():
+            for i, value in enumerate(values):
+                given = base if setting == "" else {**base, setting: value}
+                if setting == "n_steps" and "batch_size" in base and name not in OFF:
+                    given = {**given, "batch_size": value}
+                if setting == "n_envs" and "batch_size" in base:
+                    given = {**given, "batch_size": 32}
+                if setting == "policy_kwargs" and value.get("use_sde"):
+                    given = {
+                        **given,
+                        "use_sde": True,
+                        "policy_kwargs": {k: v for k, v in value.items() if k != "use_sde"},
+                    }
+                case_name = f"{name}_{kind}{'_' * bool(setting)}{setting}{i or ''}"
+                inside = f",policy_kwargs.{','.join(value)}" if setting == "policy_kwargs" else ""
+                CASES[case_name] = (
+                    f"{name}.{setting or '(base)'}{inside}",
+                    partial(run_update, name, space, total, given),
+                )
+
+
+OFF = ("DQN", "QRDQN", "SAC", "TD3", "DDPG", "TQC", "CrossQ")
+
+
+def run_update(name: str, space: gym.Space, total: int, given: dict[str, Any], lib: Library) -> Any:
+    return learned(lib, name, space, total, given)
+
+
+def vec(lib: Library, *envs: gym.Env, monitored: bool = False) -> Any:
+    """Returns a ``DummyVecEnv`` of environments."""
+    wrap = lib("common.monitor", "Monitor") if monitored else (lambda env: env)
+    return lib("common.vec_env", "DummyVecEnv")([partial(lambda one: one, wrap(env)) for env in envs])
+
+
+def small(lib: Library, env: Any, name: str = "A2C", **settings: Any) -> Any:
+    """Returns an agent that learns quickly."""
+    given = copy.deepcopy({"policy_kwargs": {"net_arch": [8]}, "seed": 0, **settings})
+    return lib.algorithm(name)("MlpPolicy", env, device="cpu", **given)
+
+
+def noted(lib: Library, note: Callable[[Any], Any]) -> tuple[Any, list[Any]]:
+    """Returns a callback and the list of what ``note`` returned of it at every step."""
+    notes: list[Any] = []
+
+    class Noting(lib("common.callbacks", "BaseCallback")):  # type: ignore[misc]
+        def _on_step(self) -> bool:
+            notes.append(note(self))
+            return True
+
+    return Noting(), notes
+
+
+def stepped(env: Any, n: int, action: Any) -> list[Any]:
+    """Returns observations, rewards and ends of a vector environment."""
+    found = [np.asarray(env.reset()).tolist()]
+    for _ in range(n):
+        obs, reward, done, _ = env.step(action)
+        found += [obs.tolist(), np.asarray(reward, float).tolist(), np.asarray(done).tolist()]
+    return found
+
+
+@case("NormalActionNoise.mean,sigma,dtype", 0.03)
+def normal_noise(lib: Library) -> Any:
+    np.random.seed(0)
+    noise = lib("common.noise", "NormalActionNoise")(np.array([0.3, -0.2]), np.array([0.1, 0.4]))
+    drawn = np.array([noise() for _ in range(4000)])
+    return [drawn.mean(axis=0), drawn.std(axis=0), str(noise().dtype)]
+
+
+@case("OrnsteinUhlenbeckActionNoise.mean,theta,dt,initial_noise")
+def ornstein_uhlenbeck_path(lib: Library) -> Any:
+    kind = lib("common.noise", "OrnsteinUhlenbeckActionNoise")
+    noise = kind(np.array([0.5]), np.array([0.0]), theta=0.3, dt=0.1, initial_noise=np.array([0.2]))
+    path = [noise().tolist() for _ in range(5)]
+    noise.reset()
+    other = kind(np.array([0.5]), np.array([0.0]))
+    return [path, noise(), [other().tolist() for _ in range(3)]]
+
+
+@case("OrnsteinUhlenbeckActionNoise.sigma", 0.05)
+def ornstein_uhlenbeck_spread(lib: Library) -> Any:
+    np.random.seed(0)
+    noise = lib("common.noise", "OrnsteinUhlenbeckActionNoise")(np.zeros(1), np.array([0.8]), theta=1.0, dt=0.25)
+    path = np.array([noise()[0] for _ in range(20000)])
+    return [path.std(), np.corrcoef(path[1:], path[:-1])[0, 1]]
+
+
+@case("VectorizedActionNoise.base_noise,n_envs")
+def vectorized_noise(lib: Library) -> Any:
+    one, many = lib("common.noise", "NormalActionNoise", "VectorizedActionNoise")
+    noise = many(one(np.array([0.3, 0.1]), np.zeros(2)), 3)
+    return [noise(), noise.n_envs]
+
+
+@case("VecNormalize.training,norm_obs,norm_reward,clip_obs,clip_reward,gamma,epsilon")
+def vec_normalize(lib: Library) -> Any:
+    kind, found = lib("common.vec_env", "VecNormalize"), []
+    for given in (
+        {},
+        {"gamma": 0.5},
+        {"clip_obs": 0.7, "clip_reward": 0.4},
+        {"epsilon": 0.5},
+        {"norm_obs": False},
+        {"norm_reward": False},
+        {"training": False},
+    ):
+        env = kind(vec(lib, Line(THREE, scale=10.0), Line(THREE, 3, scale=5.0)), **given)
+        found.append(stepped(env, 8, np.zeros(2, int)))
+        found.append([env.get_original_reward(), env.get_original_obs()])
+    return found
+
+
+class Goals(Line):
+    """``Line`` with a Dict of observations."""
+
+    def __init__(self, *arguments: Any, **named: Any) -> None:
+        super().__init__(*arguments, **named)
+        self.observation_space = gym.spaces.Dict(a=self.observation_space, b=gym.spaces.Box(-9, 9, (1,), np.float32))
+
+    def look(self) -> Any:
+        return {"a": super().look(), "b": np.array([self.t], np.float32)}
+
+
+@case("VecNormalize.norm_obs_keys VecExtractDictObs.key")
+def keys_of_dict(lib: Library) -> Any:
+    normalize, extract = lib("common.vec_env", "VecNormalize", "VecExtractDictObs")
+    found = []
+    for keys, key in ((["b"], "b"), (["b"], "a"), (None, "a")):
+        env = extract(normalize(vec(lib, Goals(THREE)), norm_obs_keys=keys), key)
+        found.append(stepped(env, 6, np.zeros(1, int)))
+    return found
+
+
+class Images(Line):
+    """``Line`` with images."""
+
+    def __init__(self, shape: tuple[int, ...], *arguments: Any, **named: Any) -> None:
+        super().__init__(THREE, *arguments, **named)
+        self.observation_space = gym.spaces.Box(0, 255, shape, np.uint8)
+
+    def look(self) -> Any:
+        return np.full(self.observation_space.shape, 10 * self.episode + self.t, np.uint8)
+
+
+@case("VecFrameStack.venv,n_stack,channels_order StackedObservations.n_stack,channels_order")
+def frame_stack(lib: Library) -> Any:
+    kind, found = lib("common.vec_env", "VecFrameStack"), []
+    for shape, order in (((36, 36, 1), None), ((1, 36, 36), None), ((36, 36, 1), "last"), ((1, 36, 36), "first")):
+        env = kind(vec(lib, Images(shape, 3)), 3, channels_order=order)
+        found.append(list(env.observation_space.shape))
+        env.reset()
+        for _ in range(5):
+            obs, _, done, infos = env.step([0])
+            axis = int(np.argmin(obs.shape[1:])) + 1
+            found.append(np.moveaxis(obs, axis, -1)[0, 0, 0].tolist())
+            if done[0]:
+                found.append(np.moveaxis(infos[0]["terminal_observation"], axis - 1, -1)[0, 0].tolist())
+    return [found, stepped(kind(vec(lib, Line(THREE)), 2), 6, [0])]
+
+
+@case("VecTransposeImage.skip")
+def transpose(lib: Library) -> Any:
+    kind = lib("common.vec_env", "VecTransposeImage")
+    return [list(kind(vec(lib, Images((36, 40, 1))), skip=skip).reset().shape) for skip in (False, True)]
+
+
+@case("VecCheckNan.raise_exception,warn_once,check_inf")
+def check_nan(lib: Library) -> Any:
+    kind, found = lib("common.vec_env", "VecCheckNan"), []
+
+    class Broken(Line):
+        def step(self, action: Any) -> Any:
+            obs, reward, *rest = super().step(action)
+            return obs * (math.inf if self.t == 1 else math.nan), reward, *rest
+
+    for given in ({"raise_exception": True}, {}, {"warn_once": False}, {"check_inf": False, "raise_exception": True}):
+        env = kind(vec(lib, Broken(THREE, 9)), **given)
+        env.reset()
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            errors = []
+            for _ in range(3):
+                try:
+                    env.step([0])
+                    errors.append("")
+                except ValueError as error:
+                    errors.append(isinstance(error, ValueError))
+        found.append([errors, len(caught)])
+    return found
+
+
+def table(path: Path) -> list[list[str]]:
+    """Returns the rows of a monitor's file without times."""
+    lines = path.read_text().splitlines()[1:]
+    head = lines[0].split(",")
+    rows = [[x for name, x in zip(head, row.split(","), strict=True) if name != "t"] for row in lines]
+    return [rows[0], *([float(x) if x.strip("-0123456789.e") == "" else x for x in row] for row in rows[1:])]
+
+
+class Informed(Line):
+    """``Line`` with an info."""
+
+    def reset(self, **options: Any) -> Any:
+        self.color = (options.pop("options", None) or {}).get("color", "none")
+        return super().reset(**options)
+
+    def step(self, action: Any) -> Any:
+        *found, info = super().step(action)
+        return *found, {**info, "t2": self.t**2, "is_success": self.t > 3}
+
+
+@case(
+    "Monitor.filename,allow_early_resets,reset_keywords,info_keywords,override_existing ResultsWriter.filename,extra_keys,override_existing"
+)
+def monitor(lib: Library) -> Any:
+    kind, found = lib("common.monitor", "Monitor"), []
+    for name, given in (
+        ("a", {}),
+        ("b", {"info_keywords": ("t2",)}),
+        ("b", {"info_keywords": ("t2",), "override_existing": False}),
+        ("b", {"info_keywords": ("t2",)}),
+        ("c.monitor.csv", {"allow_early_resets": False}),
+        ("folder", {}),
+    ):
+        if name == "folder":
+            Path(name).mkdir()
+        env = kind(Informed(THREE, 4), name, **given)
+        env.reset()
+        for i in range(9):
+            *_, over, _, info = env.step(0)
+            if over:
+                found.append({key: x for key, x in info["episode"].items() if key != "t"})
+                env.reset()
+        early = ""
+        try:
+            env.reset()
+        except RuntimeError as error:
+            early = type(error).__name__
+        env.close()
+        found += [early, env.get_total_steps(), env.get_episode_lengths(), env.get_episode_rewards()]
+        found.append([[path.name, table(path)] for path in sorted(Path().glob("**/*monitor.csv"))])
+    return found
+
+
+@case("VecMonitor.filename,info_keywords")
+def vec_monitor(lib: Library) -> Any:
+    env = lib("common.vec_env", "VecMonitor")(
+        vec(lib, Informed(THREE, 3), Informed(THREE, 4)), "v", info_keywords=("t2",)
+    )
+    env.reset()
+    found = []
+    for _ in range(8):
+        *_, infos = env.step([0, 0])
+        found.append([{k: float(x) for k, x in one.get("episode", {}).items() if k != "t"} for one in infos])
+    env.close()
+    return [found, [[path.name, table(path)] for path in sorted(Path().glob("*monitor.csv"))]]
+
+
+class Screen(gym.Env):
+    """Something like an Atari game: frames, lives, and rewards of any size."""
+
+    def __init__(self) -> None:
+        self.observation_space = gym.spaces.Box(0, 255, (210, 160, 3), np.uint8)
+        self.action_space = gym.spaces.Discrete(4)
+        self.ale, self.t, self.taken = self, 0, []
+
+    def get_action_meanings(self) -> list[str]:
+        return ["NOOP", "FIRE", "RIGHT", "LEFT"]
+
+    def lives(self) -> int:
+        return 3 - self.t // 20 % 4
+
+    def look(self) -> np.ndarray:
+        image = np.zeros((210, 160, 3), np.uint8)
+        image[self.t % 200 : self.t % 200 + 9] = [200, 100, 50]
+        return image
+
+    def reset(self, **options: Any) -> Any:
+        super().reset(**options)
+        self.t = 0
+        return self.look(), {}
+
+    def step(self, action: Any) -> Any:
+        self.t += 1
+        self.taken.append(int(action))
+        return self.look(), [0.0, 2.5, -3.0][self.t % 3], self.t >= 79, False, {}
+
+
+def played(env: Any, n: int, seed: int = 3) -> list[Any]:
+    """Returns what a game says: the mean of the frames, rewards, ends and the steps that were taken."""
+    obs, _ = env.reset(seed=seed)
+    found: list[Any] = [list(obs.shape), float(obs.mean())]
+    for i in range(n):
+        obs, reward, terminated, truncated, _ = env.step(i % 4)
+        found.append([round(float(obs.mean()), 3), float(reward), bool(terminated), bool(truncated), env.unwrapped.t])
+        if terminated or truncated:
+            obs, _ = env.reset()
+            found.append([round(float(obs.mean()), 3), env.unwrapped.t])
+    return [found, env.unwrapped.taken]
+
+
+@case(
+    "MaxAndSkipEnv.skip ClipRewardEnv.env EpisodicLifeEnv.env FireResetEnv.env WarpFrame.width,height NoopResetEnv.noop_max",
+    0.02,
+)
+def atari_wrappers(lib: Library) -> Any:
+    names = ("MaxAndSkipEnv", "ClipRewardEnv", "EpisodicLifeEnv", "FireResetEnv", "WarpFrame", "NoopResetEnv")
+    skip, clip, lives, fire, warp, noop = lib("common.atari_wrappers", *names)
+    found = [played(make(Screen()), 45) for make in (clip, lives, fire)]
+    found += [played(skip(Screen(), skip=3), 30), played(warp(Screen(), width=40, height=50), 3)]
+    env = noop(Screen(), noop_max=5)
+    starts = []
+    for seed in range(30):
+        env.reset(seed=seed)
+        starts.append(env.unwrapped.t)
+    return [found, [min(starts), max(starts)]]
+
+
+@case("AtariWrapper.frame_skip,screen_size,terminal_on_life_loss,clip_reward,noop_max", 0.02)
+def atari_wrapper(lib: Library) -> Any:
+    kind, found = lib("common.atari_wrappers", "AtariWrapper"), []
+    for given in (
+        {"noop_max": 0},
+        {"noop_max": 0, "frame_skip": 2, "screen_size": 50},
+        {"noop_max": 0, "terminal_on_life_loss": False, "clip_reward": False},
+    ):
+        found.append(played(kind(Screen(), **given), 30))
+    return found
+
+
+@case("StickyActionEnv.action_repeat_probability AtariWrapper.action_repeat_probability", 0.06)
+def sticky(lib: Library) -> Any:
+    found = []
+    for make in (
+        lambda: lib("common.atari_wrappers", "StickyActionEnv")(Screen(), 0.3),
+        lambda: lib("common.atari_wrappers", "AtariWrapper")(
+            Screen(), noop_max=0, frame_skip=1, action_repeat_probability=0.6
+        ),
+    ):
+        env = make()
+        env.reset(seed=0)
+        n, repeated = 1500, 0
+        for i in range(n):
+            env.step(i % 4)
+            repeated += env.unwrapped.taken[-1] != i % 4
+            if env.unwrapped.t >= 78:
+                env.reset()
+        found.append(repeated / n)
+    return found
+
+
+@case(
+    "make_vec_env.env_id,n_envs,seed,start_index,monitor_dir,wrapper_class,env_kwargs,vec_env_cls,vec_env_kwargs,monitor_kwargs,wrapper_kwargs"
+)
+def make_vec(lib: Library) -> Any:
+    make, dummy = lib("common.env_util", "make_vec_env"), lib("common.vec_env", "DummyVecEnv")
+    env = make(
+        "CartPole-v1",
+        n_envs=2,
+        seed=5,
+        start_index=3,
+        monitor_dir="m",
+        wrapper_class=gym.wrappers.TimeLimit,
+        wrapper_kwargs={"max_episode_steps": 4},
+        env_kwargs={"sutton_barto_reward": True},
+        vec_env_cls=dummy,
+        vec_env_kwargs={},
+        monitor_kwargs={"override_existing": True},
+    )
+    found = stepped(env, 9, np.zeros(2, int))
+    spaces_drawn = [int(one.action_space.sample()) for one in env.envs]
+    env.close()
+    names = sorted(path.name for path in Path("m").iterdir())
+    own = make(lambda: Line(THREE), n_envs=1)
+    return [found, spaces_drawn, names, stepped(own, 6, [0])]
+
+
+class Fixed:
+    """A policy that always takes one action."""
+
+    def predict(self, obs: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False) -> Any:
+        self.calls = [*getattr(self, "calls", []), [len(obs), deterministic, np.asarray(episode_start).tolist()]]
+        return np.zeros(len(obs), int), state
+
+
+@case(
+    "evaluate_policy.model,env,n_eval_episodes,deterministic,render,callback,reward_threshold,return_episode_rewards,warn"
+)
+def evaluating(lib: Library) -> Any:
+    evaluate, found = lib("common.evaluation", "evaluate_policy"), []
+    for n, lengths in ((5, (3, 7)), (4, (2, 3, 9)), (1, (4, 4)), (3, (4,))):
+        policy, seen = Fixed(), []
+        envs = vec(lib, *(Line(THREE, length) for length in lengths), monitored=True)
+        found.append(
+            evaluate(
+                policy,
+                envs,
+                n_eval_episodes=n,
+                deterministic=n != 5,
+                callback=lambda l, g: seen.append([sorted(l)[:0], l["i"]]),  # noqa: B023, E741
+                return_episode_rewards=True,
+                warn=False,
+            )
+        )
+        found += [policy.calls, seen, evaluate(policy, envs, n_eval_episodes=n, reward_threshold=-100.0)]
+        try:
+            evaluate(policy, envs, n_eval_episodes=n, reward_threshold=100.0)
+        except AssertionError:
+            found.append("below")
+        except ValueError:
+            found.append("below, as ValueError")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        evaluate(Fixed(), Line(THREE), 1)
+        evaluate(Fixed(), Line(THREE), 1, warn=False)
+    return [found, len(caught)]
+
+
+def eval_callback(lib: Library, n_envs: int, **given: Any) -> Any:
+    kind, base = lib("common.callbacks", "EvalCallback", "BaseCallback")
+    events: list[Any] = []
+
+    class Event(base):  # type: ignore[misc]
+        def __init__(self, name: str) -> None:
+            super().__init__()
+            self.title = name
+
+        def _on_step(self) -> bool:
+            events.append([self.title, self.num_timesteps, self.parent.n_calls, round(self.parent.last_mean_reward, 3)])
+            return True
+
+    callback = kind(
+        vec(lib, Line(THREE, 4), monitored=True),
+        callback_on_new_best=Event("best"),
+        callback_after_eval=Event("after"),
+        warn=False,
+        verbose=0,
+        **given,
+    )
+    small(lib, vec(lib, *(Line(THREE) for _ in range(n_envs)))).learn(40, callback=callback)
+    files = {}
+    for path in sorted(Path().glob("**/*")):
+        files[path.as_posix()] = "file" if path.is_file() else "folder"
+    logs = {}
+    if Path("logs/evaluations.npz").exists():
+        with np.load("logs/evaluations.npz") as saved:
+            logs = {key: saved[key].tolist() for key in sorted(saved)}
+    return [events, files, logs, callback.evaluations_timesteps if hasattr(callback, "evaluations_timesteps") else []]
+
+
+@case(
+    "EvalCallback.eval_env,callback_on_new_best,callback_after_eval,n_eval_episodes,eval_freq,log_path,best_model_save_path,deterministic,warn,verbose"
+)
+def eval_callback_1(lib: Library) -> Any:
+    return eval_callback(lib, 1, eval_freq=7, n_eval_episodes=2, log_path="logs", best_model_save_path="best")
+
+
+@case("EvalCallback.eval_freq,deterministic")
+def eval_callback_2(lib: Library) -> Any:
+    return eval_callback(lib, 2, eval_freq=6, n_eval_episodes=3)
+
+
+@case("CheckpointCallback.save_freq,save_path,name_prefix,save_replay_buffer,save_vecnormalize,verbose")
+def checkpoints(lib: Library) -> Any:
+    kind, normalize = lib("common.callbacks", "CheckpointCallback"), lib("common.vec_env", "VecNormalize")
+    for prefix, n_envs, off in (("one", 1, False), ("two", 2, False), ("off", 1, True)):
+        env = normalize(vec(lib, *(Line(THREE) for _ in range(n_envs))))
+        model = small(lib, env, "DQN", learning_starts=10, buffer_size=100) if off else small(lib, env)
+        model.learn(30, callback=kind(7, "saved", prefix, save_replay_buffer=True, save_vecnormalize=True))
+    return sorted(path.name for path in Path("saved").iterdir())
+
+
+@case(
+    "StopTrainingOnRewardThreshold.reward_threshold StopTrainingOnNoModelImprovement.max_no_improvement_evals,min_evals StopTrainingOnMaxEpisodes.max_episodes CallbackList.callbacks"
+)
+def stopping(lib: Library) -> Any:
+    names = (
+        "EvalCallback",
+        "StopTrainingOnRewardThreshold",
+        "StopTrainingOnNoModelImprovement",
+        "StopTrainingOnMaxEpisodes",
+    )
+    evaluate, threshold, improvement, episodes = lib("common.callbacks", *names)
+    many, found = lib("common.callbacks", "CallbackList"), []
+    fixed = {"eval_freq": 5, "n_eval_episodes": 1, "warn": False, "verbose": 0}
+    for n_envs, make in (
+        (1, lambda env: evaluate(env, callback_on_new_best=threshold(-50.0), **fixed)),
+        (1, lambda env: evaluate(env, callback_on_new_best=threshold(50.0), **fixed)),
+        (1, lambda env: evaluate(env, callback_after_eval=improvement(2, 3), **fixed)),
+        (1, lambda env: evaluate(env, callback_after_eval=improvement(1, 0), **fixed)),
+        (1, lambda env: episodes(3)),
+        (2, lambda env: episodes(3)),
+        (1, lambda env: many([episodes(9), episodes(2)])),
+    ):
+        model = small(lib, vec(lib, *(Line(THREE) for _ in range(n_envs))))
+        model.learn(60, callback=make(vec(lib, Constant(THREE), monitored=True)))
+        found.append(model.num_timesteps)
+    return found
+
+
+class Constant(Line):
+    """``Line`` in which all episodes have the same return."""
+
+    def reset(self, **options: Any) -> Any:
+        self.episode = 0
+        return super().reset(**options)
+
+
+@case("EveryNTimesteps.n_steps,callback LogEveryNTimesteps.n_steps ConvertCallback.callback EventCallback.callback")
+def every(lib: Library) -> Any:
+    kind, found = lib("common.callbacks", "EveryNTimesteps"), []
+    for n_envs, n in ((1, 7), (3, 7), (2, 10)):
+        callback, notes = noted(lib, lambda one: one.num_timesteps)
+        small(lib, vec(lib, *(Line(THREE) for _ in range(n_envs)))).learn(60, callback=kind(n, callback))
+        found.append(notes)
+    calls: list[int] = []
+    small(lib, vec(lib, Line(THREE))).learn(20, callback=lambda l, g: calls.append(l["self"].num_timesteps) or True)  # noqa: E741
+    return [found, calls]
+
+
+@case(
+    "Logger.folder,output_formats configure.folder,format_strings HumanOutputFormat.filename_or_file,max_length CSVOutputFormat.filename JSONOutputFormat.filename make_output_format._format,log_dir,log_suffix"
+)
+def logging(lib: Library) -> Any:
+    names = ("configure", "HumanOutputFormat", "make_output_format", "Logger")
+    configure, human, make, kind = lib("common.logger", *names)
+    logger = configure("logs", ["csv", "json", "log"])
+    for step in range(3):
+        logger.record("a/x", step * 0.123456789)
+        logger.record_mean("a/mean", step)
+        logger.record_mean("a/mean", step + 1)
+        logger.record("b/text", "word" * 20, exclude="csv")
+        logger.record("a/long_name_of_a_value_that_is_cut", 1e6 * step, exclude=("json",))
+        if step:
+            logger.record("c/late", True)
+        logger.dump(step)
+    logger.close()
+    text = io.StringIO()
+    other = kind(None, [human(text, max_length=12)])
+    other.record("group/a_very_long_key_indeed", 3)
+    other.record("group/b", "a long text for this table")
+    other.dump(0)
+    make("csv", "logs", "_2").close()
+    files = {path.name: path.read_text() for path in sorted(Path("logs").iterdir())}
+    return [files, text.getvalue()]
+
+
+@case(
+    "LinearSchedule.start,end,end_fraction ConstantSchedule.val FloatSchedule.value_schedule get_linear_fn.start,end,end_fraction get_schedule_fn.value_schedule constant_fn.val"
+)
+def schedules(lib: Library) -> Any:
+    names = ("LinearSchedule", "ConstantSchedule", "FloatSchedule", "get_linear_fn", "get_schedule_fn", "constant_fn")
+    linear, constant, number, line, given, fixed = lib("common.utils", *names)
+    makes = [
+        linear(1.0, 0.1, 0.4),
+        constant(0.3),
+        number(0.2),
+        number(lambda p: p * p),
+        line(0.0, 2.0, 0.5),
+        given(0.7),
+        fixed(0.9),
+    ]
+    return [[float(one(p)) for p in (1.0, 0.9, 0.6, 0.3, 0.0)] for one in makes]
+
+
+@case(
+    "safe_mean.arr explained_variance.y_pred,y_true get_latest_run_id.log_path,log_name should_collect_more_steps.train_freq,num_collected_steps,num_collected_episodes RunningMeanStd.epsilon,shape rolling_window.array,window window_func.var_1,var_2,window,func"
+)
+def small_functions(lib: Library) -> Any:
+    mean, variance, latest = lib("common.utils", "safe_mean", "explained_variance", "get_latest_run_id")
+    moments = lib("common.running_mean_std", "RunningMeanStd")(0.5, (2,))
+    moments.update(np.array([[1.0, 2.0], [3.0, 5.0]]))
+    for name in ("a_1", "a_3", "b_9", "a_x"):
+        (Path("runs") / name).mkdir(parents=True)
+    rolling, windows = lib("common.results_plotter", "rolling_window", "window_func")
+    numbers = np.arange(6.0)
+    return [
+        mean([]), mean([1, 2]), float(variance(numbers, numbers + 0.5)), float(variance(numbers, numbers**2)),
+        float(variance(numbers, np.ones(6))), latest("runs", "a"), latest("runs", "c"), moments.mean, moments.var,
+        float(moments.count), rolling(numbers, 3), windows(numbers, numbers**2, 2, np.mean),
+    ]  # fmt: skip
+
+
+@case(
+    "is_image_space.check_channels,normalized_image is_image_space_channels_first.observation_space get_obs_shape.observation_space get_flattened_obs_dim.observation_space get_action_dim.action_space maybe_transpose.observation,observation_space"
+)
+def preprocessing(lib: Library) -> Any:
+    names = (
+        "is_image_space",
+        "is_image_space_channels_first",
+        "get_obs_shape",
+        "get_flattened_obs_dim",
+        "get_action_dim",
+    )
+    image, first, shape, flat, dim = lib("common.preprocessing", *names)
+    box = gym.spaces.Box
+    made = [box(0, 255, s, np.uint8) for s in ((36, 36, 3), (3, 36, 36), (36, 36, 5), (36, 36))]
+    floats = box(0.0, 1.0, (36, 36, 3), np.float32)
+    others = [gym.spaces.Discrete(4), gym.spaces.MultiDiscrete([2, 3]), gym.spaces.MultiBinary(3), BOX]
+    return [
+        [[bool(image(s)), bool(image(s, check_channels=True))] for s in made],
+        [bool(image(floats)), bool(image(floats, normalized_image=True))],
+        [bool(first(s)) for s in made[:2]],
+        [[list(shape(s)), int(flat(s)), int(dim(s))] for s in others],
+    ]
+
+
+@case(
+    "DQN.exploration_fraction,exploration_initial_eps,exploration_final_eps QRDQN.exploration_fraction,exploration_initial_eps,exploration_final_eps"
+)
+def exploration(lib: Library) -> Any:
+    found = []
+    for name, n_envs in (("DQN", 1), ("DQN", 2), ("QRDQN", 1)):
+        callback, notes = noted(lib, lambda one: [one.num_timesteps, float(one.model.exploration_rate)])
+        given = {"exploration_fraction": 0.5, "exploration_initial_eps": 0.9, "exploration_final_eps": 0.2}
+        env = vec(lib, *(Line(THREE) for _ in range(n_envs)))
+        small(lib, env, name, learning_starts=1000, **given).learn(40, callback=callback)
+        found.append(notes)
+    return found
+
+
+@case("DQN.learning_starts,train_freq,gradient_steps")
+def updates_counted(lib: Library) -> Any:
+    found = []
+    for given in (
+        {"learning_starts": 10, "train_freq": 4, "gradient_steps": 1},
+        {"learning_starts": 10, "train_freq": 4, "gradient_steps": 3},
+        {"learning_starts": 10, "train_freq": 4, "gradient_steps": -1},
+        {"learning_starts": 12, "train_freq": 4, "gradient_steps": 1},
+        {"learning_starts": 10, "train_freq": (2, "episode"), "gradient_steps": -1},
+        {"learning_starts": 10, "train_freq": (1, "episode"), "gradient_steps": 2},
+        {"learning_starts": 0, "train_freq": (3, "step"), "gradient_steps": 1},
+    ):
+        model = small(lib, vec(lib, Line(THREE)), "DQN", buffer_size=100, batch_size=8, **given)
+        found.append(model.learn(40)._n_updates)
+    return found
+
+
+@case("DQN.learning_starts,train_freq,gradient_steps(2 environments)")
+def updates_counted_2(lib: Library) -> Any:
+    found = []
+    for given in (
+        {"learning_starts": 10, "train_freq": 4, "gradient_steps": 1},
+        {"learning_starts": 10, "train_freq": 4, "gradient_steps": -1},
+    ):
+        model = small(lib, vec(lib, Line(THREE), Line(THREE)), "DQN", buffer_size=100, batch_size=8, **given)
+        found.append(model.learn(40)._n_updates)
+    return found
+
+
+WIDE = gym.spaces.Box(np.array([-2.0, 0.0], np.float32), np.array([2.0, 4.0], np.float32))
+
+
+@case("TD3.action_noise DDPG.action_noise SAC.action_noise")
+def action_noise(lib: Library) -> Any:
+    normal, found = lib("common.noise", "NormalActionNoise"), []
+    for name, mean in (("TD3", [0.3, -0.2]), ("DDPG", [0.9, -5.0])):
+        env = Line(WIDE)
+        noise = normal(np.array(mean), np.zeros(2))
+        model = lib.make(name, "MlpPolicy", env, name, action_noise=noise, learning_starts=0, train_freq=100)
+        model.learn(10)
+        found.append(env.actions[:10])  # the original goes on to the end of a rollout
+    return found
+
+
+@case("PPO.use_sde,sde_sample_freq A2C.use_sde,sde_sample_freq SAC.use_sde,sde_sample_freq")
+def noise_of_states(lib: Library) -> Any:
+    found = []
+
+    class Same(Line):
+        def look(self) -> np.ndarray:
+            return np.ones(3, np.float32)
+
+    for name, frequency in (("PPO", 4), ("A2C", 3), ("SAC", 5), ("SAC", -1)):
+        env = Same(BOX, 100)
+        off = {"learning_starts": 0, "train_freq": 20, "batch_size": 4} if name == "SAC" else {"n_steps": 20}
+        small(lib, vec(lib, env), name, use_sde=True, sde_sample_freq=frequency, **off).learn(20)
+        actions = np.array(env.actions)
+        found.append(np.flatnonzero(np.abs(np.diff(actions, axis=0)).max(axis=1) > 1e-6).tolist())
+    return found
+
+
+@case("PPO.stats_window_size,verbose,tensorboard_log,seed A2C.stats_window_size,verbose,seed")
+def outputs(lib: Library) -> Any:
+    found = []
+    for window in (2, 7):
+        model = small(lib, vec(lib, Line(THREE), monitored=True), stats_window_size=window).learn(40)
+        found.append([len(model.ep_info_buffer), [one["l"] for one in model.ep_info_buffer]])
+    for verbose in (0, 1):
+        with contextlib.redirect_stdout(io.StringIO()) as text:
+            small(lib, vec(lib, Line(THREE), monitored=True), verbose=verbose).learn(600, log_interval=1)
+        found.append(bool(text.getvalue()))
+    same = [
+        small(lib, vec(lib, Line(THREE)), seed=seed).learn(20).predict(LOOKS, deterministic=False)[0] for seed in (3, 3)
+    ]
+    return [found, bool(np.array_equal(*same))]
+
+
+@case("TimeFeatureWrapper.max_steps,test_mode")
+def time_feature(lib: Library) -> Any:
+    kind = lib("contrib.common.wrappers", "TimeFeatureWrapper")
+    found = []
+    for given in ({"max_steps": 8}, {"max_steps": 8, "test_mode": True}):
+        for env in (Line(THREE), gym.wrappers.TimeLimit(Line(THREE), 6)):
+            wrapped = kind(env, **given)
+            found.append([wrapped.observation_space.low, wrapped.observation_space.high, wrapped.reset()[0]])
+            found.append([wrapped.step(0)[0] for _ in range(4)])
+    return found
+
+
+class Masking(Line):
+    """``Line`` with a method of masks that takes the environment, as in sb3-contrib."""
+
+    def masks_of(self, env: Any) -> np.ndarray:
+        return env.action_masks()
+
+
+@case("ActionMasker.action_mask_fn get_action_masks.env is_masking_supported.env evaluate_policy.use_masking")
+def masks(lib: Library) -> Any:
+    masker = lib("contrib.common.wrappers", "ActionMasker")
+    get, supported = lib("contrib.common.maskable.utils", "get_action_masks", "is_masking_supported")
+    found = []
+    for function in ("masks_of", lambda env: [True, False, True]):
+        env = masker(Masking(THREE), function)
+        env.reset()
+        found.append([np.asarray(get(env), int), np.asarray(get(vec(lib, env)), int), bool(supported(vec(lib, env)))])
+    return found
+
+
+@case("ARS.n_delta,n_top,alive_bonus_offset")
+def random_search(lib: Library) -> Any:
+    found = []
+    for given in ({}, {"n_delta": 3}, {"n_top": 2}, {"alive_bonus_offset": -1.0}, {"alive_bonus_offset": 2.0}):
+        settings = {"n_delta": 4, "policy_kwargs": {}, **given}
+        model = small(lib, vec(lib, Line(THREE, 3, varies=True), monitored=True), "ARS", **settings)
+        logger = lib("common.logger", "Logger")(None, [])
+        model.set_logger(logger)
+        values: dict[str, float] = {}
+        plain_record = logger.record
+
+        def record(key: str, value: Any, *rest: Any, **more: Any) -> None:
+            values[key] = value  # noqa: B023
+            plain_record(key, value, *rest, **more)  # noqa: B023
+
+        logger.record = record
+        while model._n_updates < 1:
+            model.learn(1, reset_num_timesteps=False)
+        n = settings["n_delta"]
+        top = settings.get("n_top", n)
+        if lib.is_original:
+            deviation = values["rollout/return_std"] * math.sqrt((2 * top - 1) / (2 * top))
+        else:
+            deviation = float(model.statistics()["train/return_std"])
+        found.append([deviation, model._n_updates])
+    return found
+
+
+@case("HerReplayBuffer.n_sampled_goal,goal_selection_strategy", 0.1)
+def hindsight(lib: Library) -> Any:
+    found = []
+    her = lib("", "HerReplayBuffer")
+
+    class Reach(Line):
+        def __init__(self) -> None:
+            super().__init__(BOX, 10, truncates=True)
+            box = gym.spaces.Box(-99, 99, (1,), np.float32)
+            self.observation_space = gym.spaces.Dict(observation=box, achieved_goal=box, desired_goal=box)
+
+        def look(self) -> Any:
+            here = np.array([self.t], np.float32)
+            return {"observation": here, "achieved_goal": here, "desired_goal": np.array([50], np.float32)}
+
+        def compute_reward(self, achieved: Any, desired: Any, info: Any) -> Any:
+            return -(np.abs(np.asarray(achieved) - desired).max(axis=-1) > 0.5).astype(np.float32)
+
+        def step(self, action: Any) -> Any:
+            obs, _, *rest = super().step(action)
+            return obs, float(self.compute_reward(obs["achieved_goal"], obs["desired_goal"], {})), *rest
+
+    for strategy, n in (("future", 4), ("final", 1), ("episode", 2), ("future", 0)):
+        if n == 0:
+            continue
+        model = lib.algorithm("SAC")(
+            "MultiInputPolicy", Reach(), learning_starts=1000, seed=0, device="cpu", buffer_size=1000,
+            replay_buffer_class=her, replay_buffer_kwargs={"n_sampled_goal": n, "goal_selection_strategy": strategy},
+        )  # fmt: skip
+        model.learn(100)
+        if lib.is_original:
+            batch = model.replay_buffer.sample(40000)
+            here, goal = plain(batch.observations["observation"]), plain(batch.observations["desired_goal"])
+            reward = plain(batch.rewards)
+        else:
+            drawn = model.run.replay.sample(np.random.default_rng(0), (40000,))
+            here, goal, reward = drawn.obs["observation"], drawn.obs["desired_goal"], drawn.reward
+        ahead = (np.asarray(goal) - np.asarray(here)).ravel()
+        new = np.asarray(goal).ravel() < 40
+        found.append(
+            [float(new.mean()), float(ahead[new].mean()), float(ahead[new].min() / 10), float(np.mean(reward))]
+        )
+    return found
+
+
+def run_side(name: str, folder: Path, only: list[str]) -> None:
+    """Runs the cases in one library and prints what each returned, or its error, as a line of JSON."""
+    update_cases()
+    lib = Library(name, folder)
+    warnings.simplefilter("ignore")
+    found: dict[str, Any] = {}
+    out = sys.stdout
+    for key, (_, program) in CASES.items():
+        if only and not any(word in key for word in only):
+            continue
+        lib.case = key
+        with contextlib.redirect_stdout(io.StringIO()), tempfile.TemporaryDirectory() as here:
+            back = Path.cwd()
+            os.chdir(here)
+            try:
+                found[key] = json.loads(json.dumps(program(lib), default=lambda x: np.asarray(x).tolist()))
+            except Exception as error:
+                found[key] = {"error": f"{type(error).__name__}: {error}"[:300]}
+            finally:
+                os.chdir(back)
+        print(key, file=sys.stderr, flush=True)
+    print(json.dumps(found), file=out)
+
+
+def differs(a: Any, b: Any) -> float:
+    """Returns the largest difference of numbers, relative to those above 1; infinite where anything else differs."""
+    if isinstance(a, list) and isinstance(b, list) and len(a) == len(b):
+        return max(map(differs, a, b), default=0.0)
+    if isinstance(a, dict) and isinstance(b, dict) and a.keys() == b.keys():
+        return max((differs(a[key], b[key]) for key in a), default=0.0)
+    if isinstance(a, (int, float)) and isinstance(b, (int, float)):
+        both = math.isnan(a) and math.isnan(b)
+        return 0.0 if a == b or both else abs(a - b) / max(1.0, abs(a)) if math.isfinite(a - b) else math.inf
+    return 0.0 if a == b else math.inf
+
+
+def both(peer: str, only: list[str]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Returns what the cases returned in the original and in rejeu."""
+    with tempfile.TemporaryDirectory() as folder:
+        sides = []
+        for name, python in (("original", peer), ("rejeu", sys.executable)):
+            command = [python, __file__, "--side", name, "--folder", folder, "--only", *only]
+            done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
+            sides.append(json.loads(done.stdout.strip().splitlines()[-1]))
+    return sides[0], sides[1]
+
+
+DIFFERENT: dict[str, str] = {
+    "normalize_advantage": "divided by the standard deviation over n, there over n - 1 (Training)",
+    "PPO_Discrete_clip_range1": "the schedule is read when the update begins; there the progress is that of the step before",
+    "clip_range1": "the schedule is read when the update begins, as is that of the learning rate",
+    "sub_sampling_factor": "which steps are left out is drawn at random",
+    "TRPO_Box": "target_kl and cg_damping bound the sum over action dimensions, there their mean",
+    "TRPO": "conjugate gradients in another precision",
+    "RecurrentPPO": "not explained yet: the memory of the first steps of each rollout",
+    "CrossQ": "the variance of a batch is divided by n, there by n - 1",
+    "train_freq": "open: counted in environment steps from learning_starts on; schedules and targets between two updates",
+    "use_sde": "not explained yet: the noise that next actions are drawn with in TD targets",
+    "SAC_Box_policy_kwargs2": "as use_sde",
+    "atari_wrapper": "the last frame of an episode is the maximum of its frames; there a frame of the action before may be in it",
+    "exploration": "callbacks see the rate of the next action, there that of the last one",
+    "updates_counted": "train_freq is counted from the end of learning_starts, and with n environments in environment steps",
+    "logging": "columns of a CSV file are sorted; no line 'Logging to'",
+    "checkpoints": "total_timesteps is exact, there a lower bound",
+    "random_search": "not explained yet: an environment is reset once more between candidates there, so other episodes are counted",
+    "evaluating": "open: not yet found which of the compared calls differs",
+}
+"""Reasons of the differences, by a part of the case's name; the first that fits. docs/coming-from-sb3.md has them."""
+NOT_COMPARABLE = {
+    "device": "of PyTorch",
+    "_init_setup_model": "internal",
+    "policy": "a name or a class; compared in every case",
+    "env": "given in every case",
+    "lr_schedule": "given by the agent",
+    "observation_space": "given by the environment",
+    "action_space": "given by the environment",
+    "features_extractor": "a PyTorch module",
+    "optimizer_class": "a PyTorch class",
+    "features_extractor_class": "a PyTorch module",
+    "supported_action_spaces": "internal",
+}
+"""Reasons, by the name of the argument."""
+
+
+def signatures(packages: dict[str, str]) -> Iterator[tuple[str, str, str]]:
+    """Yields module, name and argument of every setting of the installed packages."""
+    for package in packages:
+        module = importlib.import_module(package)
+        for info in pkgutil.walk_packages(module.__path__, f"{package}."):
+            try:
+                found = vars(importlib.import_module(info.name))
+            except ImportError:  # of something optional
+                continue
+            for key, one in found.items():
+                if not callable(one) or key.startswith("_") or getattr(one, "__module__", "") != info.name:
+                    continue
+                try:
+                    given = inspect.signature(one).parameters.values()
+                except (TypeError, ValueError):
+                    continue
+                for argument in given:
+                    if argument.kind not in (argument.VAR_POSITIONAL, argument.VAR_KEYWORD):
+                        yield info.name, key, argument.name
+
+
+def compared(rows: list[dict[str, Any]]) -> dict[str, list[str]]:
+    """Returns the results of the cases that compare each ``Class.argument``."""
+    found: dict[str, list[str]] = {}
+    for row in rows:
+        for part in row["settings"].split():
+            owner, _, names = part.partition(".")
+            for name in names.split(","):
+                found.setdefault(f"{owner}.{name}", []).append(row["result"])
+                found.setdefault(f"{owner}.{name.removeprefix('policy_kwargs.')}", []).append(row["result"])
+    return found
+
+
+def state_of(owner: str, argument: str, results: dict[str, list[str]]) -> str:
+    """Returns what is known of a setting."""
+    key = f"{owner}.{argument}"
+    if key in results:
+        return "equal" if {*results[key]} == {"equal"} else "different"
+    if argument in NOT_COMPARABLE:
+        return f"not comparable: {NOT_COMPARABLE[argument]}"
+    return "not compared"
+
+
+def result_row(name: str, original: Any, own: Any) -> dict[str, Any]:
+    """Returns what a case found."""
+    gap = differs(original, own)
+    same = gap <= TOLERANCES.get(name, TOLERANCE)
+    reason = "" if same else next((text for part, text in DIFFERENT.items() if part in name), "not explained yet")
+    errors = [side["error"] for side in (original, own) if isinstance(side, dict) and "error" in side]
+    row = {"case": name, "settings": CASES[name][0], "result": "equal" if same else "different"}
+    return {
+        **row,
+        "difference": gap if math.isfinite(gap) else "other",
+        "why": "; ".join([reason, *errors]).strip("; "),
+    }
+
+
+def report(peer: str, original: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
+    """Returns the content of the file of results."""
+    rows = [result_row(name, original[name], own[name]) for name in original]
+    listed = subprocess.run([peer, __file__, "--list"], stdout=subprocess.PIPE, text=True, check=True).stdout
+    results = compared(rows)
+    settings = [
+        {"module": module, "setting": f"{owner}.{argument}", "state": state_of(owner, argument, results)}
+        for module, owner, argument in json.loads(listed.strip().splitlines()[-1])
+    ]
+    by_state: dict[str, list[str]] = {}
+    for one in settings:
+        by_state.setdefault(one["state"], []).append(one["setting"])
+    every = {state: " ".join(names) for state, names in sorted(by_state.items())}
+    counts = Counter(one["state"].partition(":")[0] for one in settings)
+    cases = Counter(row["result"] for row in rows)
+    return {
+        **provenance(
+            {
+                peer: "PATH",
+                **dict.fromkeys(sys.argv[1:], "FILE"),
+                **{x: x for x in sys.argv if x.startswith("--")},
+                peer: "PATH",
+            }
+        ),
+        "settings": dict(counts),
+        "cases": dict(cases),
+        "all": every,
+        "rows": rows,
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--peer", default=sys.executable)
+    parser.add_argument("--raw", type=Path, nargs="*", help="results of --keep to join instead of running")
+    parser.add_argument("--keep", type=Path, help="file for what both libraries returned")
+    parser.add_argument("--only", nargs="*", default=[])
+    parser.add_argument("--side", choices=["original", "rejeu"])
+    parser.add_argument("--folder", type=Path)
+    parser.add_argument("--list", action="store_true")
+    options = parser.parse_args()
+    if options.list:
+        print(json.dumps([*signatures(PACKAGES)]))
+        return
+    if options.side:
+        run_side(options.side, options.folder, options.only)
+        return
+    original: dict[str, Any] = {}
+    own: dict[str, Any] = {}
+    if options.raw:
+        update_cases()
+        for path in options.raw:
+            for all_of, some in zip((original, own), json.loads(path.read_text()), strict=True):
+                all_of.update(some)
+    else:
+        update_cases()
+        original, own = both(options.peer, options.only)
+    if options.keep:
+        options.keep.write_text(json.dumps([original, own]))
+    content = report(options.peer, original, own)
+    for row in content["rows"]:
+        print(f"{row['case']:45} {row['result']:10} {row['difference']} {row['why'][:150]}")
+    print(content["settings"], content["cases"])
+    if not options.only:
+        write(RESULTS, content, "rows")
+
+
+if __name__ == "__main__":
+    main()
