@@ -1404,14 +1404,7 @@ def report(peer: str, original: dict[str, Any], own: dict[str, Any]) -> dict[str
     counts = Counter(one["state"].partition(":")[0] for one in settings)
     cases = Counter(row["result"] for row in rows)
     return {
-        **provenance(
-            {
-                peer: "PATH",
-                **dict.fromkeys(sys.argv[1:], "FILE"),
-                **{x: x for x in sys.argv if x.startswith("--")},
-                peer: "PATH",
-            }
-        ),
+        **provenance({one: "PATH" if one == peer else "FILE" for one in sys.argv[1:] if one[:2] != "--"}),
         "settings": dict(counts),
         "cases": dict(cases),
         "all": every,
