@@ -485,6 +485,7 @@ def load_zip(
             state = read_normalization(Path(vecnormalize))
     cls = kind or BUILT_IN[algorithm]
     agent: Agent = cls.__new__(cls)
+    agent.notes = notes  # before it is built, when only known attributes can be set
     own = {
         key: changes.pop(key) for key in [*changes] if key in ("seed", "device", "verbose", "log", "tensorboard_log")
     }
@@ -530,7 +531,6 @@ def load_zip(
     if vector is not None:
         agent.set_env(vector)
         agent.made_from_id = isinstance(env, str)
-    agent.notes = notes
     return agent
 
 
