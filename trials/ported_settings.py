@@ -1301,7 +1301,7 @@ DIFFERENT: dict[str, str] = {
     "sub_sampling_factor": "which steps are left out is drawn at random",
     "TRPO_Box": "target_kl and cg_damping bound the sum over action dimensions, there their mean",
     "TRPO": "conjugate gradients in another precision",
-    "RecurrentPPO": "not explained yet: the memory of the first steps of each rollout",
+    "RecurrentPPO": "not explained yet; a critic without LSTM is refused. Perhaps the memory of the first steps of each rollout",
     "CrossQ": "the variance of a batch is divided by n, there by n - 1",
     "train_freq": "open: counted in environment steps from learning_starts on; schedules and targets between two updates",
     "use_sde": "not explained yet: the noise that next actions are drawn with in TD targets",
@@ -1312,7 +1312,7 @@ DIFFERENT: dict[str, str] = {
     "logging": "columns of a CSV file are sorted; no line 'Logging to'",
     "checkpoints": "total_timesteps is exact, there a lower bound",
     "random_search": "not explained yet: an environment is reset once more between candidates there, so other episodes are counted",
-    "evaluating": "open: not yet found which of the compared calls differs",
+    "evaluating": "returns are not rounded to 6 digits; no warning without Monitor, which is optional here; environments that have played their share are told where episodes start, there always that one does",
 }
 """Reasons of the differences, by a part of the case's name; the first that fits. docs/coming-from-sb3.md has them."""
 NOT_COMPARABLE = {
