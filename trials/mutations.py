@@ -5,12 +5,17 @@ Run it with the active python::
     python trials/mutations.py                      # all that are not in the table yet
     python trials/mutations.py --only td3 --again   # those whose file or name contains the text, also known ones
     python trials/mutations.py --check              # only whether every line that is changed is still there
+    python trials/mutations.py --stages 1           # only the files that are about what was changed
+    python trials/mutations.py --together           # those that this missed: all of them at once, then one by one
 
-Each mutation is made in a copy of the tracked files, and the default tests run there with ``pytest -x``: first the files
-that are about what was changed, then the folders around it. The first test that fails is written beside the bug to
-``trials/results/mutations.json``, from which the page "How we check" has its table. A mutation that no test notices is
-*missed*. The lines are in ``trials/mutations.toml``. One that no longer
-occurs exactly once stops the script before anything runs.
+Each mutation is made in a copy of the tracked files, and the default tests run there with ``pytest -x``: first the test that
+the table names, then the files that are about what was changed, then the folders around it. The first test that fails is
+written beside the bug to ``trials/results/mutations.json``, from which the page "How we check" has its table. A mutation that
+no test notices is *missed*. The lines are in ``trials/mutations.toml``. One that no longer occurs exactly once stops the
+script before anything runs.
+
+The wider tests take long where most bugs are caught by the nearest ones. With ``--together`` they run once, without ``-x``,
+on a copy with all changes that are known as missed; the tests that fail there then run with each change alone.
 """
 
 from __future__ import annotations
@@ -25,6 +30,8 @@ import sys
 import tempfile
 import time
 import tomllib
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
@@ -44,8 +51,10 @@ class Mutation(NamedTuple):
     """Occurs once in the file."""
     new: str
     kind: str
+    room: str | None = None
+    """The part of the package, of a bug outside of algorithms, buffers and loops."""
     at_first: str | None = None
-    """``caught`` or ``missed``: what the tests did at first, of a bug by someone who knew neither the list nor the tests."""
+    """``caught`` or ``missed``: what the tests did at first, of a bug by someone who had not read them."""
 
 
 MUTATIONS = [
@@ -77,10 +86,10 @@ STAGES = {
     "networks/": ["tests/networks/test_NAME.py"],
     "envs/functional/": ["tests/envs/functional/test_NAME.py"],
     "callbacks/": ["tests/callbacks"],
-    "sb3/": ["tests/sb3/test_vec_env.py"],
-    "": ["tests/test_NAME.py"],
+    "": ["tests/ROOM/**/test_NAME*.py", "tests/test_NAME*.py"],
 }
-"""By the first characters of the file: the tests that are about it. NAME stands for the file's own."""
+"""By the first characters of the file: the tests that are about it. NAME stands for the file's own, or that of the folder
+of an ``__init__.py``; ROOM for the first folder."""
 KINDS = {
     "sac/continuous": "SAC",
     "sac/discrete": "SAC",
@@ -108,14 +117,19 @@ WIDEST = [
 
 def stages(mutation: Mutation) -> list[list[str]]:
     """Returns the tests to run one after the other."""
-    name = Path(mutation.file).stem
-    first = next(tests for prefix, tests in STAGES.items() if mutation.file.startswith(prefix))
-    first = [test.replace("NAME", name) for test in first]
+    path = Path(mutation.file)
+    name, room = path.parent.name if path.stem == "__init__" else path.stem, path.parts[0]
+    prefix = "" if mutation.room is not None else mutation.file
+    first = next(tests for start, tests in STAGES.items() if prefix.startswith(start))
+    first = [test.replace("NAME", name).replace("ROOM", room) for test in first]
+    first = sorted({found.relative_to(ROOT).as_posix() for test in first for found in ROOT.glob(test)})
+    if mutation.room is not None:
+        return [first, [f"tests/{room}"] if (ROOT / "tests" / room).is_dir() else [], ["tests"]]
     wider = [tests for prefix, tests in WIDER.items() if mutation.file.startswith(prefix)]
     of_algorithm = mutation.file.removeprefix("algorithms/").removesuffix(".py")
     kind = KINDS.get(of_algorithm, name)
     wider = [[kind if test == "KIND" else test for test in tests] for tests in wider]
-    return [[test for test in first if (ROOT / test).exists()], *wider, WIDEST]
+    return [first, *wider, WIDEST]
 
 
 def check() -> None:
@@ -139,43 +153,91 @@ def copied(folder: Path) -> None:
             shutil.copy(file, folder / file.name)
 
 
-def run(mutation: Mutation, folder: Path, n_stages: int) -> dict[str, object]:
-    """Makes the change in ``folder``, runs the tests, takes it back, and returns a row of the table."""
-    path = folder / "src/rejeu" / mutation.file
-    text = path.read_text(encoding="utf-8")
-    path.write_text(text.replace(mutation.old, mutation.new), encoding="utf-8")
+def pytest(tests: Sequence[str], folder: Path, limit: float, *options: str) -> subprocess.CompletedProcess[str]:
+    """Runs tests in ``folder``.
+
+    Raises:
+        subprocess.TimeoutExpired: after ``limit`` seconds.
+    """
     environment = os.environ | {
         "PYTHONPATH": os.pathsep.join([str(folder / "src"), str(folder)]),
         "JAX_PLATFORMS": "cpu",
     }
-    row: dict[str, object] = {name: value for name, value in mutation._asdict().items() if value}
-    row |= {"caught_by": None, "stage": None}
-    began, done = time.monotonic(), list[str]()
+    command = [sys.executable, "-m", "pytest", "-q", "--no-header", "-p", "no:cacheprovider", *options, *tests]
+    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=limit)
+
+
+def failed(output: str) -> list[str]:
+    """Returns the tests that failed, with their parameters."""
+    return re.findall(r"^(?:FAILED|ERROR) (\S+?(?:\[.*?\])?)(?: - .*)?$", output, re.MULTILINE)
+
+
+@contextmanager
+def planted(mutations: Sequence[Mutation], folder: Path) -> Iterator[None]:
+    """Makes changes in ``folder``, and takes them back."""
+    texts: dict[Path, str] = {}
     try:
-        for number, tests in enumerate(stages(mutation)[:n_stages], 1):
+        for mutation in mutations:
+            path = folder / "src/rejeu" / mutation.file
+            text = path.read_text(encoding="utf-8")
+            texts.setdefault(path, text)
+            path.write_text(text.replace(mutation.old, mutation.new), encoding="utf-8")
+        yield
+    finally:
+        for path, text in texts.items():
+            path.write_text(text, encoding="utf-8")
+
+
+def as_row(mutation: Mutation) -> dict[str, object]:
+    """Returns a row of the table of a mutation that no test has noticed yet."""
+    return {name: value for name, value in mutation._asdict().items() if value is not None} | {"caught_by": None, "stage": None}
+
+
+def run(mutation: Mutation, folder: Path, n_stages: int, limit: float) -> dict[str, object]:
+    """Makes the change in ``folder``, runs the tests, takes it back, and returns a row of the table."""
+    row, began, done = as_row(mutation), time.monotonic(), list[str]()
+    numbered = [*enumerate(stages(mutation)[:n_stages], 1)]
+    known = table().get(key(mutation), row)
+    if known["caught_by"] is not None and "::" in known["caught_by"] and known["stage"] <= n_stages:
+        numbered.insert(0, (known["stage"], [known["caught_by"]]))
+    with planted([mutation], folder):
+        for number, tests in numbered:
             tests = [test for test in tests if test not in done]
             done += [] if "-k" in tests else tests
             if not tests:
                 continue
-            command = [sys.executable, "-m", "pytest", "-x", "-q", "--no-header", "-p", "no:cacheprovider", *tests]
             try:
-                ended = subprocess.run(
-                    command, cwd=folder, env=environment, capture_output=True, text=True, timeout=LIMIT
-                )
+                ended = pytest(tests, folder, limit, "-x")
             except subprocess.TimeoutExpired:
-                row |= {"caught_by": f"no end after {LIMIT} s", "stage": number}
+                row |= {"caught_by": f"no end after {limit:g} s", "stage": number}
                 break
-            if ended.returncode == 1:
-                found = re.search(r"^(?:FAILED|ERROR) (\S+?)(?:\[.*)?(?: - .*)?$", ended.stdout, re.MULTILINE)
-                row |= {"caught_by": found[1] if found else "?", "stage": number}
+            if ended.returncode in (1, 2):  # 2: a file of tests cannot be imported
+                found = failed(ended.stdout)
+                row |= {"caught_by": found[0].partition("[")[0] if found else "?", "stage": number}
                 break
-            if ended.returncode not in (0, 5):  # 5: there is no such test
+            if ended.returncode not in (0, 4, 5):  # 4 and 5: there is no such test
                 sys.exit(
                     f"pytest ended with {ended.returncode} on {mutation}:\n{ended.stdout[-2000:]}{ended.stderr[-2000:]}"
                 )
-    finally:
-        path.write_text(text, encoding="utf-8")
     return row | {"seconds": round(time.monotonic() - began)}
+
+
+def run_together(mutations: Sequence[Mutation], folder: Path, tests: Sequence[str], limit: float) -> None:
+    """Runs tests with all changes at once, then those that fail with each change alone, and writes the table."""
+    with planted(mutations, folder):
+        ended = pytest(tests, folder, limit)
+    found = failed(ended.stdout)
+    print(f"{len(found)} tests fail with {len(mutations)} changes\n{ended.stdout[-300:]}", flush=True)
+    if not found:
+        return
+    found = [test for test in found if test not in failed(pytest(found, folder, limit).stdout)]
+    for mutation in mutations:
+        began = time.monotonic()
+        with planted([mutation], folder):
+            caught = failed(pytest(found, folder, limit, "-x").stdout)
+        about = {"caught_by": caught[0].partition("[")[0] if caught else None, "stage": 3 if caught else None}
+        print(f"{mutation.file}  {mutation.kind}: {about['caught_by'] or 'MISSED'}", flush=True)
+        write({key(mutation): as_row(mutation) | about | {"seconds": round(time.monotonic() - began)}})
 
 
 def main() -> None:
@@ -186,6 +248,8 @@ def main() -> None:
     parser.add_argument("--missed", action="store_true", help="those that the table has as missed")
     parser.add_argument("--stages", type=int, default=3, help="how far around what was changed tests are run, 1 to 3")
     parser.add_argument("--part", default="0/1", help="i/n: every n-th mutation, from the i-th")
+    parser.add_argument("--limit", type=float, default=LIMIT, help="seconds for the tests of one stage")
+    parser.add_argument("--together", nargs="*", metavar="TESTS", help="those missed, at once, by these tests or all")
     parser.add_argument("--check", action="store_true", help="only check that every line is there")
     given = parser.parse_args()
     check()
@@ -196,12 +260,19 @@ def main() -> None:
         folder = Path(name) / "copy"
         folder.mkdir()
         copied(folder)
+        if given.together is not None:
+            known = table()
+            missed = [m for m in MUTATIONS if key(m) in known and known[key(m)]["caught_by"] is None]
+            run_together(
+                [m for m in missed if given.only in m.file + m.old], folder, given.together or ["tests"], given.limit
+            )
+            return
         for mutation in MUTATIONS[i::n]:
             old = table().get(key(mutation))
             again = given.again or (given.missed and old is not None and old["caught_by"] is None)
             if given.only not in mutation.file + mutation.old or (old is not None and not again):
                 continue
-            row = run(mutation, folder, given.stages)
+            row = run(mutation, folder, given.stages, given.limit)
             print(
                 f"{row['seconds']:>5} s  {mutation.file}  {mutation.kind}: {row['caught_by'] or 'MISSED'}", flush=True
             )
@@ -233,7 +304,10 @@ def write(new: dict[tuple[str, str, str], dict]) -> None:
     )
     ordered = [rows[key(m)] for m in MUTATIONS if key(m) in rows]
     caught = sum(row["caught_by"] is not None for row in ordered)
-    at_first = [mutation.at_first for mutation in MUTATIONS if mutation.at_first]
+    at_first, elsewhere = (
+        [one.at_first for one in MUTATIONS if one.at_first and (one.room is not None) == is_elsewhere]
+        for is_elsewhere in (False, True)
+    )
     content = {
         "command": "python trials/mutations.py",
         "commit": commit.stdout.strip(),
@@ -244,7 +318,14 @@ def write(new: dict[tuple[str, str, str], dict]) -> None:
             "caught": caught,
             "planted by someone who knew neither the list nor the tests": len(at_first),
             "of these caught at first": at_first.count("caught"),
+            "planted outside of algorithms, buffers and loops by someone who had not read the tests": len(elsewhere),
+            "of these caught at first, outside": elsewhere.count("caught"),
         },
+        "rooms": [
+            {"room": room, "planted": len(first), "caught_at_first": first.count("caught")}
+            for room in sorted({one.room for one in MUTATIONS if one.room is not None})
+            if (first := [one.at_first for one in MUTATIONS if one.room == room])
+        ],
         "mutations": ordered,
     }
     RESULTS.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
