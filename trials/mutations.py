@@ -190,7 +190,10 @@ def planted(mutations: Sequence[Mutation], folder: Path) -> Iterator[None]:
 
 def as_row(mutation: Mutation) -> dict[str, object]:
     """Returns a row of the table of a mutation that no test has noticed yet."""
-    return {name: value for name, value in mutation._asdict().items() if value is not None} | {"caught_by": None, "stage": None}
+    return {name: value for name, value in mutation._asdict().items() if value is not None} | {
+        "caught_by": None,
+        "stage": None,
+    }
 
 
 def run(mutation: Mutation, folder: Path, n_stages: int, limit: float) -> dict[str, object]:
