@@ -337,7 +337,7 @@ def bad_models(content: bytes) -> Iterator[Variant]:
         text = text_of(Parts({**header, "observation_space": "HERE"}, take_apart(content).arrays))
         yield Variant("deep", f"spaces {deep}", put_together(take_apart(content), text.replace('"HERE"', space)))
 
-    for key in header.keys() - {"env_id", "success_threshold"}:
+    for key in header.keys() - {"env_id", "success_threshold", "made_from"}:
         yield from with_values(content, "of another type", key, [GONE, [] if key != "config" else 3])
     yield from with_values(content, "algorithm", "algorithm", ([], {}, 3, None, "sac", "SAC\n", "x" * 100_000))
 
@@ -371,11 +371,6 @@ def bad_buffers(content: bytes) -> Iterator[Variant]:
     for name in ("head", "n_steps"):
         changes[f"{name} of nothing"] = lambda a, n=name: a.update({n: a[n][:0]})
         changes[f"{name} of more"] = lambda a, n=name: a.update({n: np.repeat(a[n], 2)})
-    # Only older files contain the counters of each row.
-    for name in ("since_start", "until_end"):
-        changes[f"{name} alone"] = lambda a, n=name: only_counter(a, n)
-        changes[f"{name} wide"] = lambda a, n=name: with_counters(a, n, lambda c: c.astype(np.int64))
-        changes[f"{name} flat"] = lambda a, n=name: with_counters(a, n, np.ravel)
     for name in arrays:
         changes[f"{name} gone"] = lambda a, n=name: a.pop(n)
         changes[f"{name} shorter"] = lambda a, n=name: a.update({n: a[n][:, :-1] if a[n].ndim > 1 else a[n][:-1]})
@@ -437,24 +432,6 @@ def sparse(content: bytes, size: int = 6 * 2**30) -> Iterator[Sparse]:
         table[name] = {"dtype": NAMES[one.dtype.name], "shape": shape, "data_offsets": [begin, end]}
         start = join(table, b"".join(array.tobytes() for array in others.values()))
         yield Sparse(name, start, len(start) - begin + end)
-
-
-def counters(arrays: dict) -> dict[str, np.ndarray]:
-    """Returns the counters of each row in older replay files: zeros, which are valid."""
-    return {name: np.zeros(arrays["kind"].shape, np.int32) for name in ("since_start", "until_end")}
-
-
-def with_counters(arrays: dict, name: str, change: Callable[[np.ndarray], np.ndarray]) -> None:
-    """Puts the two counters into a file, one of them changed."""
-    both = counters(arrays)
-    arrays |= {**both, name: change(both[name])}
-
-
-def only_counter(arrays: dict, name: str) -> None:
-    """Keeps only one of the two counters in a file."""
-    for other in counters(arrays):
-        arrays.pop(other, None)
-    arrays[name] = counters(arrays)[name]
 
 
 def flipped(content: bytes, bit: int) -> bytes:

@@ -12,7 +12,7 @@ import numpy as np
 
 import rejeu
 from rejeu.callbacks import Checkpoint, Evaluate
-from rejeu.tuning import LogUniform
+from rejeu.algorithms.search import LogUniform
 
 env: gym.Env = gym.make("Pendulum-v1")
 agent = rejeu.SAC("MlpPolicy", env, learning_rate=1e-3, seed=0)

@@ -1,12 +1,12 @@
 """Kills runs, Ray workers, Ray nodes and commands with many runs at random moments, and compares the models.
 
     python trials/sweep_kills.py --kills 30 --only sweep ray
-    python trials/sweep_kills.py --kills 20 --only seeds tune pbt --out trials/results/experiment_kills.json
+    python trials/sweep_kills.py --kills 20 --only seeds tune --out trials/results/experiment_kills.json
 
 A sweep has eight runs: SAC on Pendulum, DQN and PPO on CartPole. ``--seeds`` has four of DQN on CartPole. A study has
-three trials of PPO on CartPole and compares its winner with the default on five seeds. A population has four members of
-SAC on Pendulum and three rounds. An undisturbed one is trained once, two runs at a time. Then others are disturbed
-until there were as many kills as asked for, those on Ray on a cluster of a head and two nodes on this machine. Every
+three trials of PPO on CartPole and compares its winner with the default on five seeds. An undisturbed one is trained
+once, two runs at a time. Then others are disturbed until there were as many kills as asked for, those on Ray on a
+cluster of a head and two nodes on this machine. Every
 kill is a SIGKILL at a random moment: of a run; of the command that began them, after which ``rejeu resume`` continues;
 of a Ray worker, or of everything that belongs to a node, in whose place a new one begins.
 
@@ -71,10 +71,6 @@ COMMANDS = {
     ],
     "tune": [
         *["tune", "CartPole-v1", "--algo", "PPO", "--trials", "3", "--steps", "{steps}", "--pruner", "none"],
-        *["--backend", "gymnasium", "--only", "learning_rate", "gamma", *QUIET, *SMALL],
-    ],
-    "pbt": [
-        *["pbt", "Pendulum-v1", "--algo", "SAC", "--members", "4", "--rounds", "3", "--round-steps", "{round_steps}"],
         *["--backend", "gymnasium", "--only", "learning_rate", "gamma", *QUIET, *SMALL],
     ],
 }
@@ -274,7 +270,7 @@ def main() -> None:
         root = Path(name).resolve()
         plan = root / "plan.toml"
         plan.write_text(PLAN.format(steps=arguments.steps, minutes=minutes), encoding="utf-8")
-        values = {"plan": plan, "minutes": minutes, "steps": arguments.steps, "round_steps": arguments.steps // 10}
+        values = {"plan": plan, "minutes": minutes, "steps": arguments.steps}
         for kind in arguments.only:
             words = [word.format(**values) for word in COMMANDS[kind]]
             began, undisturbed = time.monotonic(), root / f"{kind}-undisturbed"

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import itertools
 import os
 import re
 import shutil
@@ -18,7 +16,6 @@ import pytest
 
 import rejeu
 from rejeu import xla
-from rejeu.agents.run_files import copy_run
 from rejeu.callbacks import Checkpoint, Evaluate
 from rejeu.envs.functional.gym_env import GymnasiumEnv
 from rejeu.envs.make import InProcess
@@ -32,7 +29,8 @@ from tests.every_agent import KINDS
 from tests.helpers import small_sac
 from tests.jax_environments import Forbidden
 from tests.sharing import shared_learners
-from tests.tiers import exhaustive, only
+from tests.tiers import only
+from tests.worker_environments import in_order
 
 SMALL = {"policy_kwargs": {"net_arch": [8]}, "seed": 3}
 RECURRENT = {"policy_kwargs": {"net_arch": [8], "lstm_hidden_size": 8}, "n_steps": 16, "batch_size": 16, "seed": 3}
@@ -50,10 +48,8 @@ def vector(env_id, n_envs=3, backend="gymnasium"):
 
 
 def first_of_n():
-    """Returns environments that do not wait for each other, with an order of arrival in place of chance."""
-    rng = np.random.default_rng(0)
-    order = [np.sort(rng.choice(3, 2, replace=False)) for _ in range(200)]
-    return rejeu.make_vector("Pendulum-v1", 3, "gymnasium-async", seed=1, wait_for=2, arrivals=order)
+    """Returns environments that do not wait for each other, with an order of arrival that no chance decides."""
+    return in_order(rejeu.make_vector("Pendulum-v1", 3, "gymnasium-async", seed=1, wait_for=2))
 
 
 CASES = {
@@ -570,35 +566,3 @@ def test_observations_of_half_precision_are_saved(tmp_path):
     with pytest.warns(UserWarning, match="at the start of new episodes"):
         resumed = rejeu.SAC.resume(tmp_path, env())
     assert_same(resumed.replay_buffer.arrays(), agent.replay_buffer.arrays())
-
-
-@pytest.mark.parametrize(
-    ("name", "env_id", "settings"),
-    [
-        ("SAC", "Pendulum-v1", {"learning_starts": 20, "batch_size": 16, "priorities": {}}),
-        pytest.param("SAC", "jax/Pendulum-v1", {"learning_starts": 20, "batch_size": 16}, marks=exhaustive),
-        pytest.param("PPO", "CartPole-v1", {"n_steps": 24, "batch_size": 8}, marks=exhaustive),
-    ],
-)
-def test_no_two_copies_of_a_run_are_trained_to_the_same_agent(tmp_path, name, env_id, settings):
-    kind = rejeu.AGENTS[name]
-    agent = kind("MlpPolicy", env_id, seed=0, policy_kwargs={"net_arch": [8]}, **settings)
-    agent.learn(60, callback=Checkpoint(tmp_path / "source", every=30))
-    ends = {}
-    for folder, seed in (("one", 1), ("two", 2), ("again", 1), ("source", None)):
-        if seed is not None:
-            copy_run(tmp_path / "source", tmp_path / folder, seed)
-        with pytest.warns(UserWarning, match="it is a copy of another run") if seed else contextlib.nullcontext():
-            copied = kind.resume(tmp_path / folder)
-        np.testing.assert_equal(copied.get_parameters(), agent.get_parameters() | keys_of(copied))
-        copied.learn(60, reset_num_timesteps=False)
-        ends[folder] = copied.get_parameters() | {"returns": copied.evaluate(2, seed=copied.seed).returns}
-    np.testing.assert_equal(ends["one"], ends["again"])
-    for one, other in itertools.combinations(("one", "two", "source"), 2):
-        assert all(np.any(ends[one][key] != ends[other][key]) for key in ends[one] if "weight" in key)
-        assert np.any(ends[one]["returns"] != ends[other]["returns"])
-
-
-def keys_of(agent):
-    """The keys of the updates, which a copy has of its own."""
-    return {key: value for key, value in agent.get_parameters().items() if key == "key"}

@@ -215,20 +215,6 @@ def test_arrays_leave_out_rows_that_were_never_written():
     assert ring_arrays["obs.where"].shape == (2, 4, 2)
 
 
-def with_counters(arrays):
-    """The two arrays that older files have beside the others."""
-    return dict.fromkeys(COUNTERS, np.zeros(arrays["kind"].shape, np.int32))
-
-
-def test_counters_in_older_files_are_counted_anew(arrays):
-    rings = [make_ring(12, 2, counters=COUNTERS) for _ in range(2)]
-    ring_io.restore(rings[0], arrays)
-    ring_io.restore(rings[1], arrays | with_counters(arrays))
-    np.testing.assert_array_equal(rings[0].until_end, rings[1].until_end)
-    np.testing.assert_array_equal(rings[0].since_start, rings[1].since_start)
-    assert rings[0].since_start.any()
-
-
 @settings(max_examples=60)
 @given(case=histories(), cuts=st.lists(st.integers(0, 40), max_size=4), priorities=st.booleans())
 def test_rows_written_bit_by_bit_make_the_same_ring(case, cuts, priorities):
@@ -258,16 +244,6 @@ def test_rows_written_bit_by_bit_make_the_same_ring(case, cuts, priorities):
             one, two = (p.draw(np.random.default_rng(0), 5, 0.5) for p in (again, replay.priorities))
             np.testing.assert_array_equal(one[0], two[0])
             np.testing.assert_array_equal(one[1], two[1])
-
-
-def test_rows_with_counters_of_older_checkpoints_are_read():
-    ring = filled(2, 6, [NO_END] * 8)[0].ring
-    rows = ring_io.rows_since(ring, np.full(2, -1))
-    assert "since_start" not in rows
-    other = make_ring(12, 2)
-    ring_io.put_rows(other, [rows | {"since_start": np.zeros(len(rows["kind"]), np.int32)}])
-    np.testing.assert_array_equal(other.records, ring.records)
-    np.testing.assert_array_equal(other.kind, ring.kind)
 
 
 def counts(replay):

@@ -13,7 +13,6 @@ from rich.console import Console
 import rejeu
 from rejeu.callbacks import (
     Evaluate,
-    Film,
     ProgressBar,
     RecordVideo,
     stop_on_return,
@@ -111,9 +110,6 @@ def test_a_resumed_evaluation_knows_how_many_episodes_were_cut_off():
     state = one.state_dict()
     other.load_state_dict(state)
     assert [result.evaluation.cut for result in other.results] == [1]
-    del state["cut"]  # as in files of earlier versions
-    other.load_state_dict(state)
-    assert [result.evaluation.cut for result in other.results] == [0]
 
 
 @pytest.mark.parametrize("n_envs", [1, 3])
@@ -374,7 +370,3 @@ class Pictured(gym.Wrapper):
 
     def render(self):
         return np.zeros((32, 32, 3), np.uint8)
-
-
-def test_film_is_still_the_name_of_a_video_callback():
-    assert Film is RecordVideo

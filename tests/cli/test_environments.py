@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 
 import rejeu
-from rejeu.cli import check, environment, main, parsing
-from rejeu.cli.commands import COMMANDS, Train
+from rejeu.cli import check, environment, main
+from rejeu.cli.commands import Train
 from rejeu.cli.environment import Environment
 from rejeu.errors import WorkerError
 from rejeu.experiments.folder import Job, again
@@ -262,11 +262,6 @@ def test_output_to_a_pipe_whose_encoding_lacks_a_character(registered_run, monke
     assert main(["evaluate", str(registered_run), "--episodes", "1"]) == 0
     pipe.flush()
     assert b" ? " in pipe.buffer.getvalue()
-
-
-def test_film_every_is_still_accepted():
-    command, arguments = parsing.parse(["train", "Pendulum-v1", "--film-every", "1e4"], COMMANDS, "")
-    assert (command, arguments.video_every) == ("train", 10_000)
 
 
 def test_a_folder_of_runs_names_the_newest_inside(registered_run, capsys):

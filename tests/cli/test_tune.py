@@ -38,7 +38,6 @@ def test_a_study_from_the_command_line(pretend, tmp_path, capsys):
     assert "search        learning_rate: 1e-05 to 0.004, logarithmic" in printed
     assert "trials        3 complete" in printed
     assert f"preset        {tmp_path / 'study' / 'preset.json'}" in printed
-    assert (tmp_path / "study" / "study.html").is_file()
 
 
 def test_the_final_comparison_is_announced_with_its_length(pretend, tmp_path, capsys):

@@ -10,9 +10,8 @@ import pytest
 
 from rejeu.agents import PPO
 from rejeu.envs.make import make_vector
-from rejeu.envs.workers.vector import checked_record
 from rejeu.errors import WorkerError
-from tests.worker_environments import Gated, Losable, Paced
+from tests.worker_environments import Gated, Losable, Paced, in_order
 
 
 @contextlib.contextmanager
@@ -38,7 +37,6 @@ def test_the_others_do_not_wait_for_a_slow_step(tmp_path):
         vector.send(ZERO)
         while 0 not in vector.receive().which:
             vector.send(ZERO)
-        np.testing.assert_array_equal(vector.arrivals[:2], [[1, 2]] * 2)
 
 
 def test_infos_are_those_of_the_results_that_were_taken():
@@ -93,9 +91,8 @@ def test_a_slow_reset_does_not_keep_the_others_waiting(tmp_path):
     with opened(functools.partial(Gated, tmp_path / "gate"), 2) as vector:
         vector.reset()
         slow.touch()
-        for _ in range(20):
-            turn()
-        assert np.bincount(vector.arrivals.ravel()).tolist() == [2, 18]  # the third step of the first ends its episode
+        taken = np.concatenate([turn()[0].which for _ in range(20)])
+        assert np.bincount(taken).tolist() == [2, 18]  # the third step of the first ends its episode
         slow.unlink()
         step, begun = turn()
         while 0 not in step.which:
@@ -138,22 +135,18 @@ def test_a_snapshot_keeps_the_results_that_wait():
         return rows
 
     with opened(functools.partial(Paced, 0.002)) as vector:
-        obs = vector.reset()
+        obs = in_order(vector).reset()
         play(vector, range(20))
         saved = vector.snapshot()
         obs = obs.copy()
         rest = play(vector, range(20, 40))
-        record = vector.arrivals
     assert len(saved["results"]) == 2
-    with opened(functools.partial(Paced, 0.002), arrivals=record) as again:
-        again.restore(saved, obs)
-        np.testing.assert_array_equal(again.arrivals, record[:20])
+    with opened(functools.partial(Paced, 0.002)) as again:
+        in_order(again).restore(saved, obs)
         for ours, theirs in zip(play(again, range(20, 40)), rest, strict=True):
             for left, right in zip(ours, theirs, strict=True):
                 np.testing.assert_array_equal(left, right)
     with opened(Paced, wait_for=2) as other, pytest.raises(ValueError, match="the run had wait_for=1"):
-        other.restore(saved, obs)
-    with opened(Paced, arrivals=record[::-1]) as other, pytest.raises(ValueError, match="of another run"):
         other.restore(saved, obs)
     with opened(Paced, wait_for=None) as other, pytest.raises(ValueError, match="wait_for=1"):
         other.restore(saved, obs)
@@ -181,29 +174,11 @@ def test_damaged_snapshots_are_refused(change, words):
             vector.restore(saved, obs)
 
 
-def test_at_the_end_of_a_record_results_are_taken_as_they_arrive():
-    with opened(Paced, 2, arrivals=[[1], [0]]) as vector:
-        vector.reset()
-        for expected in ([1], [0]):
-            vector.send(ZERO)
-            assert vector.receive().which.tolist() == expected
-        vector.send(ZERO)
-        with pytest.warns(RuntimeWarning, match="ends after 2 turns"):
-            vector.receive()
-
-
-@pytest.mark.parametrize("record", [[[0, 0]], [[1, 0]], [[0, 3]], [[-1, 0]], [0, 1], [[0.0, 1.0]], [[0]]])
-def test_other_arrays_are_no_record(record):
-    with pytest.raises(ValueError, match="arrivals"):
-        checked_record(record, 3, 2)
-
-
 @pytest.mark.parametrize(
     ("options", "words"),
     [
         ({"wait_for": 4}, "wait_for=4 must be a whole number of at least 1 and at most 3"),
         ({"wait_for": 2, "backend": "gymnasium"}, r"wait_for=2 is for worker processes.*'gymnasium-async' or 'ray'"),
-        ({"arrivals": [[0]]}, "give the wait_for of that run too"),
         ({"ray": {"num_cpus": 1}}, "is for backend='ray', got backend='gymnasium-async'"),
     ],
 )

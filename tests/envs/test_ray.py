@@ -25,7 +25,7 @@ from rejeu.errors import ClusterError, WorkerError
 from tests import ray_cluster
 from tests.environments import Reach
 from tests.helpers import assert_same_parameters, small_sac
-from tests.worker_environments import Faulty, Losable, Paced, Rules, UnsendableError, imports_jax, process_id
+from tests.worker_environments import Faulty, Losable, Paced, Rules, UnsendableError, imports_jax, in_order, process_id
 
 pytestmark = [
     pytest.mark.exhaustive,
@@ -111,7 +111,7 @@ def test_nothing_is_left_when_a_program_ends(tmp_path, ends):
             f"""
             import os, signal
             import rejeu
-            from tests.worker_environments import Paced, process_id
+            from tests.worker_environments import Paced, process_id, in_order
 
             def main():
                 env = rejeu.make_vector(Paced, 2, "ray")
@@ -229,11 +229,11 @@ def test_a_run_resumes_exactly(tmp_path):
     assert_same_parameters(whole, again)
 
 
-def test_a_run_in_actors_repeats_in_processes_from_its_record():
+def test_results_in_the_same_order_train_the_same_agent_in_actors_and_in_processes():
     with opened(functools.partial(Paced, 0.002), 3, wait_for=2) as env:
-        live, record = small_sac(env).learn(60), env.arrivals
-    with contextlib.closing(make_vector(Paced, 3, "gymnasium-async", seed=0, wait_for=2, arrivals=record)) as env:
-        again = small_sac(env).learn(60)
+        live = small_sac(in_order(env)).learn(60)
+    with contextlib.closing(make_vector(Paced, 3, "gymnasium-async", seed=0, wait_for=2)) as env:
+        again = small_sac(in_order(env)).learn(60)
     assert_same_parameters(live, again)
 
 

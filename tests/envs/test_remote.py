@@ -113,8 +113,8 @@ def test_results_are_taken_as_they_arrive():
         for _ in range(10):
             vector.send(np.zeros((3, 1), np.float32))
             step = vector.receive()
+            assert len(step.which) == 2
             vector.reset_done(step.terminated | step.truncated)
-        assert vector.arrivals.shape == (10, 2)
 
 
 def test_an_actor_that_never_ran_is_started_again(monkeypatch):

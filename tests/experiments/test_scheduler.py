@@ -250,47 +250,31 @@ def test_the_threads_of_a_sweep_are_fixed_when_it_begins(tmp_path):
     assert joined.sweep.threads == 1
 
 
-def older(job):
-    """A job as earlier versions wrote it."""
-    run = {key: job["run"][key] for key in ("env", "seed", "env_kwargs", "wrappers", "algorithm", "hyperparameters")}
-    return {"name": job["name"], "setting": job["setting"], **run, "options": {"envs": 4, "no_report": True, "log": []}}
-
-
-def test_a_sweep_of_an_earlier_version_is_read(tmp_path):
-    folder = make_folder(tmp_path, 1)
-    path = folder.path / "sweep.json"
-    content = json.loads(path.read_text(encoding="utf-8"))
-    content["jobs"] = [older(job) for job in content["jobs"]]
-    path.write_text(json.dumps(content), encoding="utf-8")
-    (job,) = read_folder(folder.path).jobs
-    assert job == Job(name="job-0", run=RunConfig(env="CartPole-v1", seed=0, n_envs=4), no_report=True)
-
-
 @pytest.mark.parametrize(
     ("key", "value", "problem"),
     [
         ("name", "../x", "jobs[0].name"),
         ("name", "job-1", "same name"),
         ("hyperparameters", {"a --import os": 1}, ""),
-        ("options", {"minutes": 10**400}, "out of range"),
-        ("options", {"ray": "evil.org:6379"}, "no file may name what is connected to; set RAY_ADDRESS"),
+        ("minutes", 10**400, "out of range"),
+        ("ray", "evil.org:6379", "no file may name what is connected to; set RAY_ADDRESS"),
         ("env", "evil:Env-v0", "name it again: --env evil:Env-v0"),
         ("wrappers", ["evil:Wrapper"], "--wrapper evil:Wrapper"),
         ("env_kwargs", {"path": "/etc/passwd"}, "imported or made with more than numbers"),
         ("env_kwargs", {"render_mode": "rgb_array", "--import": "evil.py"}, "env_kwargs"),
-        ("options", {"imports": ["evil.py"]}, "names what is imported"),
+        ("imports", ["evil.py"], "names what is imported"),
         ("env_argument", "evil.py", "names what is imported"),
         ("seed", -1, "seed"),
         ("seed", None, "has no seed"),
-        ("options", {"steps": 0}, "steps"),
+        ("steps", 0, "steps"),
     ],
 )
 def test_the_file_of_a_sweep_is_untrusted(tmp_path, key, value, problem):
     folder = make_folder(tmp_path)
     path = folder.path / "sweep.json"
     content = json.loads(path.read_text(encoding="utf-8"))
-    content["jobs"] = [older(job) for job in content["jobs"]]
-    content["jobs"][0][key] = value
+    job = content["jobs"][0]
+    (job if key in job else job["run"]).update({key: value})
     path.write_text(json.dumps(content), encoding="utf-8")
     with pytest.raises(CheckpointError) as raised:
         read_folder(folder.path)
@@ -319,7 +303,7 @@ def test_code_that_the_command_line_names_again_is_trusted(tmp_path):
 
 
 class Alone(Work):
-    """A run that no claim protects, such as a member of a population."""
+    """A run that no claim protects, of a work without a claim file."""
 
     def __init__(self, folder):
         self.name, self.run, self.log, self.lock = "alone", folder / "run", folder / "run.log", folder / "process.lock"

@@ -11,13 +11,13 @@ from types import SimpleNamespace
 import pytest
 
 from rejeu import presets
+from rejeu.algorithms.search import LogUniform
 from rejeu.errors import CheckpointError
 from rejeu.experiments import process, search, study as studies, study_plan as plans, tune as tuning
 from rejeu.experiments.search import Search
 from rejeu.experiments.study import StudyFolder
 from rejeu.interrupt import Interrupt
 from rejeu.runs.config import RunConfig
-from rejeu.tuning import LogUniform
 
 optuna = pytest.importorskip("optuna")
 

@@ -6,10 +6,10 @@ import json
 import pytest
 
 from rejeu import presets
+from rejeu.algorithms.search import Integers, LogUniform
 from rejeu.errors import CheckpointError
 from rejeu.experiments import study_plan as plans
 from rejeu.io.records import json_text
-from rejeu.tuning import Integers, LogUniform
 
 
 def test_a_plan_takes_what_is_not_said_from_the_preset():

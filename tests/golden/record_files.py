@@ -1,14 +1,11 @@
 """Records files of the current schema and their contents for ``tests/io/test_schemas.py``.
 
-Run it once for each released schema, with the code that writes it::
+Run it when the schema changes, with the folder removed::
 
     python tests/golden/record_files.py
 
-It writes the folder ``schema<number>`` to its own folder: models, a replay buffer and normalization statistics as saved
-by rejeu, and ``expected.npz``, which contains the same arrays and the predictions of the models without rejeu's format.
-It also writes the folder ``replay_without_counters``: a replay buffer in the newer format, which omits what follows
-from the kinds of the rows, and the same expected arrays. An existing folder is never overwritten, because its files
-represent those of users.
+It writes the folder ``files`` beside this script: models, a replay buffer and normalization statistics as saved by rejeu,
+and ``expected.npz``, which contains the same arrays and the predictions of the models without rejeu's format.
 """
 
 from __future__ import annotations
@@ -22,7 +19,6 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
 import rejeu
-from rejeu.io import checkpoint
 from rejeu.sb3.common.vec_env import DummyVecEnv, VecNormalize
 from tests.environments import Counter, Reach, Sampled
 
@@ -58,25 +54,13 @@ def flat(agent: rejeu.Agent) -> np.ndarray:
     return np.concatenate([arrays[name].ravel().astype(np.float64) for name in sorted(arrays)])
 
 
-def replay_agent(strategy: str = "future") -> rejeu.SAC:
+def replay_agent() -> rejeu.SAC:
     """Returns an agent with an empty buffer of the recorded kind."""
-    kwargs = {"goal_selection_strategy": strategy}
-    settings = {**OFF_POLICY, "learning_starts": 10**6, **HINDSIGHT, "replay_buffer_kwargs": kwargs}
+    settings = {**OFF_POLICY, "learning_starts": 10**6, **HINDSIGHT}
     return rejeu.SAC("MultiInputPolicy", Reach(), **settings)
 
 
-def kept_counters(agent: rejeu.SAC) -> dict[str, np.ndarray]:
-    """Returns the counters of the stored rows, oldest first, of a buffer with hindsight's strategy ``episode``."""
-    ring = agent.replay_buffer.ring
-    times = np.arange(ring.oldest()[0], ring.head[0] + 1)
-    index = times % ring.rows
-    return {
-        "since_start": np.minimum(ring.since_start[index], times - times[0]),
-        "until_end": ring.until_end[index],
-    }
-
-
-def record_schema(folder: Path) -> None:
+def record(folder: Path) -> None:
     """Writes files of every kind."""
     expected: dict[str, np.ndarray] = {}
     for name, agent in models().items():
@@ -98,25 +82,7 @@ def record_schema(folder: Path) -> None:
     np.savez_compressed(folder / "expected.npz", **expected)
 
 
-def record_replay(folder: Path) -> None:
-    """Writes a replay buffer that has overwritten its first steps, and the counters recorded during the steps."""
-    agent = replay_agent("episode").learn(63)
-    agent.save_replay_buffer(folder / "replay.safetensors")
-    np.savez_compressed(folder / "expected.npz", **agent.replay_buffer.arrays(), **kept_counters(agent))
-
-
-def main() -> None:
-    """Writes the missing folders and prints the sizes of their files."""
-    here = Path(__file__)
-    for name, record in ((f"schema{checkpoint.SCHEMA}", record_schema), ("replay_without_counters", record_replay)):
-        folder = here.with_name(name)
-        if folder.exists():
-            continue
-        folder.mkdir()
-        record(folder)
-        for path in sorted(folder.iterdir()):
-            print(name, path.name, path.stat().st_size, "bytes")
-
-
 if __name__ == "__main__":
-    main()
+    folder = Path(__file__).with_name("files")
+    folder.mkdir()
+    record(folder)

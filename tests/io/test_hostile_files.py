@@ -17,7 +17,7 @@ from rejeu.sb3.common.vec_env import DummyVecEnv, VecNormalize
 from tests import hostile_files
 from tests.environments import Counter
 from tests.golden import record_files
-from tests.io.test_schemas import FOLDERS, WITHOUT_COUNTERS
+from tests.io.test_schemas import FILES as RECORDED
 from tests.tiers import only
 
 SECONDS = 2.0
@@ -25,10 +25,9 @@ SECONDS = 2.0
 MEGABYTES = 64
 """Most memory that any file may take, beyond what was in use."""
 FILES = {
-    "agent": FOLDERS[-1] / "sac",
-    "replay": WITHOUT_COUNTERS / "replay",
-    "replay with counters": FOLDERS[-1] / "replay",
-    "vec_normalize": FOLDERS[-1] / "vec_normalize",
+    "agent": RECORDED / "sac",
+    "replay": RECORDED / "replay",
+    "vec_normalize": RECORDED / "vec_normalize",
 }
 """A valid file of each kind, which is the first word."""
 CONTENTS = {kind: path.with_suffix(".safetensors").read_bytes() for kind, path in FILES.items()}
@@ -128,7 +127,7 @@ def test_a_hostile_file_takes_little_memory(kind, loaders, tmp_path):
 
 def test_a_refused_file_leaves_the_parameters_as_they_were(tmp_path):
     """The same for ``set_parameters``, which gets behind the header: only the arrays count there."""
-    agent = rejeu.load(FOLDERS[-1] / "sac.safetensors")
+    agent = rejeu.load(RECORDED / "sac.safetensors")
     before, path = agent.get_parameters(), tmp_path / "hostile.safetensors"
     for variant in hostile_files.bad_arrays(CONTENTS["agent"]):
         path.write_bytes(variant.content)
@@ -227,7 +226,7 @@ def test_a_hole_makes_no_room_for_a_space_or_a_network(tmp_path):
 
 @pytest.mark.parametrize("path", ["", ".", "..", "/", "a/..", Path()])
 def test_a_path_that_names_no_file_is_refused_on_one_line(path, tmp_path, monkeypatch):
-    agent = rejeu.load(FOLDERS[-1] / "sac.safetensors")
+    agent = rejeu.load(RECORDED / "sac.safetensors")
     monkeypatch.chdir(tmp_path)
     words = r"^'.*' is (a folder without a model; a run|not the path of a file; give one, such as).*$"
     for load in (rejeu.load, rejeu.SAC.load):
@@ -240,7 +239,7 @@ def test_a_path_that_names_no_file_is_refused_on_one_line(path, tmp_path, monkey
 
 
 def test_a_path_that_is_too_long_is_refused_in_a_few_words(tmp_path):
-    agent = rejeu.load(FOLDERS[-1] / "sac.safetensors")
+    agent = rejeu.load(RECORDED / "sac.safetensors")
     for path in (tmp_path / ("a" * 5000), "b/" * 5000 + "c"):
         for call in (rejeu.load, agent.set_parameters):
             with pytest.raises(CheckpointError, match=r"cannot be read: .*long") as caught:
@@ -266,7 +265,7 @@ def test_the_environment_of_a_file_is_only_looked_for_among_those_that_are_regis
 
 
 def test_what_the_caller_gives_is_not_blamed_on_the_file():
-    path = FOLDERS[-1] / "sac.safetensors"
+    path = RECORDED / "sac.safetensors"
     with pytest.raises(ValueError, match="gamma=7 must be") as caught:
         rejeu.load(path, gamma=7)
     assert not isinstance(caught.value, CheckpointError)

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 import rejeu
-from tests.io.test_schemas import FOLDERS
+from tests.io.test_schemas import FILES
 
 ROOT = Path(__file__).parents[2]
 SOURCE = Path(rejeu.__file__).parent
@@ -103,7 +103,7 @@ print(json.dumps(seen))
 def seen(tmp_path_factory) -> dict:
     """What was run, compiled, imported or started while a process read each kind of file, and a pickle at last."""
     folder = tmp_path_factory.mktemp("files")
-    for path in FOLDERS[-1].glob("*.safetensors"):
+    for path in FILES.glob("*.safetensors"):
         shutil.copy(path, folder)
     (folder / "evil.pkl").write_bytes(pickle.dumps(print))
     result = subprocess.run(

@@ -377,7 +377,7 @@ class Agent(BaseAgent):
         self.drop_rollout()
 
     def summary(self) -> str:
-        """Returns a drawing of the networks in text, with their numbers of parameters; see :mod:`rejeu.reporting.summary`."""
+        """Returns a table of the networks, their layers and numbers of parameters; see :mod:`rejeu.reporting.summary`."""
         return summary.describe(self.learner.shapes, self.obs_leaves)
 
 

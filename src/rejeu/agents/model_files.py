@@ -11,13 +11,12 @@ import numpy as np
 from msgspec import Meta
 
 from rejeu import devices, spaces, xla
-from rejeu.agents.base import AGENT_ARGUMENTS, BEST_WINDOW, BaseAgent
+from rejeu.agents.base import AGENT_ARGUMENTS, BaseAgent
 from rejeu.algorithms import config as configs
 from rejeu.envs.registry import are_plain, is_plain_id
 from rejeu.errors import CheckpointError, MissingObjectError
 from rejeu.io import checkpoint
 from rejeu.io.records import WRONG, Positive, Seed, brief, convert
-from rejeu.networks import settled
 
 if TYPE_CHECKING:
     from rejeu.envs.make import VectorEnv
@@ -39,7 +38,7 @@ class Counters(msgspec.Struct):
     steps_before: Count32
     episode: Count32
     n_updates: Count32
-    episodes_before: Count32 = 0  # missing in older files
+    episodes_before: Count32
 
 
 class GeneratorState(msgspec.Struct):
@@ -61,7 +60,7 @@ class AgentHeader(msgspec.Struct, kw_only=True):
     counters: Counters
     rng: GeneratorState
     success_threshold: float | None = None
-    best_window: Positive = BEST_WINDOW
+    best_window: Positive
 
 
 class Saved(NamedTuple):
@@ -89,8 +88,7 @@ def interpret(header: Mapping[str, Any], room: int, kind: Any, changes: Mapping[
     """
     try:
         saved = convert(header, AgentHeader)
-        said = _with_widths(saved.config, kind)
-        config = configs.rebuild(kind, said, configs.own_changes(said, changes))
+        config = configs.rebuild(kind, saved.config, configs.own_changes(saved.config, changes))
         largest = max(spaces.MAX_NUMBERS, room)
         observation_space = spaces.rebuild(saved.observation_space, largest)
         spaces.check_policy(saved.policy, observation_space, config.policy_kwargs.normalize_images)
@@ -100,7 +98,9 @@ def interpret(header: Mapping[str, Any], room: int, kind: Any, changes: Mapping[
     except WRONG as error:
         raise CheckpointError(f"the header is damaged or of another version: {brief(error)}") from None
     check_depths(config)
-    return Saved(saved, configs.rebuild(kind, said, changes) if changes else config, observation_space, action_space)
+    return Saved(
+        saved, configs.rebuild(kind, saved.config, changes) if changes else config, observation_space, action_space
+    )
 
 
 def check_space(description: Any, own: gym.Space, kind: str) -> None:
@@ -116,16 +116,6 @@ def check_space(description: Any, own: gym.Space, kind: str) -> None:
     other = spaces.rebuild(description, max(spaces.MAX_NUMBERS, sum(leaf.nbytes for leaf in spaces.leaves(own))))
     if not spaces.same(other, own, bounds=kind == "action"):
         raise ValueError(f"it is of the {kind} space {other}, and this agent was made for {own}")
-
-
-def _with_widths(config: Any, kind: Any) -> dict[str, Any]:
-    """Returns the configuration of a file with the widths of hidden layers that it leaves to the default.
-
-    Only older files leave them out, from when the default did not depend on the observation.
-    """
-    shape = config.get("policy_kwargs")
-    shape = {} if shape is None else shape
-    return {**config, "policy_kwargs": {**shape, **settled(shape, kind.hidden_layers)}}
 
 
 def check_depths(config: Any) -> None:

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import re
 import secrets
-import shutil
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -213,33 +212,6 @@ def _remove(path: Path) -> None:
 
 UPDATES = 3
 """Number of the arithmetic of updates; a change that rounds anything differently raises it."""
-
-
-def copy_run(source: Path, target: Path, seed: int) -> None:
-    """Writes the newest checkpoint in a folder to a new one, as a run with random numbers of its own.
-
-    Networks, optimizers and replay buffer are the same. Exploration, batches, evaluations and the environments, which begin
-    new episodes, draw from ``seed``, so that two copies of a run are trained to different agents.
-    """
-    path = run_files(source)[0]
-    with checkpoint.opened(path, "run") as file:
-        header, arrays = file.header, file.read()
-    saved = records.decode(header["run"], arrays)
-    saved |= {
-        "rng": np.random.default_rng(seed).bit_generator.state,
-        "seed": seed,
-        "reason": "it is a copy of another run",
-    }
-    saved |= {"envs": None, "obs": None, "action": None}
-    kept = {name: array for name, array in arrays.items() if not name.startswith("run.")}
-    if "state.key" in kept:  # of the updates
-        kept["state.key"] = np.random.SeedSequence(seed).generate_state(2).astype(kept["state.key"].dtype)
-    header = {key: value for key, value in header.items() if key not in checkpoint.RESERVED}
-    header |= {"seed": seed, "run_id": secrets.token_hex(8), "run": records.encode(saved, kept, "run")}
-    atomic.make_folder(target)
-    for name in header["rows"]:
-        shutil.copy(source / name, target / name)
-    checkpoint.write(target / path.name, "run", kept, header)
 
 
 def versions() -> dict[str, Any]:

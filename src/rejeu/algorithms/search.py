@@ -131,9 +131,6 @@ def plain(value: Any) -> str:
     return json.dumps(json.loads(json.dumps(value), parse_int=float), sort_keys=True)
 
 
-FIXED_AT_START = ("policy_kwargs", "replay_buffer_kwargs", "n_steps", "learning_starts")
-"""Hyperparameters that population-based training does not change: they change shapes, or act only when training starts."""
-
 OFF_POLICY: SearchSpace = {
     "learning_rate": LogUniform(1e-5, 1e-2),
     "gamma": NearOne(0.9, 0.9999),

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from rejeu.buffers.ring import COUNTERS, Ring
+from rejeu.buffers.ring import Ring
 
 
 def arrays(ring: Ring) -> dict[str, np.ndarray]:
@@ -23,8 +23,6 @@ def arrays(ring: Ring) -> dict[str, np.ndarray]:
 
 def restore(ring: Ring, arrays: Mapping[str, np.ndarray]) -> None:
     """Restores the result of :func:`arrays`; everything is checked before anything is changed.
-
-    Arrays of ``COUNTERS``, which older files hold, are computed again.
 
     Raises:
         ValueError: if names, shapes or dtypes are not those of this ring.
@@ -46,8 +44,7 @@ def check(ring: Ring, found: Mapping[str, Any]) -> None:
         ValueError: if names, shapes or dtypes are others, or there are more rows than this ring has.
     """
     own = ring.stored()
-    counters = {*COUNTERS} if {*COUNTERS} <= {*found} else set()
-    if differing := {*found} ^ {*own, *counters, "head", "n_steps"}:
+    if differing := {*found} ^ {*own, "head", "n_steps"}:
         raise ValueError(f"the replay file and this buffer differ in the arrays {', '.join(sorted(differing))[:200]}")
     head, n_steps = found["head"], found["n_steps"]
     if head.shape != (ring.n_envs,) or n_steps.shape != (ring.n_envs,):
@@ -58,7 +55,6 @@ def check(ring: Ring, found: Mapping[str, Any]) -> None:
         raise ValueError("the replay file's counters are damaged")
     n_envs, used = ring.n_envs, min((*found["kind"].shape, 0, 0)[1], ring.rows)
     expected = {name: ((n_envs, used, *array.shape[1:]), array.dtype) for name, array in own.items()}
-    expected |= dict.fromkeys(counters, ((n_envs, used), np.dtype(np.int32)))
     check_specs(found, expected, "the replay file")
 
 
@@ -86,8 +82,6 @@ def rows_since(ring: Ring, heads: np.ndarray) -> dict[str, np.ndarray]:
 
 def put_rows(ring: Ring, parts: Sequence[Mapping[str, np.ndarray]]) -> None:
     """Restores successive results of :func:`rows_since`, each beginning where the one before ended, or earlier.
-
-    An array ``since_start``, which older files hold, is ignored.
 
     Raises:
         ValueError: if they are of another ring, or rows are missing; the ring is then empty.
@@ -118,7 +112,7 @@ def check_rows(ring: Ring, found: Mapping[str, Any]) -> None:
         ValueError: if names, shapes or dtypes are others, or there are more rows than the ring has.
     """
     own = ring.stored()
-    if {*found} - {"since_start"} != {*own, "first", "head"}:
+    if {*found} != {*own, "first", "head"}:
         raise ValueError(
             f"rows of the replay buffer hold {', '.join(sorted(found))[:200]}, expected "
             f"{', '.join(sorted({*own, 'first', 'head'}))}"
@@ -126,8 +120,6 @@ def check_rows(ring: Ring, found: Mapping[str, Any]) -> None:
     n = found["kind"].shape[0] if found["kind"].shape else 0
     expected = {name: ((n, *array.shape[1:]), array.dtype) for name, array in own.items()}
     expected |= dict.fromkeys(("first", "head"), ((ring.n_envs,), np.dtype(np.int64)))
-    if "since_start" in found:
-        expected["since_start"] = ((n,), np.dtype(np.int32))
     check_specs(found, expected, "rows of the replay buffer")
     if n > ring.rows * ring.n_envs:
         raise ValueError(f"there are {n:,} rows, and the replay buffer has {ring.rows * ring.n_envs:,}")

@@ -16,7 +16,7 @@ from rejeu.callbacks.base import Callback, TrainingCallback
 from rejeu.callbacks.checkpoint import Checkpoint
 from rejeu.callbacks.evaluate import Evaluate, Evaluated
 from rejeu.callbacks.progress_bar import ProgressBar
-from rejeu.callbacks.record_video import Film, RecordVideo
+from rejeu.callbacks.record_video import RecordVideo
 from rejeu.loops.run import Episode, Progress
 from rejeu.validation import whole
 
@@ -25,7 +25,6 @@ __all__ = [
     "Checkpoint",
     "Evaluate",
     "Evaluated",
-    "Film",
     "ProgressBar",
     "RecordVideo",
     "TrainingCallback",

@@ -21,8 +21,6 @@ HIDDEN = (
     "rejeu.callbacks.TrainingCallback with every_step = True"
 )
 """What is added to the error of a callback that needs what a chunk hides."""
-RENAMED_CALLBACKS = {"Film": "RecordVideo"}
-"""Classes of callbacks that older checkpoints know by another name."""
 
 
 class TrainingCallback(ABC):
@@ -166,7 +164,7 @@ def unpacked(saved: Sequence[tuple[str, Any]], callbacks: Sequence[Callback]) ->
     for name, state in saved:
         try:
             inside = state["inside"] if name == "CallbackList" and name not in given else [(name, state)]
-            states += [(RENAMED_CALLBACKS.get(inner, inner), part) for inner, part in inside]
+            states += [(inner, part) for inner, part in inside]
         except WRONG as error:
             raise CheckpointError(f"the saved state of {name} is damaged: {brief(error)}") from error
     return states

@@ -134,7 +134,7 @@ class Evaluate(TrainingCallback):
         ends = np.cumsum(state["counts"])[:-1]
         returns, lengths, successes = (np.split(state[key], ends) for key in EVALUATED)
         steps = state["steps"]
-        cut = state.get("cut", np.zeros_like(steps))  # earlier versions did not save it
+        cut = state["cut"]
         parts = zip(steps.tolist(), returns, lengths, successes, cut.tolist(), strict=False)
         self.results = [Evaluated(step, Evaluation(r, n.astype(int), s, c)) for step, r, n, s, c in parts]
         self.best = None if state["best"] is None else self.results[state["best"]]

@@ -89,7 +89,3 @@ class RecordVideo:
         """Restores what :meth:`state_dict` returned."""
         self._n_episodes = int(state["n_episodes"])
         self.paths = [Path(path) for path in state["paths"]]
-
-
-Film = RecordVideo
-"""The earlier name."""

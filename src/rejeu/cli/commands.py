@@ -145,7 +145,7 @@ class Sweep:
 
 @dataclass(frozen=True)
 class Resume(RunOptions):
-    """Resumes a run that was stopped, or that crashed, from its newest checkpoint; or a sweep, a study or a population.
+    """Resumes a run that was stopped, or that crashed, from its newest checkpoint; or a sweep or a study.
 
     Without --steps or --minutes it trains to the goal that was set when it began. Example: rejeu resume runs/NAME
     """
@@ -154,7 +154,7 @@ class Resume(RunOptions):
     finish: bool = False
     """Of a complete run whose process ended before all files were written: write them, rather than report an error."""
     workers: Several = None
-    """Of a sweep, a study or a population: runs at once; by default half as many as there are cores."""
+    """Of a sweep or a study: runs at once; by default half as many as there are cores."""
     ray: Annotated[str | None, Shown("ADDRESS")] = None
     """Of a sweep, or of a run with --backend ray: use this Ray cluster, auto or HOST:PORT."""
     steps: Count = None
@@ -175,8 +175,11 @@ class Resume(RunOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Search(EnvironmentOptions):
-    """What studies and populations search, and how each agent is trained. Abstract."""
+class Tune(EnvironmentOptions):
+    """Searches hyperparameters with Optuna, and compares the best ones with the default on fresh seeds.
+
+    Ctrl-C stops cleanly; rejeu resume continues. Example: rejeu tune Pendulum-v1 --algo SAC --trials 30
+    """
 
     env: EnvironmentId
     """Id of an environment, as for rejeu train."""
@@ -194,7 +197,7 @@ class Search(EnvironmentOptions):
     only: Annotated[Assignments, Shown("NAME ...")] = ()
     """Search these hyperparameters and no others."""
     measure: Annotated[Literal["return", "success"], Shown("{return,success}")] = "return"
-    """Maximize the mean return of the last evaluation of a trial or round, or its success rate."""
+    """Maximize the mean return of the last evaluation of a trial, or its success rate."""
     evaluate_episodes: EpisodeCount = None
     checkpoint_minutes: Annotated[float, Meta(ge=0), Shown("M")] = 5.0
     """Minutes between two checkpoints of a training; 0 for none."""
@@ -202,16 +205,6 @@ class Search(EnvironmentOptions):
     """Determines what is sampled and the seeds of all trainings."""
     workers: Several = None
     """Agents trained at once; by default half as many as there are cores."""
-    json: Json = False
-
-
-@dataclass(frozen=True, kw_only=True)
-class Tune(Search):
-    """Searches hyperparameters with Optuna, and compares the best ones with the default on fresh seeds.
-
-    Ctrl-C stops cleanly; rejeu resume continues. Example: rejeu tune Pendulum-v1 --algo SAC --trials 30
-    """
-
     trials: Annotated[int, Meta(ge=1, le=100_000), Shown("N")] = 30
     """How many trials; of a study that exists, how many in all."""
     steps: Count = None
@@ -226,23 +219,7 @@ class Tune(Search):
     """Stop trials that are below the median of the others, or by successive halving, or none."""
     out: Folder = None
     """Study folder; an existing one is continued or joined. By default a new one under runs."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Pbt(Search):
-    """Trains a population: after each round the worst members copy the best, and their hyperparameters are perturbed.
-
-    Ctrl-C stops cleanly; rejeu resume continues. Example: rejeu pbt Pendulum-v1 --algo SAC --members 8 --round-steps 5000
-    """
-
-    members: Annotated[int, Meta(ge=2, le=1000), Shown("K")] = 8
-    """Agents that are trained."""
-    rounds: Annotated[int, Meta(ge=1, le=100_000), Shown("N")] = 10
-    """Rounds of training."""
-    round_steps: Annotated[Positive, Shown("N")] = 10_000
-    """Environment steps of each member in a round."""
-    out: Folder = None
-    """Folder of the population, new or empty; by default a new one under runs."""
+    json: Json = False
 
 
 @dataclass(frozen=True)
@@ -521,7 +498,7 @@ class Pull:
     json: Json = False
 
 
-OF_RUNS = (Train, Clone, Tune, Pbt, Resume, Sweep, Evaluate, Record, Export, Play, Watch)
+OF_RUNS = (Train, Clone, Tune, Resume, Sweep, Evaluate, Record, Export, Play, Watch)
 OTHERS = (Check, List, Compare, Runs, Status, Course, Report, Class, Import, Push, Pull)
 COMMANDS: dict[str, Callable[..., Any]] = {kind.__name__.lower(): kind for kind in (*OF_RUNS, *OTHERS)}
 """The arguments of each command, by its name."""
@@ -532,7 +509,6 @@ MODULES = {
     "evaluate": "models",
     "export": "models",
     "import": "models",
-    "pbt": "tune",
     "play": "models",
     "pull": "models",
     "push": "models",

@@ -17,8 +17,6 @@ from typing import Any, Literal, NoReturn, get_args, get_origin
 from rejeu.runs.config import Option, assigned, options
 from rejeu.validation import field_docs, number, whole
 
-OLDER = {"--film-every": "--video-every"}
-"""Options of earlier versions, which are still accepted."""
 ELSEWHERE = {
     "--env": "the environment is given without an option: rejeu {command} ENV",
     "--lr": "hyperparameters are given as --set learning_rate=1e-3",
@@ -138,15 +136,14 @@ def make_parser(command: str, kind: type, known: Iterable[Option], with_help: ob
 
 
 def normalized(word: str) -> str:
-    """Returns a word as ``argparse`` reads it: options by their present names, with dashes, and numbers without exponents.
+    """Returns a word as ``argparse`` reads it: options with dashes, and numbers without exponents.
 
-    >>> [normalized(word) for word in ("--evaluate_every=5", "--film-every", "-1e3", "-1e-5", "a_b")]
-    ['--evaluate-every=5', '--video-every', '-1000.0', '-0.00001', 'a_b']
+    >>> [normalized(word) for word in ("--evaluate_every=5", "-1e3", "-1e-5", "a_b")]
+    ['--evaluate-every=5', '-1000.0', '-0.00001', 'a_b']
     """
     if word.startswith("--"):
         name, equals, text = word.partition("=")
-        name = name.replace("_", "-")
-        return OLDER.get(name, name) + equals + text
+        return name.replace("_", "-") + equals + text
     if word.startswith("-"):
         with suppress(ValueError):
             return f"{int(word)}" if word[1:].isdecimal() else f"{Decimal(repr(float(word))):f}"

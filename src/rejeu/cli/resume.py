@@ -17,7 +17,6 @@ from rejeu.cli.output import Stopwatch, echo
 from rejeu.cli.session import Limits, Session, has_reached_goal, make_evaluation_env
 from rejeu.envs.make import WorkerOptions
 from rejeu.experiments.folder import is_sweep
-from rejeu.experiments.population import FILE
 from rejeu.experiments.study import StudyFolder
 from rejeu.interrupt import Interrupt
 from rejeu.reporting.logging import require
@@ -28,7 +27,7 @@ from rejeu.runs.folder import RunFolder, read_config
 
 
 def run_resume(arguments: Resume) -> tuple[int, dict[str, Any]]:
-    """Trains, as ``rejeu train``, ``rejeu sweep``, ``rejeu tune`` or ``rejeu pbt`` does.
+    """Trains, as ``rejeu train``, ``rejeu sweep`` or ``rejeu tune`` does.
 
     Raises:
         ValueError: for options of a sweep with the folder of a run.
@@ -37,8 +36,6 @@ def run_resume(arguments: Resume) -> tuple[int, dict[str, Any]]:
         return sweep.resume(arguments)
     if StudyFolder(arguments.run).plan.is_file():
         return tune.resume_study(arguments)
-    if (arguments.run / FILE).is_file():
-        return tune.resume_population(arguments)
     if arguments.workers is not None:
         raise ValueError(f"{arguments.run} is a single run; --workers is for the folder of a sweep or a study")
     return resume(arguments)

@@ -29,7 +29,7 @@ from rejeu.reporting.history import EpisodeTable
 from rejeu.reporting.logging import CsvFile, RetryingSink, Sink, check_logs, guarded, open_log, require
 from rejeu.reporting.video import ffmpeg
 from rejeu.runs.config import DecidedRun, quoted
-from rejeu.runs.folder import RunFolder, write_arrivals as write_order
+from rejeu.runs.folder import RunFolder
 
 VIDEO_EPISODES = 3
 VIDEO_STEPS = 600
@@ -265,16 +265,8 @@ def saved_at_exit(agent: Agent, folder: RunFolder, evaluate: Evaluate) -> Iterat
         save_model(agent, folder.agent)
         raise
     finally:
-        write_arrivals(agent, folder)
         write = partial(agent.history.write_csv, folder.episodes)
         agent.failed_writes.attempt(f"table {folder.episodes}", write)
-
-
-def write_arrivals(agent: Agent, folder: RunFolder) -> None:
-    """Writes the order in which the results of environments were taken, if they did not wait for each other."""
-    if agent.run.env is not None and (arrivals := agent.run.env.arrivals) is not None:
-        write = partial(write_order, folder, arrivals)
-        agent.failed_writes.attempt(f"order of arrival {folder.arrivals}", write)
 
 
 def save_model(agent: Agent, path: Path) -> None:

@@ -28,7 +28,7 @@ from rejeu.interrupt import Interrupt
 from rejeu.presets import Preset
 from rejeu.runs import config as runs
 from rejeu.runs.config import DecidedRun, merged
-from rejeu.runs.folder import RunFolder, check_free, create, read_arrivals
+from rejeu.runs.folder import RunFolder, check_free, create
 from rejeu.spaces import leaves
 
 MANY = 64
@@ -110,8 +110,7 @@ def make_env(arguments: Train, made: Environment, preset: Preset | None, seed: i
     if backend == "envpool" and not is_envpool_installed() and (made.is_registered() or provider(made.env_id)):
         backend = "gymnasium"
     backend = arguments.backend or backend
-    order = None if arguments.arrivals is None else read_arrivals(Path(arguments.arrivals))
-    workers = WorkerOptions(restart_workers=arguments.restart_workers, wait_for=arguments.wait_for, arrivals=order)
+    workers = WorkerOptions(restart_workers=arguments.restart_workers, wait_for=arguments.wait_for)
     if backend == "ray" or arguments.ray is not None:
         workers = workers._replace(ray={"address": arguments.ray, "num_cpus": arguments.env_cpus})
     return made.vector(n_envs, backend, seed, workers)

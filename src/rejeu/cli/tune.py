@@ -1,24 +1,19 @@
-"""``rejeu tune`` and ``rejeu pbt``: searches of hyperparameters and populations, which ``rejeu resume`` continues."""
+"""``rejeu tune``: searches of hyperparameters, which ``rejeu resume`` continues."""
 
 from __future__ import annotations
 
 import dataclasses
-import re
-import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 from rejeu.agents import AGENTS, find_agent, find_preset, modules_of
 from rejeu.algorithms.search import Dimension
 from rejeu.cli import environment
-from rejeu.cli.commands import Pbt, Resume, Tune
+from rejeu.cli.commands import Resume, Tune
 from rejeu.cli.environment import Environment
 from rejeu.cli.output import echo
-from rejeu.experiments import population as populations, space, study as studies, study_plan as plans, tune as tuning
-from rejeu.experiments.population import Members
-from rejeu.experiments.process import default_workers
+from rejeu.experiments import space, study as studies, study_plan as plans, tune as tuning
 from rejeu.experiments.search import Watch
 from rejeu.experiments.study import Outcome, Study, StudyFolder
 from rejeu.experiments.study_plan import Plan
@@ -27,7 +22,6 @@ from rejeu.interrupt import NAMES, Interrupt
 from rejeu.reporting import formatting
 from rejeu.reporting.formatting import counted, number
 from rejeu.runs.config import RunConfig, apply, quoted
-from rejeu.runs.folder import check_free
 
 
 def run_tune(arguments: Tune) -> tuple[int, dict[str, Any]]:
@@ -63,7 +57,7 @@ def resume_study(arguments: Resume) -> tuple[int, dict[str, Any]]:
     return complete(study, environment_of(study.plan, "a study", arguments), arguments.workers)
 
 
-def usable_environment(arguments: Tune | Pbt) -> Environment:
+def usable_environment(arguments: Tune) -> Environment:
     """Returns the environment that the command line names, after one was made."""
     made = environment.from_arguments(arguments.env, arguments)
     made.vector(1, arguments.backend or "auto", arguments.seed).close()
@@ -71,7 +65,7 @@ def usable_environment(arguments: Tune | Pbt) -> Environment:
 
 
 def environment_of(plan: Plan, what: str, arguments: Resume) -> Environment:
-    """Returns the environment of a study or a population.
+    """Returns the environment of a study.
 
     Raises:
         CheckpointError: if the command line must name it again.
@@ -83,8 +77,8 @@ def environment_of(plan: Plan, what: str, arguments: Resume) -> Environment:
     return made
 
 
-def shared(arguments: Tune | Pbt, made: Environment) -> dict[str, Any]:
-    """Returns the arguments of a plan that studies and populations share."""
+def shared(arguments: Tune, made: Environment) -> dict[str, Any]:
+    """Returns the arguments of a plan that come from the options."""
     name = None if arguments.algo is None else find_agent(arguments.algo).algorithm.Config.name
     preset = find_preset(made.env_id, name, arguments.preset)
     algorithm = name if preset is None else preset.algorithm
@@ -184,70 +178,3 @@ def header(study: Study, made: Environment) -> list[str]:
         *([f"at the end    the best trial and the default: {tuning.announcement(plan)}"] if plan.final_seeds else []),
         f"study folder  {study.folder.path}",
     ]
-
-
-def run_pbt(arguments: Pbt) -> tuple[int, dict[str, Any]]:
-    """Trains a population; the exit status is 0, 1 if a run could not be started, 130 after Ctrl-C, 143 after SIGTERM."""
-    check_free(arguments.out)
-    made = usable_environment(arguments)
-    population = populations.make(
-        arguments.rounds, arguments.round_steps, arguments.members, env_id=made.env_id, **shared(arguments, made)
-    )
-    name = re.sub(r"[^\w.-]+", "-", f"pbt-{made.env_id}-{population.plan.algorithm}-{time.strftime('%Y%m%d-%H%M%S')}")
-    members = populations.create(arguments.out or Path("runs") / name, population)
-    return train(members, made, arguments.workers)
-
-
-def resume_population(arguments: Resume) -> tuple[int, dict[str, Any]]:
-    """Continues the population of a folder; returns the exit status and the result.
-
-    Raises:
-        ValueError: for options of a run, or an environment that is not that of the population.
-    """
-    if arguments.steps is not None or arguments.minutes is not None or arguments.hyperparameters:
-        raise ValueError(f"{arguments.run} is a population of rejeu pbt; leave out --steps, --minutes and --set")
-    members = populations.read(arguments.run)
-    made = environment_of(members.population.plan, "a population", arguments)
-    return train(members, made, arguments.workers)
-
-
-def train(members: Members, made: Environment, workers: int | None) -> tuple[int, dict[str, Any]]:
-    """Trains a population to its end; returns the exit status and the result."""
-    population, plan = members.population, members.population.plan
-    at_once = min(workers or default_workers(), population.members)
-    echo(f"environment   {made}, {plan.n_envs} at once")
-    echo(f"algorithm     {plan.algorithm}, seed {plan.seed}")
-    echo(f"population    {population.members} members, {population.rounds} rounds of {plan.evaluate_every:,} steps")
-    for i, (name, dimension) in enumerate(plan.search_space.items()):
-        echo(f"{'changing' if i == 0 else '':<14}{name}: {dimension}")
-    echo(f"folder        {members.path}")
-    with members.lock(), Interrupt() as stop:
-        complete = populations.train(members, common(made, plan.algorithm), at_once, stop, echo)
-    result = as_dict(members, complete, stop.signal)
-    if stop.signal is not None or not complete:
-        why = "not complete" if stop.signal is None else f"stopped by {NAMES[stop.signal]}"
-        echo(f"{why}; rejeu resume {quoted(members.path)}{made.run.again()} continues")
-        return 1 if stop.signal is None else 128 + stop.signal, result
-    echo(f"\nbest member   {result['best']['member']}: {plan.measure} {result['best']['score']:,.4g}")
-    echo(f"model         {members.path / 'best.safetensors'}")
-    echo(f"history       {members.path / 'history.csv'}")
-    return 0, result
-
-
-def as_dict(members: Members, complete: bool, signal: int | None) -> dict[str, Any]:
-    """Returns the result for ``--json``."""
-    plan, history = members.population.plan, members.history()
-    best = None
-    if complete:
-        member = members.best()
-        best = next(row for row in reversed(history) if row["member"] == member)
-    return {
-        "population": members.path,
-        "env_id": plan.env_id,
-        "algorithm": plan.algorithm,
-        "seed": plan.seed,
-        "complete": complete,
-        "signal": signal,
-        "best": best,
-        "history": history,
-    }

@@ -212,11 +212,6 @@ class VectorEnv(ABC):
     def goals(self) -> GoalFunctions | None:
         """Returns the goal functions, or None for environments without goals."""
 
-    @property
-    def arrivals(self) -> np.ndarray | None:
-        """In which order results were taken, where environments do not wait for each other; None elsewhere."""
-        return None
-
     def infos(self, begun: bool = False) -> list[dict[str, Any]]:
         """Returns the info of each environment: that of its last step, or with ``begun`` of its last reset."""
         return each_info(self.info, self.n_envs, begun)

@@ -69,7 +69,6 @@ class WorkerOptions(NamedTuple):
     worker_timeout: float | None = TIMEOUT
     restart_workers: int = 0
     wait_for: int | None = None
-    arrivals: Any = None
     ray: Mapping[str, Any] | None = None
 
 
@@ -82,7 +81,6 @@ def make_vector(
     worker_timeout: float | None = TIMEOUT,
     restart_workers: int = 0,
     wait_for: int | None = None,
-    arrivals: Any = None,
     ray: Mapping[str, Any] | None = None,
     **env_kwargs: Any,
 ) -> VectorEnv:
@@ -107,8 +105,6 @@ def make_vector(
         wait_for: how many results off-policy algorithms take at a time, from 1 to ``n_envs``: those that arrive first.
             They are stored, and these environments continue while the others still step. None: all environments step
             together.
-        arrivals: the attribute ``arrivals`` of the environments of an earlier run with the same ``wait_for``, to take the
-            results in the same order. None: in the order in which they arrive.
         ray: for ``"ray"``: ``address`` of the cluster (``"HOST:PORT"`` or ``"auto"``; by default that in the environment
             variable ``RAY_ADDRESS``, else Ray is started on this machine), and what each environment reserves:
             ``num_cpus`` (1, or 0 if Ray is started here), ``num_gpus`` (0), ``memory`` in bytes, ``resources`` by name.
@@ -129,7 +125,7 @@ def make_vector(
         raise ValueError(f"backend={backend!r} must be one of {', '.join(BACKENDS)}")
     if isinstance(n_envs, bool) or not isinstance(n_envs, int) or n_envs < 1:
         raise ValueError(f"n_envs={n_envs!r} must be a whole number of at least 1")
-    workers = WorkerOptions(worker_timeout, restart_workers, wait_for, arrivals, ray)
+    workers = WorkerOptions(worker_timeout, restart_workers, wait_for, ray)
     check_workers(env, n_envs, backend, workers)
     if isinstance(env, VectorEnv | gym.vector.VectorEnv) or adapter_of(env) is not None:
         n_envs = env.n_envs if isinstance(env, VectorEnv) else env.num_envs
@@ -169,7 +165,7 @@ def _made(
     if callable(env):
         if backend in WORKERS:
             starter = Actors(workers.ray or {}) if backend == "ray" else None
-            return InWorkers(env, n_envs, seed, *workers[:4], starter)
+            return InWorkers(env, n_envs, seed, *workers[:3], starter)
         return InProcess([env() for _ in range(n_envs)], seed)
     if not isinstance(env, str):
         raise TypeError(environment_fault(env, KINDS))
@@ -224,8 +220,6 @@ def check_workers(env: Any, n_envs: int, backend: Backend, options: WorkerOption
             )
     if options.wait_for is not None:
         validation.whole("wait_for", options.wait_for, least=1, most=n_envs)
-    elif options.arrivals is not None:
-        raise ValueError("arrivals is the order of results in a run with wait_for; give the wait_for of that run too")
     if options.ray is not None and backend != "ray":
         raise ValueError(f"ray={dict(options.ray)} is for backend='ray', got backend={backend!r}")
 

@@ -1,1 +1,1 @@
-"""Many runs at once: sweeps, studies and populations, and the scheduler that trains their runs."""
+"""Many runs at once: sweeps and studies, and the scheduler that trains their runs."""

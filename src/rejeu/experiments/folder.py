@@ -19,7 +19,7 @@ import os
 import re
 import shutil
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -35,7 +35,7 @@ from rejeu.io import atomic
 from rejeu.io.records import Malformed, convert, json_text, read_json, shown
 from rejeu.reporting.runs import EVALUATIONS, METRICS, is_locked
 from rejeu.reporting.tables import read_bytes, read_table
-from rejeu.runs.config import RENAMED, RunConfig, Task, quoted, written
+from rejeu.runs.config import RunConfig, Task, quoted, written
 from rejeu.runs.folder import newest_step
 from rejeu.validation import assign
 
@@ -135,18 +135,6 @@ class Job:
             f"{where} names an environment that is imported or made with more than numbers, which no file may ask for; "
             f"if you trust it, name it again:{options if len(options) < 500 and options.isprintable() else ' --env ENV'}"
         )
-
-
-def from_file(content: Any) -> Any:
-    """Returns a job of a ``sweep.json`` in the present form; earlier versions wrote the run between the fields of the job."""
-    if not isinstance(content, dict) or "run" in content:
-        return content
-    options = content.get("options", {})
-    if not isinstance(options, dict):
-        raise Malformed("the options of a job are no table")
-    own = {one.name for one in fields(Job)}
-    run = {RENAMED.get(key, key): one for key, one in {**options, **content}.items() if key not in {*own, "options"}}
-    return {key: one for key, one in {**options, **content, "run": run}.items() if key in own}
 
 
 def again(jobs: Iterable[Job], typed: RunConfig) -> str:
@@ -379,10 +367,7 @@ def read_folder(path: Path, typed: RunConfig = NOTHING) -> SweepFolder:
     if not is_sweep(path):
         raise FileNotFoundError(f"{path} is no folder of a sweep: it holds no {SWEEP}")
     try:
-        content: Any = read_json(path / SWEEP, MAX_BYTES)
-        if isinstance(content, dict) and isinstance(content.get("jobs"), list):
-            content["jobs"] = [from_file(job) for job in content["jobs"]]
-        sweep = convert(content, Sweep)
+        sweep = convert(read_json(path / SWEEP, MAX_BYTES), Sweep)
         if len({job.name.lower() for job in sweep.jobs}) < len(sweep.jobs):
             raise Malformed("two jobs have the same name")
     except (Malformed, CheckpointError) as error:

@@ -1,6 +1,6 @@
 """The scheduler of all runs that are processes: which starts when, and what its end means.
 
-Sweeps, several seeds, studies, their final comparisons and populations give it their runs. One rule holds for all of them:
+Sweeps, several seeds, studies and their final comparisons give it their runs. One rule holds for all of them:
 
 - A run that ends with status 0 is done if it left its result; otherwise it has failed.
 - A run that was lost (its process was killed, its machine is gone, it was stopped by somebody else) continues from its newest

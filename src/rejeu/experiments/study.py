@@ -7,7 +7,7 @@
     trials/0007/            preset.json, and a run folder for each seed
     final/                  the winner and the default on fresh seeds, a run folder for each seed
     preset.json             the winner
-    study.html              the page
+    compare.html            the comparison of the winner with the default
 
 Every trial has an index from 0. A trial whose process died is entered again with the same index and parameters, so that the
 study continues as it would have without the interruption.
@@ -81,8 +81,8 @@ class StudyFolder:
     """Optuna's journal."""
     preset = File("preset.json")
     """The winner."""
-    page = File("study.html")
-    """The page about the study."""
+    page = File("compare.html")
+    """The page that compares the winner with the default."""
     final = File("final")
     """Folder of the final comparison."""
 

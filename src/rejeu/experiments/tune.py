@@ -17,7 +17,7 @@ from rejeu import envs, presets
 from rejeu.agents import modules_of
 from rejeu.algorithms.search import SearchSpace
 from rejeu.errors import MissingExtra
-from rejeu.experiments import page, search as searches, study as studies, study_plan as plans
+from rejeu.experiments import search as searches, study as studies, study_plan as plans
 from rejeu.experiments.process import default_workers
 from rejeu.experiments.search import Final, Search, Watch
 from rejeu.experiments.study import Outcome, Study, StudyFolder
@@ -204,7 +204,7 @@ def run(
     watch: Watch,
     echo: Echo,
 ) -> Result:
-    """Searches, writes the winner, compares it with the default, and writes the page; returns the result.
+    """Searches, writes the winner, compares it with the default, and writes the page about that; returns the result.
 
     Args:
         study: the study.
@@ -232,10 +232,12 @@ def run(
         compared = None if stop.requested else searches.compared(study, best, failed)
     complete = study.is_searched() and not stop.requested and not (compared and compared.failed)
     notes = [f"trial {text}" for text in search.scheduler.left]
-    try:
-        echo(f"page          {page.write(study, outcomes, compared)}")
-    except (MissingExtra, OSError) as error:
-        notes.append(f"no {folder.page.name}: {error}")
+    if compared and compared.comparison:
+        try:
+            compared.comparison.save(folder.page)
+            echo(f"page          {folder.page}")
+        except (MissingExtra, OSError) as error:
+            notes.append(f"no {folder.page.name}: {error}")
     return Result(folder.path, plan, tuple(outcomes), best, compared, complete, stop.signal, tuple(notes))
 
 

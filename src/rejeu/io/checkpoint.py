@@ -18,7 +18,7 @@ import json
 import math
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -145,7 +145,7 @@ SUFFIX = ".safetensors"
 FOREIGN = (".zip", ".pkl")
 """Suffixes that Stable-Baselines3 gives its files; where a script asks for one, ours of that name is read."""
 SCHEMA = 2
-"""Version of the header's layout; raised when it changes, with a function in ``MIGRATIONS``."""
+"""Version of the header's layout; raised when it changes."""
 HEADER_KEY, CHECKSUM_KEY = "rejeu", "crc32"
 """Names of the header and of its checksum in the file's metadata."""
 CHECKSUMS = "checksums"
@@ -154,15 +154,6 @@ RESERVED = ("schema", "kind", CHECKSUMS)
 
 Header = dict[str, Any]
 PyTree = Any
-
-
-def _from_1(header: Header) -> Header:
-    """Schema 2 added the checksums, which are verified before; the rest is unchanged."""
-    return {**header, "schema": 2}
-
-
-MIGRATIONS: dict[int, Callable[[Header], Header]] = {1: _from_1}
-"""For each older schema, a pure function from its header to a header of the next schema."""
 
 
 def resolve(path: str | Path, suffix: str = SUFFIX) -> Path:
@@ -244,7 +235,7 @@ class Contents:
 
 @contextlib.contextmanager
 def opened(path: str | Path, kind: str) -> Iterator[Contents]:
-    """Opens a file of that ``kind``; headers of older schemas are converted to the current one.
+    """Opens a file of that ``kind``.
 
     Instead of a missing ``model.zip``, ``model.safetensors`` is opened, and the other way round. No array is read: a loader
     first compares ``specs`` with what it expects (:func:`match`), so that a file cannot make it read more than the model
@@ -262,7 +253,7 @@ def opened(path: str | Path, kind: str) -> Iterator[Contents]:
             size, memory = path.stat().st_size, physical_memory()
             if memory is not None and size > memory:
                 raise CheckpointError(f"{path} has {size / 2**30:.1f} GiB and the machine {memory / 2**30:.1f} GiB")
-        yield Contents(path, file, _migrated(path, header), sums)
+        yield Contents(path, file, header, sums)
 
 
 def read(path: str | Path, kind: str) -> tuple[Header, dict[str, np.ndarray]]:
@@ -376,23 +367,13 @@ def _header(path: Path, text: str, checksum: str | None) -> Header:
         raise damaged(str(error)) from None
     if not isinstance(header, dict) or type(schema := header.get("schema")) is not int:
         raise damaged("it has no schema")
-    if schema > SCHEMA or schema < 1:
+    if schema != SCHEMA:
         raise CheckpointError(
-            f"{path} has schema {schema} and this rejeu reads schemas 1 to {SCHEMA}; "
+            f"{path} has schema {schema} and this rejeu reads schema {SCHEMA}; "
             + ("upgrade rejeu" if schema > SCHEMA else "it is from an unreleased version")
         )
-    if (schema > 1 or checksum is not None) and checksum != _text_checksum(text):
+    if checksum != _text_checksum(text):
         raise damaged("its checksum differs")
-    return header
-
-
-def _migrated(path: Path, header: Header) -> Header:
-    """Returns a header of the current schema from one of any released schema."""
-    try:
-        while header["schema"] < SCHEMA:
-            header = MIGRATIONS[header["schema"]](header)
-    except (LookupError, TypeError, ValueError, AttributeError) as error:
-        raise CheckpointError(f"{path}: the header of schema {header['schema']} is damaged: {shown(error)}") from None
     return header
 
 

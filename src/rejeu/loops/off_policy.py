@@ -15,7 +15,7 @@ updates are started, and wait for them.
 
 With ``env.wait_for`` one turn takes the results of so many environments that have them first, ``step.which``, and gives these
 new actions, while the others still step. Arrays of a turn have a row for each environment; only the rows of ``which`` are
-new. The results depend on the seed and on the order of arrival, which ``env.arrivals`` records.
+new. The results depend on the seed and on the order of arrival, which no seed determines.
 """
 
 from __future__ import annotations

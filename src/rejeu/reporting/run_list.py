@@ -36,7 +36,7 @@ from rejeu.reporting.tables import EMPTY, MAX_COLUMNS, Table, read_bytes, read_t
 MAX_DEPTH = 4
 """Levels of folders that are searched for runs."""
 MAX_RUNS = 10_000
-SKIPPED = {"checkpoints", "videos", "films", "node_modules", "__pycache__"}
+SKIPPED = {"checkpoints", "videos", "node_modules", "__pycache__"}
 
 
 def read(path: str | Path, table_only: bool = False) -> Run:

@@ -24,15 +24,9 @@ from rejeu import presets
 from rejeu.errors import CheckpointError
 from rejeu.io.records import Malformed, convert, is_deep, parse_json, shown
 from rejeu.reporting.tables import EMPTY, Table, read_bytes, read_table
-from rejeu.runs.config import MAX_BYTES, RunConfig, parse, quoted
+from rejeu.runs.config import MAX_BYTES, RunConfig, quoted
 from rejeu.runs.folder import RunFolder, newest_inside, newest_step
 
-RENAMED = {
-    "time/seconds": "time/time_elapsed",
-    "time/steps_per_second": "time/fps",
-    "train/exploration_rate": "rollout/exploration_rate",
-}
-"""Names of metrics in older run folders, and their present names."""
 CONFIG, EPISODES, METRICS, EVALUATIONS = "config.json", "episodes.csv", "metrics.csv", "evaluations.csv"
 WARNINGS = "warnings.txt"
 MAX_DEPTH = 20
@@ -244,13 +238,13 @@ def best_row(evaluations: Table) -> int | None:
 
 
 def statistics_rows(table: Table) -> Table:
-    """Returns a table of metrics under their present names, without the rows of evaluations, which have no time.
+    """Returns a table of metrics without the rows of evaluations, which have no time.
 
-    >>> older = Table({"step": np.arange(2.0), "time/seconds": np.array([0.5, np.nan]), "eval/mean_reward": np.ones(2)})
-    >>> statistics_rows(older).columns
+    >>> table = Table({"step": np.arange(2.0), "time/time_elapsed": np.array([0.5, np.nan]), "eval/mean_reward": np.ones(2)})
+    >>> statistics_rows(table).columns
     {'step': array([0.]), 'time/time_elapsed': array([0.5])}
     """
-    columns = {RENAMED.get(name, name): values for name, values in table.columns.items()}
+    columns = table.columns
     known = np.isfinite(columns.get("time/time_elapsed", np.zeros(len(table))))
     return Table({name: values[known] for name, values in columns.items() if not name.startswith("eval/")}, table.notes)
 
@@ -261,7 +255,7 @@ def read_config(path: Path) -> tuple[RunConfig | None, dict[str, str | None], li
         content = parse_json(read_bytes(path, MAX_BYTES))
         if is_deep(content, MAX_DEPTH):
             raise Malformed("it is nested too deeply")
-        return parse(content, RunConfig), convert(content.get("versions", {}), dict[str, str | None]), []
+        return convert(content, RunConfig), convert(content.get("versions", {}), dict[str, str | None]), []
     except FileNotFoundError:
         return None, {}, [f"there is no {CONFIG}, so the configuration is not known"]
     except (OSError, Malformed, CheckpointError) as error:

@@ -121,8 +121,6 @@ LOGS = ("csv", "json", "tensorboard", "wandb", "mlflow", "trackio")
 """What the argument ``log`` takes."""
 MAX_EPISODES = 10_000
 """Upper limit on the episodes of an evaluation while training."""
-RENAMED = {"film_every": "video_every", "envs": "n_envs", "wrapper": "wrappers"}
-"""Fields of earlier versions, and their present names."""
 
 
 WORDS_OF_THEIR_OWN = ("env", "env_kwargs", "wrappers", "imports", "hyperparameters")
@@ -203,8 +201,6 @@ class RunConfig(EnvironmentOptions):
     """With --backend gymnasium-async or ray: how many workers that crashed, hung or were lost are restarted."""
     wait_for: Annotated[Positive | None, Shown("K")] = None
     """With these: take the first K results that arrive, and do not wait for the other environments."""
-    arrivals: Annotated[str | None, Shown("FILE")] = None
-    """With --wait-for: take the results in the order of an earlier run, its arrivals.npy."""
     ray: Annotated[str | None, Shown("ADDRESS")] = None
     """With --backend ray: HOST:PORT of the cluster, or auto; by default RAY_ADDRESS, else Ray on this machine."""
     env_cpus: Annotated[Annotated[float, Meta(ge=0, le=10_000)] | None, Shown("N")] = None
@@ -359,17 +355,6 @@ def unmarked(hint: Any) -> tuple[Any, list[Any]]:
     return (get_args(hint)[0], [*get_args(hint)[1:]]) if get_origin(hint) is Annotated else (hint, [])
 
 
-def parse(content: Any, kind: type[R]) -> R:
-    """Returns the run that JSON values describe, also those of earlier versions.
-
-    Raises:
-        CheckpointError: if they are damaged.
-    """
-    if isinstance(content, dict):
-        content = {RENAMED.get(name, name): value for name, value in content.items()}
-    return convert(content, kind)
-
-
 def read(path: Path) -> DecidedRun:
     """Returns what :func:`write` wrote.
 
@@ -378,7 +363,7 @@ def read(path: Path) -> DecidedRun:
         OSError: if it cannot be read.
     """
     try:
-        return parse(read_json(path, MAX_BYTES), DecidedRun)
+        return convert(read_json(path, MAX_BYTES), DecidedRun)
     except (Malformed, CheckpointError) as error:
         raise CheckpointError(f"{path} is damaged: {shown(error, 1000)}") from None
 

@@ -8,11 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
-
-from rejeu.errors import CheckpointError
-from rejeu.io import atomic, checkpoint
-from rejeu.io.records import WRONG
+from rejeu.io import checkpoint
 from rejeu.runs import config
 from rejeu.runs.config import DecidedRun, quoted
 
@@ -52,8 +48,6 @@ class RunFolder:
     """The model that evaluated best."""
     checkpoints = File("checkpoints")
     """Folder of the checkpoints from which the run can be resumed."""
-    arrivals = File("arrivals.npy")
-    """In which order the results of environments were taken, of a run with ``wait_for``; see :func:`read_arrivals`."""
     curve = File("curve.png")
     """The learning curve."""
     replays = File("replays.csv")
@@ -65,11 +59,8 @@ class RunFolder:
     video = File("video.mp4")
     """A few episodes of the best model."""
 
-    @property
-    def videos(self) -> Path:
-        """Folder of videos of the policy during training; earlier versions called it ``films``."""
-        videos, films = self.path / "videos", self.path / "films"
-        return films if films.is_dir() and not videos.exists() else videos
+    videos = File("videos")
+    """Folder of videos of the policy during training."""
 
 
 def read_config(folder: RunFolder) -> DecidedRun:
@@ -120,28 +111,6 @@ def check_free(out: Path | None) -> None:
     """Raises ``FileExistsError`` if a run may not be written there: nothing is ever overwritten."""
     if out is not None and out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise FileExistsError(f"--out {out} exists and is not an empty folder; name another, or remove it first")
-
-
-def write_arrivals(folder: RunFolder, arrivals: np.ndarray) -> None:
-    """Writes the order in which the results of environments were taken."""
-    with atomic.replacing(folder.arrivals) as file:
-        np.save(file, arrivals, allow_pickle=False)
-
-
-def read_arrivals(path: Path) -> np.ndarray:
-    """Returns what :func:`write_arrivals` wrote.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        CheckpointError: if it is not a NumPy array without pickles.
-    """
-    try:
-        with path.open("rb") as file:  # np.load also opens zip files, which cannot be a record
-            return np.lib.format.read_array(file, allow_pickle=False)
-    except (*WRONG, EOFError) as error:
-        raise CheckpointError(
-            f"{path} is not the arrivals.npy of a run: {' '.join(str(error).split())[:100]}"
-        ) from None
 
 
 def find_model(run: str | Path, which: Literal["best", "last"] = "best") -> Path:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import warnings
-from array import array
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Annotated, Any, NamedTuple
@@ -81,23 +79,6 @@ def from_saved(saved: Any, leaves: Sequence[Leaf]) -> tuple[int, Result]:
     return one.env, Result(one.obs, one.reward, one.terminated, one.truncated, info, one.begun)
 
 
-def checked_record(record: Any, n_envs: int, wait_for: int) -> np.ndarray:
-    """Returns a record of arrivals, ``uint16 (turns, wait_for)``: which environments' results were taken together.
-
-    Raises:
-        ValueError: if it is not that of ``n_envs`` environments and of ``wait_for`` results at a time.
-    """
-    array = np.asarray(record)
-    if array.ndim != 2 or array.shape[1] != wait_for or array.dtype.kind not in "iu":
-        raise ValueError(
-            f"arrivals is {array.dtype}{list(array.shape)}, expected whole numbers of shape (turns, wait_for={wait_for}), as "
-            "the attribute arrivals of the environments holds them"
-        )
-    if array.size and (array.min() < 0 or array.max() >= n_envs or (np.diff(array.astype(int), axis=1) <= 0).any()):
-        raise ValueError(f"arrivals must have increasing indices below n_envs={n_envs} in every row")
-    return array.astype(INDEX)
-
-
 class InWorkers(VectorEnv):
     """Environments in workers that are stepped in parallel.
 
@@ -114,12 +95,10 @@ class InWorkers(VectorEnv):
         worker_timeout: timeout of a step or a reset, in seconds. None waits without limit.
         restart_workers: maximum number of lost workers that are replaced, in total.
         wait_for: number of results that :meth:`receive` returns.
-        arrivals: which results it returns, a record of another run (see :attr:`arrivals`). None: those that arrive first.
         starter: starts workers elsewhere, which send their observations. None starts processes with shared memory.
 
     Raises:
         TypeError: if ``make_one`` cannot be pickled.
-        ValueError: if ``arrivals`` is not a record of so many environments.
         WorkerError: if a worker cannot be started, or fails to make its environment.
     """
 
@@ -131,7 +110,6 @@ class InWorkers(VectorEnv):
         worker_timeout: float | None = TIMEOUT,
         restart_workers: int = 0,
         wait_for: int | None = None,
-        arrivals: Any = None,
         starter: Starter | None = None,
     ) -> None:
         one = make_one()
@@ -159,8 +137,6 @@ class InWorkers(VectorEnv):
         """First observations of episodes that environments have begun by themselves, where no result was taken since."""
         self._pending: set[int] = set()
         """Environments that are stepping on their own."""
-        self._record = array("H")
-        self._given = None if wait_for is None or arrivals is None else checked_record(arrivals, n_envs, wait_for)
         self._leaves = leaves(self.observation_space)
         self._stores = [np.zeros((n_envs, *leaf.shape), leaf.dtype) for leaf in self._leaves]
         self._obs = jax.tree.unflatten(structure(self.observation_space), self._stores)
@@ -266,14 +242,6 @@ class InWorkers(VectorEnv):
         """Returns the leaves of an observation of environment ``i`` that has just arrived."""
         return encoded if self._rows is None else [np.array(shared[i]) for shared in self._rows]
 
-    @property
-    def arrivals(self) -> np.ndarray | None:
-        """Which results :meth:`receive` has returned, ``uint16 (turns, wait_for)``: a row of indices for each call.
-
-        Given to :func:`rejeu.make_vector` again, they repeat a run. None without ``wait_for``.
-        """
-        return None if self.wait_for is None else np.array(self._record, INDEX).reshape(-1, self.wait_for)
-
     def send(self, action: np.ndarray) -> None:
         """Gives actions to the environments that await one, which step on their own, and reset where an episode ends.
 
@@ -297,11 +265,9 @@ class InWorkers(VectorEnv):
             WorkerError, BadEnvironmentError: as for :meth:`step`.
         """
         assert self.wait_for is not None
-        chosen = self._chosen()
-        while len(self._results) < self.wait_for if chosen is None else not chosen <= self._results.keys():
+        while len(self._results) < self.wait_for:
             self._listen()
-        which = np.array(sorted([*self._results][: self.wait_for] if chosen is None else chosen))
-        self._record.extend(which.tolist())
+        which = np.array(sorted([*self._results][: self.wait_for]))
         self.n_steps += 1
         reward = np.zeros(self.n_envs, np.float32)
         terminated, truncated = np.zeros(self.n_envs, bool), np.zeros(self.n_envs, bool)
@@ -314,22 +280,6 @@ class InWorkers(VectorEnv):
             if result.begun is not None:
                 self._begun[i] = result.begun
         return Step(self._obs, reward, terminated, truncated, info, which=which)
-
-    def _chosen(self) -> set[int] | None:
-        """Returns the environments whose results the given record says are next, None without one or at its end."""
-        assert self.wait_for is not None
-        turn = len(self._record) // self.wait_for
-        if self._given is None or turn > len(self._given):
-            return None
-        if turn == len(self._given):
-            warnings.warn(
-                f"the record of arrivals ends after {turn:,} turns; from here on results are taken as they arrive",
-                RuntimeWarning,
-                stacklevel=3,
-            )
-            self._given = None
-            return None
-        return set(self._given[turn].tolist())
 
     def _listen(self) -> None:
         """Waits until at least one environment that steps on its own has answered."""
@@ -400,10 +350,10 @@ class InWorkers(VectorEnv):
         if states is None or self.wait_for is None:
             return states
         results = [to_saved(i, result) for i, result in self._results.items()]
-        return {"states": states, "wait_for": self.wait_for, "results": results, "arrivals": self.arrivals}
+        return {"states": states, "wait_for": self.wait_for, "results": results}
 
     def restore(self, saved: Any, obs: Any) -> list[int]:
-        if isinstance(saved, dict) and {*saved} == {"states", "wait_for", "results", "arrivals"}:
+        if isinstance(saved, dict) and {*saved} == {"states", "wait_for", "results"}:
             self._restore_results(saved)
             saved = saved["states"]
         snapshot.check_count(saved, self.n_envs)
@@ -418,22 +368,17 @@ class InWorkers(VectorEnv):
         return [i for i, is_over in replies.items() if is_over]
 
     def _restore_results(self, saved: Mapping[str, Any]) -> None:
-        """Restores the results that waited, and the record of those that were taken.
+        """Restores the results that waited.
 
         Raises:
-            CheckpointError, ValueError: if they are damaged, or of another ``wait_for`` or another record.
+            CheckpointError, ValueError: if they are damaged, or of another ``wait_for``.
         """
         if self.wait_for is None or saved["wait_for"] != self.wait_for:
             raise ValueError(f"the run had wait_for={saved['wait_for']!r}, and the environments have {self.wait_for}")
-        record = checked_record(saved["arrivals"], self.n_envs, self.wait_for)
-        given = None if self._given is None else self._given[: len(record)]
-        if given is not None and not np.array_equal(given, record):
-            raise ValueError("the record of arrivals that is given is of another run")
         results = [from_saved(one, self._leaves) for one in convert(saved["results"], list[Any])]
         if len({i for i, _ in results}) < len(results) or any(i >= self.n_envs for i, _ in results):
             raise ValueError(f"the results that wait are not those of {self.n_envs} environments")
         self._results = dict(results)
-        self._record = array("H", record.ravel().tolist())
 
     def close(self) -> None:
         """Closes the environments and ends the processes. Further calls do nothing."""

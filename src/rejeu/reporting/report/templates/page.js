@@ -37,9 +37,7 @@
       hoverlabel: { bgcolor: color("card"), bordercolor: color("rule"), font: { color: color("ink") }, namelength: -1 },
       hovermode: "closest", dragmode: phone ? false : "zoom",
       xaxis: {
-        ...line, showgrid: false, tickformat: chart.plain_x ? "" : "~s", title: title(more.x ?? ""), range: more.range, nticks: 8,
-        ...(chart.log ? { type: "log", exponentformat: "power", dtick: more.range[1] - more.range[0] > 1.5 ? 1 : undefined } : {}),
-        ...(chart.labels?.length ? { tickvals: chart.labels.map((_, i) => i + 1), ticktext: chart.labels.map(plain) } : {}),
+        ...line, showgrid: false, tickformat: "~s", title: title(more.x ?? ""), range: more.range, nticks: 8,
       },
       yaxis: {
         ...line, title: title(chart.y ?? ""), range: chart.range ?? undefined, nticks: 7, exponentformat: "power",

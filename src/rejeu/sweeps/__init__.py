@@ -1,1 +1,0 @@
-"""Sweeps, under the name of earlier versions; see :mod:`rejeu.experiments`."""
