@@ -135,7 +135,7 @@ class Recording:
         atomic.write(self._data / f"episode_{i}.hdf5", content)
 
     def _show(self, *frames: np.ndarray, last: bool = False) -> None:
-        """Adds frames to the video, and completes it after the last. If it cannot be written, the game goes on with a warning."""
+        """Adds frames to the video, and completes it after the last. If it cannot be written, the game goes on."""
         if self._video is None:
             return
         try:
