@@ -8,12 +8,15 @@ from types import SimpleNamespace
 from typing import Any
 
 import equinox as eqx
+import jax
 import numpy as np
 import pytest
 
 import rejeu
 from rejeu.callbacks import Checkpoint
+from rejeu.core import Clock
 from rejeu.demonstrations import Demonstrations, learn_offline, read, record
+from rejeu.loops.learner import Readings
 from tests.sharing import shared_learners
 from tests.test_demonstrations import SMALL, Anywhere, Target, by_hand, shown
 
@@ -56,6 +59,45 @@ def test_the_target_network_of_q_learning_follows_the_updates() -> None:
         networks[updates] = state.network, state.target_network
     assert eqx.tree_equal(networks[200][1], networks[100][0])
     assert not eqx.tree_equal(*networks[200])
+
+
+def clocks_of(agent: rejeu.DQN) -> list[tuple[Any, Any]]:
+    """Replaces the update by one that does nothing; returns a list of the batches and the clock of each call."""
+    calls: list[tuple[Any, Any]] = []
+
+    def update(state: Any, batches: Any, clock: Any) -> tuple[Any, Readings, None]:
+        calls.append((batches, clock))
+        return state, Readings((), np.zeros(1)), None
+
+    agent.learner.update = update
+    return calls
+
+
+def test_every_gradient_step_without_an_environment_has_its_own_clock(tmp_path: Path) -> None:
+    """Updates are made a hundred in one call; each counts, so that it is the same as one call for each."""
+    pytest.importorskip("minari")
+    env, known = Target("Discrete"), record(Anywhere(discrete := Target("Discrete")), discrete, 2, tmp_path, seed=0)
+    rate = rejeu.Linear(1e-2, 1e-3)
+    settings = {**SMALL, "target_update_interval": 7, "learning_rate": rate, "batch_size": 8, "tau": 0.3}
+    agent, twin, run = (
+        rejeu.DQN("MlpPolicy", env, **settings, **more)
+        for more in ({}, {}, {"demonstrations": tmp_path, "offline": True})
+    )
+    calls, of_run = clocks_of(twin), clocks_of(run)
+    learn_offline(twin, known, 130)
+    run.learn(130)
+    for found in (calls, of_run):
+        for name, expected in (("step", np.arange(130)), ("progress", np.arange(130, dtype=np.float32) / 130)):
+            parts = [np.atleast_1d(getattr(clock, name)) for _, clock in found]
+            np.testing.assert_allclose(np.concatenate(parts), expected, rtol=1e-6)
+    state, update = agent.learner.state(agent.run.state), jax.jit(agent.learner.algorithm.update)
+    learn_offline(agent, known, 130)
+    for i in range(130):
+        batches = calls[i // 100][0]
+        one = jax.tree.map(lambda leaf: leaf[i % 100], batches)  # noqa: B023
+        state, _ = update(state, one, Clock(np.uint32(i), np.uint32(0), np.float32(i / 130)))
+    for found, expected in zip(*map(jax.tree.leaves, (agent.learner.state(agent.run.state), state)), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-6)
 
 
 class Untouched(Target):

@@ -392,7 +392,7 @@ def learn_offline(
     if not keep_policy:
         observe(agent, demonstrations)
     for n in chunks(updates):
-        learn_from(run, learner, agent.config, replay, n, done / updates, done)
+        learn_from(run, learner, agent.config, replay, [(done + i) / updates for i in range(n)], done)
         done += n
         if interrupt.requested() is not None:
             break

@@ -203,13 +203,14 @@ def reported(agent: Any, update: NonFiniteUpdate, of: str = "") -> NonFiniteErro
 
     The running episodes end: the actions chosen since are invalid. ``of`` names the run where there are several.
     """
-    run, learner, clock = agent.run, agent.learner, update.clock
+    run, learner = agent.run, agent.learner
     run.td_errors, run.obs, run.action = [], None, None
     keep_finite = lambda fresh, leaf: leaf if np.isfinite(leaf).all() else fresh  # noqa: E731
     run.carry = jax.tree.map(keep_finite, learner.initial_carry(agent.n_envs), run.carry)
     run.state = run.state if update.state is None else update.state
     state, n_updates, compiled = learner.state(run.state), update.n_updates, jax.jit(learner.algorithm.update)
     for i, batch in enumerate(one_by_one(update.batches)):
+        clock = jax.tree.map(lambda leaf: leaf[i] if np.ndim(leaf) else leaf, update.clock)  # noqa: B023
         after, metrics = compiled(state, batch, clock)
         found = [*bad_leaves(checked(metrics)), *(f"{leaf} of the state" for leaf in bad_leaves(after))]
         if found:

@@ -20,7 +20,7 @@ new. The results depend on the seed and on the order of arrival, which no seed d
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
@@ -103,22 +103,24 @@ def offline(
     while last is None or run.step < last:
         due = STEPS_OFFLINE - run.step % STEPS_OFFLINE
         n = due if last is None else min(due, last - run.step)
-        learn_from(run, learner, config, run.replay, n, progress(run.step - first))
+        learn_from(run, learner, config, run.replay, [progress(run.step + i - first) for i in range(n)])
         run.step += n
         run.monitor.read()
         yield Progress(run.step, [], run.metrics)
 
 
 def learn_from(
-    run: Run, learner: Learner, config: OffPolicyConfig, replay: Any, n: int, progress: float, before: int = 0
+    run: Run, learner: Learner, config: OffPolicyConfig, replay: Any, progress: Sequence[float], before: int = 0
 ) -> None:
-    """Starts ``n`` gradient steps on batches of a replay buffer, in one call.
+    """Starts gradient steps on batches of a replay buffer in one call, one for each progress of schedules.
 
-    For target networks that move after environment steps, those ``before`` count as such beside the run's.
+    Each counts as an environment step beside the run's, for target networks that move after these; so do those ``before``.
     """
-    batch, drawn = replay.draw(run.rng, (n, config.batch_size), progress)
-    clock = clock_of(run, progress)
-    update(run, learner, [(batch, drawn)], clock._replace(step=np.uint32(run.step + before)))
+    n = len(progress)
+    batch, drawn = replay.draw(run.rng, (n, config.batch_size), progress[0])
+    steps = run.step + before + np.arange(n)
+    clock = Clock(steps.astype(np.uint32), np.full(n, run.episode, np.uint32), np.asarray(progress, np.float32))
+    update(run, learner, [(batch, drawn)], clock)
     run.td_errors = []
 
 
