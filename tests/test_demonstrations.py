@@ -221,6 +221,23 @@ def test_what_is_played_keeps_arrays_that_environment_and_agent_write_to_again()
     assert [part.observations[:, 0].tolist() for part in parts] == [[0, 1, 2, 3], [4, 5, 6]]
 
 
+@pytest.mark.parametrize("takes_over", [False, True])
+def test_answers_to_actions_that_were_not_taken_are_cloned_and_not_replayed(takes_over: bool, tmp_path: Path) -> None:
+    """Rewards and next observations follow from the agent's actions; where the expert takes over they are its own."""
+    env = Target()
+    agent = rejeu.SAC("MlpPolicy", env, **SMALL)
+    answers = dagger(agent, env.best, env, takes_over=takes_over, rounds=1, steps=5, updates=1)
+    taken = record(Expert(env), env, 1, seed=0)
+    assert {episode.is_labeled for episode in answers.episodes} == {not takes_over}
+    for known in (answers, taken + answers, answers + taken):
+        if takes_over:
+            assert agent.replay_of(known, agent.run.env).size() == known.n_steps
+            continue
+        with pytest.raises(ValueError, match="clone them, or record"):
+            learn_offline(agent, known, 1)
+    assert not any(episode.is_labeled for episode in taken.episodes)
+
+
 def test_an_expert_that_never_answers_labels_nothing() -> None:
     agent = rejeu.PPO("MlpPolicy", Target(), **SMALL)
     assert str(dagger(agent, lambda obs: None, Target(), rounds=1, steps=5)) == "0 episodes, 0 steps, mean return nan"

@@ -144,11 +144,16 @@ class OffPolicyAgent(Agent):
         """Returns a replay buffer that holds demonstrations, from which batches are drawn as from the agent's own.
 
         Raises:
-            ValueError: if the spaces differ, or the agent uses action masks.
+            ValueError: if the spaces differ, the actions were not taken, or the agent uses action masks.
         """
         from rejeu import demonstrations
 
         demonstrations.check(self, recorded)
+        if any(episode.is_labeled for episode in recorded.episodes):
+            raise ValueError(
+                "these episodes have an expert's answers in place of the actions that were taken, as those of dagger, and "
+                "rewards that do not follow from them; clone them, or record(expert, env, ...) what the expert does"
+            )
         if self.takes_masks:
             raise ValueError(
                 f"{self.name} has action_masks=True, and a dataset has no masks, so that its targets would value forbidden "

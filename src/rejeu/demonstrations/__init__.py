@@ -54,6 +54,8 @@ class Episode:
     """``(T,)``."""
     terminated: bool
     """Whether it ended in a terminal state; else it was truncated."""
+    is_labeled: bool = False
+    """Whether the actions are an expert's answers, and others were taken: rewards and next observations follow from those."""
 
     def __len__(self) -> int:
         return len(self.rewards)
@@ -178,7 +180,7 @@ def play(
     """Plays an episode with an agent, and returns what was labeled and the number of all steps.
 
     ``label(obs, action)`` are the actions of the result, and with ``takes_over`` also those that are taken. Steps for which it
-    is None are left out; each stretch between them is an episode.
+    is None are left out; each stretch between them is an episode. Where actions of the result were not taken, it says so.
     """
     masked = for_agent(agent, env)
     plain = (lambda seen: seen) if masked is env else (lambda seen: split(seen, None)[0])
@@ -196,11 +198,12 @@ def play(
         memory = () if state is None else (state,)
         labeled = label(obs, action)
         action = labeled if takes_over and labeled is not None else action
+        is_labeled = labeled is not action
         before, labeled = jax.tree.map(np.copy, (obs, labeled))  # which may be written to again
         seen, reward, terminated, truncated, _ = masked.step(action)
         obs = plain(seen)
         if labeled is not None:
-            parts[-1].append((before, labeled, float(reward), jax.tree.map(np.copy, obs), bool(terminated)))
+            parts[-1].append((before, labeled, float(reward), jax.tree.map(np.copy, obs), bool(terminated), is_labeled))
         elif parts[-1]:
             parts.append([])
         if recording is not None:
@@ -210,10 +213,11 @@ def play(
 
 
 def episode_of(steps: Sequence[tuple[Any, ...]]) -> Episode:
-    """Returns successive steps ``(obs, action, reward, next_obs, terminated)`` as an episode."""
-    obs, actions, rewards, following, terminated = zip(*steps, strict=True)
+    """Returns successive steps ``(obs, action, reward, next_obs, terminated, is_labeled)`` as an episode."""
+    obs, actions, rewards, following, terminated, is_labeled = zip(*steps, strict=True)
     stack = lambda parts: jax.tree.map(lambda *leaves: np.stack(leaves), *parts)  # noqa: E731
-    return Episode(stack((*obs, following[-1])), stack(actions), np.asarray(rewards, np.float32), terminated[-1])
+    obs = stack((*obs, following[-1]))
+    return Episode(obs, stack(actions), np.asarray(rewards, np.float32), terminated[-1], any(is_labeled))
 
 
 def clone(
@@ -315,6 +319,9 @@ def dagger(
 
     In each round the agent acts, the expert says what it would have done, and the agent is cloned from all rounds. So it
     learns to come back from its own mistakes, which demonstrations do not show.
+
+    The result is for :func:`clone`. Unless the expert takes over, rewards and next observations in it follow from the agent's
+    actions, and :func:`learn_offline` and replay buffers refuse it.
 
     Args:
         agent: any agent without a memory.
