@@ -9,14 +9,16 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import rejeu
 from rejeu.callbacks import Checkpoint
-from rejeu.core import Clock
-from rejeu.demonstrations import Demonstrations, learn_offline, read, record
-from rejeu.loops.learner import Readings
+from rejeu.core import Clock, Transition, names
+from rejeu.demonstrations import Demonstrations, keeping_policy, learn_offline, read, record
+from rejeu.loops.learner import Learner, Readings
+from tests.every_agent import KINDS, Kind
 from tests.sharing import shared_learners
 from tests.test_demonstrations import SMALL, Anywhere, Target, by_hand, shown
 
@@ -98,6 +100,54 @@ def test_every_gradient_step_without_an_environment_has_its_own_clock(tmp_path: 
         state, _ = update(state, one, Clock(np.uint32(i), np.uint32(0), np.float32(i / 130)))
     for found, expected in zip(*map(jax.tree.leaves, (agent.learner.state(agent.run.state), state)), strict=True):
         np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["TD3BC", "SAC"])
+def test_the_statistics_of_normalization_are_those_of_the_data(name: str) -> None:
+    """Each step counts once, its reward by the discounted sum up to it."""
+    env = Target()
+    known = record(Anywhere(env), env, 3, seed=0)
+    with shared_learners():
+        agent = getattr(rejeu, name)("MlpPolicy", env, normalize=True, gamma=0.5, **SMALL)
+    clocks_of(agent)
+    learn_offline(agent, known, 1)
+    statistics = agent.learner.state(agent.run.state).statistics
+    obs = np.concatenate([episode.observations[:-1] for episode in known.episodes])
+    sums = [sum(0.5**k * one.rewards[i - k] for k in range(i + 1)) for one in known.episodes for i in range(len(one))]
+    assert statistics.obs[0].n_seen == statistics.returns.n_seen == 15
+    np.testing.assert_allclose(statistics.obs[0].mean, obs.mean(0), atol=1e-5)
+    np.testing.assert_allclose(statistics.returns.mean, np.mean(sums), rtol=1e-5)
+
+
+LEARNS = {
+    *("critic", "critics", "target_critic", "target_critics", "critic_optimizer", "critics_optimizer"),
+    *("value", "value_optimizer", "log_alpha", "alpha_optimizer", "n_updates", "actor_loss", "entropy"),
+}
+"""Fields of states that change while the policy is kept."""
+
+
+@pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
+def test_a_kept_policy_keeps_its_target_and_its_optimizer(kind: Kind) -> None:
+    """What is kept leaves the update as it came in, which the traced program says without running."""
+    env = Target("Discrete" if kind.discrete else "Box")
+    config = kind.agent.algorithm.Config(policy_kwargs={"net_arch": [4]})
+    learner = Learner(kind.agent.algorithm.make(config, env.observation_space, env.action_space), None)
+    agent = SimpleNamespace(learner=learner, name=kind.name)
+    state = names(learner.shapes)
+    if not any("critic" in name for name in state):
+        with pytest.raises(ValueError, match="has no critics"):
+            keeping_policy(agent)
+        return
+    action = jnp.zeros(4, jnp.int32) if kind.discrete else jnp.zeros((4, 2))
+    batch = Transition(jnp.ones((4, 2)), action, jnp.ones(4), jnp.ones((4, 2)), jnp.ones(4))
+    if getattr(config, "needs_next_action", False):
+        batch = batch._replace(next_action=action)
+    clock = Clock(np.uint32(0), np.uint32(0), np.float32(0))
+    traced = jax.make_jaxpr(keeping_policy(agent).algorithm.update)(learner.shapes, batch, clock).jaxpr
+    left = zip(state, traced.invars[: len(state)], traced.outvars[: len(state)], strict=True)
+    changed = {name.split(".")[0] for name, before, after in left if before is not after}
+    assert changed <= LEARNS
+    assert changed & {"critic", "critics"}
 
 
 class Untouched(Target):

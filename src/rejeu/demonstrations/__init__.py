@@ -381,8 +381,8 @@ def learn_offline(
         agent: learns with its own settings; schedules and target networks follow the updates.
         demonstrations: with its spaces.
         updates: number of gradient steps.
-        keep_policy: learn the values of the present policy, such as that of :func:`clone`, and leave it as it is. The
-            temperature of SAC and its relatives learns as well.
+        keep_policy: learn the values of the present policy, such as that of :func:`clone`, and leave it as it is, with its
+            target and its optimizer. The temperature of SAC and its relatives learns as well.
 
     Raises:
         ValueError: if the spaces differ, the agent has no replay buffer, or the policy is to be kept and the agent has no
@@ -417,6 +417,9 @@ def keeping_policy(agent: Any) -> Learner:
 
     def update(state: PyTree, batch: Any, clock: Clock) -> tuple[PyTree, Metrics]:
         new, metrics = algorithm.update(state, batch, clock)
+        of_actor = ["actor" in name.removesuffix("actor_loss") for name in names(new)]  # also its target and moments
+        kept = jax.tree.unflatten(jax.tree.structure(new), of_actor)
+        new = jax.tree.map(lambda kept, old, new: old if kept else new, kept, state, new)
         return eqx.tree_at(algorithm.actor, new, algorithm.actor(state)), metrics
 
     return Learner(algorithm._replace(update=update), None, agent.learner.skips)
