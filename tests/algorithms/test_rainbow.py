@@ -104,8 +104,9 @@ def test_the_munchausen_target_equals_loops(double_q, masked):
     shown = batch._replace(obs=Masked(batch.obs, mask[0]), next_obs=Masked(batch.next_obs, mask[1]))
     returns = dqn.MEAN._replace(munchausen=dqn.Config(**settings).munchausen)
     given = dqn.td_target(network, target_network, shown if masked else batch, double_q, returns)
-    own, theirs = forward(target_network, batch.obs), forward(target_network, batch.next_obs)
-    chooser = forward(network, batch.next_obs) if double_q else theirs
+    policy_of = network if double_q else target_network
+    own, chooser = forward(policy_of, batch.obs), forward(policy_of, batch.next_obs)
+    theirs = forward(target_network, batch.next_obs)
     clipped = 0
     for i in range(BATCH):
         allowed = np.flatnonzero(mask[1, i])

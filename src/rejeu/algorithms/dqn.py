@@ -479,7 +479,7 @@ def td_target(
     values, mask = returns.values(chooser, batch.next_obs, key), unmasked(some_allowed(batch.next_obs))[1]
     following = returns.describe(target_network, batch.next_obs, keys[1])
     if returns.munchausen is not None:
-        own = returns.values(target_network, batch.obs, keys[1])
+        own = returns.values(chooser, batch.obs, key)
         return returns.target(*munchausen_target(returns.munchausen, batch, own, forbid(values, mask), following))
     return returns.target(batch.reward, batch.discount, taken(following, greedy(values, mask)))
 
@@ -489,18 +489,19 @@ def munchausen_target(
 ) -> tuple[Array, Array, Array]:
     """Returns the reward, the discount and what follows, of Munchausen Q-learning (arXiv 2007.14430, equation 3 and M-IQN).
 
-    With the policies ``pi = softmax(Q' / tau)`` and a description ``Z'`` of the return that follows::
+    With the policy ``pi = softmax(Q' / tau)`` and a description ``Z'`` of the return that follows::
 
         r + alpha [tau log pi(a|s)]_clip^0 + d sum_a' pi(a'|s') (Z'(s', a') - tau log pi(a'|s'))
 
     The entropy does not depend on the description, so that it is a part of the reward here. For n-step returns it is
-    discounted with the value that follows, and only the first action has its log-probability added.
+    discounted with the value that follows, and only the first action has its log-probability added. With double Q-learning,
+    which the paper does not have, the policy is that of ``Q`` in both places, and ``Z'`` stays the target's.
 
     Args:
         settings: ``alpha``, the temperature ``tau`` and ``clip``.
         batch: of transitions.
-        own: values of all actions in ``obs``, ``(batch, n_actions)``.
-        values: by which the policy chooses in ``next_obs``, likewise.
+        own: values of all actions in ``obs`` by which the policy chooses, ``(batch, n_actions)``.
+        values: those in ``next_obs``, likewise.
         following: ``(batch, n_actions, ...)``.
     """
     tau = settings.temperature
