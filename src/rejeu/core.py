@@ -148,6 +148,8 @@ class Clock(NamedTuple):
     """Episodes finished so far, over all environments."""
     progress: Any
     """How far schedules are, in [0, 1]: the fraction that is done of the present ``learn`` call and those it continues."""
+    n_envs: Any = 1
+    """Environments that step at once, by which ``step`` grows."""
 
 
 class Explorer(NamedTuple):

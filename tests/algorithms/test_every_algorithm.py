@@ -122,6 +122,17 @@ def test_targets_start_as_copies_and_move_by_themselves(kind):
         assert 0 < moved[target] < (2 + kind.delay) * LEARNING["tau"] * moved[online]
 
 
+@pytest.mark.parametrize("kind", [KINDS[name] for name in ("DQN", "QRDQN", "IQN")], ids=("DQN", "QRDQN", "IQN"))
+def test_a_step_of_several_environments_moves_the_target_once(kind):
+    """As in Stable-Baselines3, whose interval of 1 is one step of the vector environment, which is 4 steps here."""
+    one, four = (
+        small(kind, wanderers(kind, 4), learning_starts=16, train_freq=8, target_update_interval=n).learn(64)
+        for n in (1, 4)
+    )
+    assert one.n_updates == 6
+    assert_same_parameters(one, four)
+
+
 @every_algorithm
 def test_critics_start_different_and_targets_share_no_memory_with_the_networks(kind):
     """Equal targets in the same memory would be overwritten when the state is donated to an update."""

@@ -23,8 +23,9 @@ place of it probabilities, quantiles (:mod:`rejeu.algorithms.qrdqn`) or a quanti
 
 The target moves just before the first gradient step at or after every multiple of ``target_update_interval``: to the
 same numbers as in Stable-Baselines3, where it moves between two gradient steps. If several multiples have passed since
-the last gradient step, so many soft updates are made at once, of ``1 - (1 - tau)^n`` together. Unlike there, the
-interval is counted in environment steps exactly, also where the number of environments does not divide it.
+the last gradient step, so many soft updates are made at once, of ``1 - (1 - tau)^n`` together. As there, several
+environments that step at once count as one step for an interval that is shorter. Unlike there, a longer one is counted in
+environment steps exactly, also where the number of environments does not divide it.
 
 Unlike in the paper on dueling networks, the gradients of both streams enter the shared layers unscaled, without the factor
 ``1 / sqrt(2)``.
@@ -103,8 +104,8 @@ class QLearningConfig(OffPolicyConfig):
     """Update every ``train_freq`` environment steps, or ``(n, "episode")``: every n finished episodes. Counted over all
     environments together."""
     target_update_interval: int = 10_000
-    """Environment steps between two updates of the target network, over all environments. A larger interval is more
-    stable and slower."""
+    """Environment steps between two updates of the target network, over all environments, and at least one step of each. A
+    larger interval is more stable and slower."""
     exploration_fraction: float = 0.1
     """Fraction of the run over which epsilon decreases, in (0, 1]."""
     exploration_initial_eps: float = 1.0
@@ -280,7 +281,8 @@ def q_learning(
         return State(network, copy(network), optimizer.init(network), jnp.uint32(0), jnp.int32(0), update_key)
 
     def update(state: State, batch: Transition, clock: Clock) -> tuple[State, Metrics]:
-        moves = moves_due(state.step, clock.step, config.target_update_interval)
+        interval = jnp.maximum(jnp.asarray(clock.n_envs, jnp.uint32), config.target_update_interval)
+        moves = moves_due(state.step, clock.step, interval)
         target_network = moved_target(state.target_network, state.network, moves, config.tau)
         key, *keys = (None, *NO_KEYS) if state.key is None else jax.random.split(nth(state.key, state.n_updates), 3)
         target = without_gradient(td_target)(state.network, target_network, batch, config.double_q, returns, keys)
@@ -577,7 +579,7 @@ def epsilon_schedule(config: Any) -> Schedule:
     return kind(config.exploration_initial_eps, config.exploration_final_eps, config.exploration_fraction)
 
 
-def moves_due(last_step: Array, step: Any, interval: int) -> Array:
+def moves_due(last_step: Array, step: Any, interval: Any) -> Array:
     """Returns how many multiples of ``interval`` lie above ``last_step`` and not above ``step``, ``int32[]``.
 
     >>> int(moves_due(jnp.uint32(599), jnp.uint32(608), 600))

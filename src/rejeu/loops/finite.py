@@ -268,7 +268,7 @@ def _save(
     header = {
         "algorithm": agent.name,
         "env_id": None if run.env is None else run.env.env_id,
-        "clock": {"step": step, "episode": int(clock.episode), "progress": float(clock.progress)},
+        "clock": {name: np.asarray(value).item() for name, value in clock._asdict().items()},
         "n_updates": n_updates,
         "names": names,
     }
@@ -325,7 +325,8 @@ def load_batch(agent: Any, path: str | Path) -> tuple[Transition | Rollout, Cloc
         arrays = file.read()
     try:
         clock = header["clock"]
-        clock = Clock(np.uint32(clock["step"]), np.uint32(clock["episode"]), np.float32(clock["progress"]))
+        step, episode, n_envs = map(np.uint32, (clock["step"], clock["episode"], clock.get("n_envs", 1)))
+        clock = Clock(step, episode, np.float32(clock["progress"]), n_envs)
     except (KeyError, TypeError, ValueError, OverflowError):
         raise CheckpointError(f"{path}: the header is damaged") from None
     return jax.tree.unflatten(jax.tree.structure(like), [arrays[name] for name in names]), clock

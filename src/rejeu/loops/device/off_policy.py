@@ -166,7 +166,7 @@ def take_turn(program: OffPolicyProgram, env: FunctionalEnv, loop: Loop, limits:
         learned = learned._replace(state=algorithm.observe(learned.state, episodes.obs, episodes.running_return))
     n_ended = (episodes.n_finished - before.episodes.n_finished).astype(jnp.int32)
     n, counts = due(config, before.counts, jnp.sum(result.kept, dtype=jnp.int32), n_ended, limits.learn_from)
-    clock = Clock(counts.step, episodes.n_finished, limits.progress[i + 1])
+    clock = Clock(counts.step, episodes.n_finished, limits.progress[i + 1], program.n_envs)
     n_pending = jnp.where(n <= limits.most_updates, before.counts.pending, 0)
     carry, root = loop.carry._replace(counts=counts), draws(before.key, clock.step)
 

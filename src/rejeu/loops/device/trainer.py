@@ -257,7 +257,7 @@ class DeviceTrainer:
         skipped = int(self.carries[0].in_a_row) if self.program.skips else 0
         self._repeat(limits._replace(most_updates=np.int32(number)), in_a_row)
         carry, group = self.carries[0], self.groups[0]
-        clock = Clock(carry.counts.step, carry.episodes.n_finished, limits.progress[1])
+        clock = Clock(carry.counts.step, carry.episodes.n_finished, limits.progress[1], self.program.n_envs)
         batch = copies(self.compiled(bad_batch)(group.carry, group.experience, clock, np.uint32(number)))
         before = None if self.program.skips else group.carry.state
         raise NonFiniteUpdate(before, batch, clock, skipped, run.n_updates + number)
