@@ -213,6 +213,20 @@ def test_a_target_of_iqn_has_the_quantiles_of_the_best_action():
         np.testing.assert_allclose(given[i], batch.reward[i] + batch.discount[i] * quantiles, atol=1e-5)
 
 
+def test_the_loss_of_iqn_is_at_the_fractions_of_its_predictions():
+    _, state = make(iqn, **IQN)
+    batch, key = random_batch(), jax.random.PRNGKey(3)
+    target = np.random.default_rng(0).normal(size=(BATCH, 6))
+    loss, _ = dqn.td_loss(state.network, batch, jnp.asarray(target, jnp.float32), iqn.implicit_returns(5, 6, 7, 4), key)
+    fractions, expected = np.asarray(jax.random.uniform(key, (BATCH, 5))), 0.0
+    for i in range(BATCH):
+        current = implicit(state.network, batch.obs[i], fractions[i])[batch.action[i]]
+        u = target[i][None] - current[:, None]
+        huber = np.where(np.abs(u) <= 1, u * u / 2, np.abs(u) - 0.5)
+        expected += (np.abs(fractions[i][:, None] - (u < 0)) * huber).mean(axis=1).sum() / BATCH
+    assert float(loss) == pytest.approx(expected, rel=1e-5)
+
+
 def test_iqn_draws_other_fractions_in_every_update():
     algorithm, state = make(iqn, **IQN)
     errors = [

@@ -89,6 +89,30 @@ def test_the_step_is_the_natural_gradient_scaled_to_the_bound(actions):
     np.testing.assert_array_equal(network.value_head.weight, state.network.value_head.weight)
 
 
+def test_the_step_is_within_the_bound_and_the_attempt_before_it_was_not():
+    """The attempt before is a ninth longer. By the reversed divergence, or with a bound half as large again, it would do."""
+    config, algorithm = make("box", target_kl=0.3, line_search_shrinking_factor=0.9, line_search_max_iter=40)
+    state = begin(algorithm)
+    data = samples(state.network, random_rollout(ACTIONS["box"][0], seed=2), config.gae_lambda)
+    network, step = jax.jit(lambda n, d: trpo.policy_step(n, d, config))(state.network, data)
+
+    def normal(scale):
+        """Means and standard deviations after a multiple of the step that was taken."""
+        old, new = ([n.head.weight, n.head.bias, n.log_std] for n in (state.network, network))
+        weight, bias, log_std = (
+            np.float64(o) + scale * (np.float64(n) - np.float64(o)) for o, n in zip(old, new, strict=True)
+        )
+        return np.float64(data.obs) @ weight + bias, np.exp(log_std)
+
+    def divergence(one, two):
+        (mean, std), (other, wider) = one, two
+        return (np.log(wider / std) + (std**2 + (mean - other) ** 2) / (2 * wider**2) - 0.5).sum(axis=1).mean()
+
+    assert float(step.kl) == pytest.approx(divergence(normal(0.0), normal(1.0)), rel=1e-4)
+    assert float(step.kl) < 0.3 < divergence(normal(0.0), normal(1 / 0.9)) < 1.5 * 0.3
+    assert divergence(normal(1 / 0.9), normal(0.0)) < 0.3
+
+
 def test_a_step_that_does_not_improve_is_refused():
     """With one attempt whose step is far too long for the quadratic approximation, the policy stays; the value learns."""
     _, algorithm = make("choice", target_kl=50.0, cg_damping=0.0, line_search_max_iter=1, cg_max_steps=40)

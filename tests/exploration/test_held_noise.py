@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import rejeu
-from rejeu.algorithms import crossq, sac, tqc
+from rejeu.algorithms import crossq, flashsac, sac, tqc, xqc
 from rejeu.algorithms.sac import continuous
 from rejeu.core import Clock
 from rejeu.exploration.held_noise import spells
@@ -52,6 +52,19 @@ def test_an_action_is_the_policy_with_noise_that_stays_for_a_spell(module):
         )
         for i in changes:
             assert left[i - 1][env] == 0 or i == begins
+
+
+@pytest.mark.parametrize("module", [sac, tqc, crossq, flashsac, xqc])
+def test_noise_is_drawn_anew_where_an_episode_begins_and_else_after_its_spell(module):
+    settings = {"noise_repeat": 9, "policy_kwargs": {"net_arch": [4]}}
+    algorithm = module.make(module.Config(**settings), OBS_SPACE, BOX)
+    shapes = jax.eval_shape(algorithm.actor, jax.eval_shape(algorithm.init, jax.random.PRNGKey(1)))
+    carry = algorithm.explorer.init(shapes, 3)._replace(left=jnp.array([5, 5, 0]))
+    actor = jax.tree.map(lambda leaf: jnp.ones(leaf.shape, leaf.dtype), shapes)
+    obs, ended = jnp.zeros((3, OBS_DIM)), jnp.array([True, False, False])
+    _, after = algorithm.explorer.act(carry, actor, obs, ended, jax.random.PRNGKey(2), CLOCK)
+    assert (np.asarray(after.noise != carry.noise).any(axis=1) == [True, False, True]).all()
+    assert int(after.left[1]) == 4
 
 
 def test_an_agent_with_it_learns_and_resumes_equal(tmp_path):
