@@ -70,7 +70,17 @@ def assert_same_priorities(one: Any, two: Any, tolerance: float) -> None:
         pytest.param(3, {"train_freq": 4, "gradient_steps": 2, "n_steps": 2}, marks=pytest.mark.exhaustive),
         pytest.param(2, {"train_freq": (2, "episode"), "gradient_steps": 3}, marks=pytest.mark.exhaustive),
         pytest.param(2, {"overlap": False, "gradient_steps": -1}, marks=pytest.mark.exhaustive),
-        (2, {"priorities": {}, "train_freq": 4, "gradient_steps": 2, "n_steps": 2, "target_update_interval": 1, "tau": 0.3}),
+        (
+            2,
+            {
+                "priorities": {},
+                "train_freq": 4,
+                "gradient_steps": 2,
+                "n_steps": 2,
+                "target_update_interval": 1,
+                "tau": 0.3,
+            },
+        ),
         pytest.param(3, {"priorities": {"alpha": 1.0}, "gradient_steps": -1}, marks=pytest.mark.exhaustive),
     ],
 )
