@@ -56,6 +56,14 @@ def attribute(env: Any, name: str) -> Any:
     return None if getattr(found, "__isabstractmethod__", False) else found
 
 
+def info_fault(name: str, error: KeyError) -> BadEnvironmentError:
+    """Returns what to raise where a function of goals reads a key of the info that is not there."""
+    return BadEnvironmentError(
+        f"{name} found no key {error}: the info is empty in hindsight replay; let it depend on the goals alone, or "
+        "keep infos with replay_buffer_kwargs={'copy_info_dict': True}"
+    )
+
+
 def over_batches(function: Callable[..., Any], dtype: Any) -> Callable[..., np.ndarray]:
     """Returns ``function(achieved, desired, info)`` as a function of batches of goals, and of their infos if they are given.
 
@@ -75,10 +83,7 @@ def over_batches(function: Callable[..., Any], dtype: Any) -> Callable[..., np.n
         try:
             rows = [one_number(function(a, d, info)) for a, d, info in zip(achieved, desired, each, strict=True)]
         except KeyError as error:
-            raise BadEnvironmentError(
-                f"{name} found no key {error}: the info is empty in hindsight replay; let it depend on the goals alone, or "
-                "keep infos with replay_buffer_kwargs={'copy_info_dict': True}"
-            ) from error
+            raise info_fault(name, error) from error
         if any(row is None or np.shape(row) != () for row in rows):
             wrong = next(row for row in rows if row is None or np.shape(row) != ())
             raise BadEnvironmentError(

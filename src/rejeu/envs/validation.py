@@ -148,21 +148,28 @@ def called_reset(env: gym.Env, seed: int | None = None, options: dict[str, Any] 
     Raises:
         BadEnvironmentError: if it does not accept a seed, or not this one.
     """
-    arguments: dict[str, Any] = {} if options is None else {"options": options}
-    if seed is None:
-        return env.reset(**arguments)
+    arguments = {key: value for key, value in (("seed", seed), ("options", options)) if value is not None}
     try:
-        return env.reset(seed=seed, **arguments)
+        return env.reset(**arguments)  # type: ignore[arg-type]
     except Exception as error:
-        fault = arguments_fault(env) if isinstance(error, TypeError) else None
-        if fault is None and not _resets(env, arguments):
-            raise
-        raise BadEnvironmentError(
-            fault
-            or f"reset(seed={seed}) raised {type(error).__name__}: {error}, and reset without a seed does not; accept every "
-            "seed from 0 to 2**31 - 2, of which rejeu chose this one, or give one seed for each environment: "
-            "rejeu.make_vector(env, 2, seed=[0, 1])"
-        ) from error
+        if (fault := seed_fault(env, seed, options, error)) is not None:
+            raise BadEnvironmentError(fault) from error
+        raise
+
+
+def seed_fault(env: gym.Env, seed: int | None, options: dict[str, Any] | None, error: Exception) -> str | None:
+    """Describes why ``reset`` raised an error because of its seed; None if the seed is not the reason."""
+    if seed is None:
+        return None
+    if isinstance(error, TypeError) and (fault := arguments_fault(env)) is not None:
+        return fault
+    if not _resets(env, {} if options is None else {"options": options}):
+        return None
+    return (
+        f"reset(seed={seed}) raised {type(error).__name__}: {error}, and reset without a seed does not; accept every seed "
+        "from 0 to 2**31 - 2, of which rejeu chose this one, or give one seed for each environment: "
+        "rejeu.make_vector(env, 2, seed=[0, 1])"
+    )
 
 
 def _resets(env: gym.Env, arguments: dict[str, Any]) -> bool:
