@@ -172,18 +172,14 @@ class Learner:
         """
 
         def step(before: PyTree, drawn: tuple[Any, Clock]) -> tuple[PyTree, Metrics]:
-            batch, clock = drawn
-            after, metrics = self.algorithm.update(before, batch, clock)
+            after, metrics = self.algorithm.update(before, *drawn)
             metrics = {name: jnp.asarray(value) for name, value in metrics.items()}
             return undo(before, after, metrics) if self.skips else (after, metrics)
 
         before = xla.one_kernel(self.packing.unpack)(state)
         is_one = isinstance(batches, Rollout) or batches.reward.ndim == 1
-        if is_one:
-            after, metrics = step(before, (batches, clock))
-        else:
-            clocks = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, len(batches.reward)), clock)
-            after, metrics = jax.lax.scan(step, before, (batches, clocks))
+        clocks = clock if is_one else jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, len(batches.reward)), clock)
+        after, metrics = step(before, (batches, clocks)) if is_one else jax.lax.scan(step, before, (batches, clocks))
         # Without the barrier XLA would compute the optimizer's step once more for the check.
         state = jax.lax.optimization_barrier(xla.one_kernel(self.packing.pack, self.packing.longest)(after))
         td_error = td_error_of(metrics, batches)
