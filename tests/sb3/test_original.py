@@ -160,6 +160,14 @@ def test_neutral_arguments_are_accepted_and_those_not_followed_warn():
     )
     assert model.config.action_noise == noise.base_noise
     env = sb3.common.env_util.make_vec_env("Pendulum-v1")
+    for make, given in (
+        (sac, {"use_sde_at_warmup": True}),
+        (ppo, {"rollout_buffer_class": sb3.common.buffers.RolloutBuffer}),
+        (ppo, {"rollout_buffer_kwargs": {"gamma": 0.5}}),
+    ):
+        with pytest.warns(UserWarning, match=f"{next(iter(given))}=.* has no effect") as caught:
+            make(**given)
+        assert len(caught) == 1
     with pytest.warns(UserWarning, match="handle_timeout_termination"):
         sb3.SAC("MlpPolicy", env, replay_buffer_kwargs={"handle_timeout_termination": False}, **SMALL)
     with pytest.raises(TypeError, match="no_such_argument"):

@@ -25,9 +25,12 @@ WITHOUT_EFFECT = (
     "monitor_wrapper",
     "support_multi_env",
 )
-"""Arguments that mean nothing here and are accepted with any value."""
+"""Arguments that mean nothing here and are accepted with any value; those in ``NEUTRAL`` warn of other values."""
 NEUTRAL: dict[str, tuple[Any, ...]] = {
     "use_sde": (False,),
+    "use_sde_at_warmup": (False,),
+    "rollout_buffer_class": (None,),
+    "rollout_buffer_kwargs": (None, {}),
     "sde_sample_freq": (-1,),
     "squash_output": (False, True),
     "use_expln": (False,),
@@ -66,6 +69,8 @@ def converted(kind: type[Agent], settings: Mapping[str, Any]) -> dict[str, Any]:
     result: dict[str, Any] = {}
     for key, value in settings.items():
         if key in WITHOUT_EFFECT or (key not in known and value in NEUTRAL.get(key, ())):
+            if value not in NEUTRAL.get(key, (value,)):
+                unsupported(key, value)
             continue
         result[key] = utils.of_progress(value) if key in SCHEDULED else value
     if isinstance(result.get("priorities"), Mapping):
