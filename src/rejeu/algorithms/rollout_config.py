@@ -21,7 +21,8 @@ class RolloutConfig(AlgorithmConfig):
     often."""
     n_episodes: int | None = None
     """Complete episodes of each environment between two updates, instead of ``n_steps``; environments that are done wait
-    for the others. Without a time limit an episode counts at most ``n_steps`` steps. None uses ``n_steps``."""
+    for the others. Without a time limit an episode ends after ``n_steps`` steps, and the history leaves it out. None uses
+    ``n_steps``."""
 
     max_grad_norm: float | None = 0.5
 

@@ -378,7 +378,8 @@ def learn_offline(
     Hindsight replay and n-step returns work as in training. Ctrl-C ends it, and keeps what was learned.
 
     Args:
-        agent: learns with its own settings; schedules and target networks follow the updates.
+        agent: learns with its own settings; schedules follow the updates, and target networks that move after a number of
+            environment steps count each update as one.
         demonstrations: with its spaces.
         updates: number of gradient steps.
         keep_policy: learn the values of the present policy, such as that of :func:`clone`, and leave it as it is, with its
