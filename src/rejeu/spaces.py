@@ -180,6 +180,8 @@ def check_policy(policy: str, space: spaces.Space, normalize_images: bool = True
         raise ValueError("policy='MlpPolicy' does not fit a Dict observation; use 'MultiInputPolicy'")
     if policy == "MultiInputPolicy" and not isinstance(space, spaces.Dict | spaces.Tuple):
         raise ValueError(f"policy='MultiInputPolicy' needs a Dict or Tuple observation, got {space}; use 'MlpPolicy'")
+    if not any(leaf.n_features for leaf in leaves(space)):
+        raise ValueError(f"the observation space is {space}, which holds nothing; show the agent one number at least")
     images = [leaf.kind == "image" or (len(leaf.shape) == 3 and not normalize_images) for leaf in leaves(space)]
     if policy == "CnnPolicy" and not any(images):
         raise ValueError(f"policy='CnnPolicy' needs a uint8 image observation, got {space}; use 'MlpPolicy'")

@@ -20,7 +20,7 @@ from rejeu.envs import validation
 from rejeu.envs.base import SEEDS_END
 from rejeu.envs.goals import attribute
 from rejeu.errors import BadEnvironmentError
-from rejeu.spaces import GOAL_KEYS, bounded, check_goal_space, leaves, members, plain, random_action
+from rejeu.spaces import GOAL_KEYS, bounded, check_action, check_goal_space, check_policy, members, plain, random_action
 
 MOST_STEPS = 2_000
 """Random steps after which episodes are assumed never to end, in an environment that declares no time limit."""
@@ -128,9 +128,14 @@ def _played(env: gym.Env, effort: Effort) -> dict[str, Finding]:
     if (fault := validation.environment_fault(env)) is not None:
         raise TypeError(fault)
     try:
-        leaves(env.observation_space)
+        is_nested = isinstance(env.observation_space, spaces.Dict | spaces.Tuple)
+        check_policy("MultiInputPolicy" if is_nested else "MlpPolicy", env.observation_space)
         random_action(env.action_space, 1, np.random.default_rng(SEED))
-    except TypeError as error:
+        if (
+            not isinstance(env.action_space, spaces.Box) or env.action_space.dtype.kind == "f"
+        ):  # SAC takes whole numbers too
+            check_action(env.action_space, "every algorithm")
+    except (TypeError, ValueError) as error:
         return {"space": Finding("error", str(error))}
     found: dict[str, Finding] = {}
     seen = _play(env, found, effort)
