@@ -337,7 +337,7 @@ class Spaceless(gym.Env): ...
 NO_ENVIRONMENTS = {
     SeveralAgents: "got SeveralAgents, an environment of several agents as PettingZoo's; rejeu trains one",
     Simulator: "got Simulator, as dm_control's; wrap it: shimmy",
-    OldEnvironment: "got OldEnvironment; .*of the old package gym: shimmy",
+    OldEnvironment: "got OldEnvironment; .*of the old package gym .*: rejeu.OldEnvironment",
     Spaceless: "Spaceless has no observation_space and no action_space; set it in __init__",
     (lambda: None): "got NoneType; derive its class",
     (lambda: "CartPole-v1"): r"got str; make it: gymnasium.make\('CartPole-v1'\)",

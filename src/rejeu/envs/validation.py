@@ -282,7 +282,7 @@ def environment_fault(env: Any, expected: str = "a gymnasium.Env") -> str | None
         name += ", several environments as one"
         fix = "give a single one"
     elif hasattr(env, "reset") and hasattr(env, "step"):
-        fix += ", or wrap it, if it is of the old package gym: shimmy.GymV21CompatibilityV0(env=env)"
+        fix += ", or wrap it, if it is of the old package gym or in its style: rejeu.OldEnvironment(env)"
     return f"env must be {expected}, got {name}; {fix}"
 
 

@@ -1,4 +1,4 @@
-"""A wrapper that treats time limits as terminal states, and ``rejeu/CartPoleNoVelocity-v0``, which is partially observable."""
+"""Wrappers for time limits and old environments, and ``rejeu/CartPoleNoVelocity-v0``, which is partially observable."""
 
 from __future__ import annotations
 
@@ -31,6 +31,72 @@ class TimeLimitTerminates(gym.Wrapper, gym.utils.RecordConstructorArgs):
         """Steps the environment, and reports truncation as termination."""
         obs, reward, terminated, truncated, info = self.env.step(action)
         return obs, reward, terminated or truncated, False, info
+
+
+class OldEnvironment(gym.Env):
+    """Makes an environment of Gymnasium from one written for the old package gym, or in its style.
+
+    ``reset()`` of such an environment returns the observation, and ``step(action)`` ``(obs, reward, done, info)``. Its
+    spaces may be of any class with ``low`` and ``high``, of ``shape`` if that is given, or with ``n``. An episode that is
+    done counts as terminated, or as truncated if ``info["TimeLimit.truncated"]`` is true.
+
+    Args:
+        env: the old environment. If it has no ``seed`` method and draws from
+            ``numpy.random``, its episodes are not repeatable.
+
+    Raises:
+        ValueError: if a space has neither bounds nor a number of choices.
+    """
+
+    def __init__(self, env: Any) -> None:
+        self.old = env
+        self.observation_space = to_space(env.observation_space)
+        self.action_space = to_space(env.action_space)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Resets the environment, after its ``seed`` method was given the seed if it has one."""
+        super().reset(seed=seed)
+        if seed is not None and hasattr(self.old, "seed"):
+            self.old.seed(seed)
+        return self._converted(self.old.reset()), {}
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Steps the environment, and tells time limits from ends of the task."""
+        obs, reward, done, info = self.old.step(action)
+        cut = bool(done) and bool(info.get("TimeLimit.truncated", False))
+        return self._converted(obs), reward, bool(done) and not cut, cut, info
+
+    def render(self) -> Any:
+        """Calls the environment's ``render``."""
+        return self.old.render()
+
+    def close(self) -> None:
+        """Closes the environment if it can be closed."""
+        getattr(self.old, "close", lambda: None)()
+
+    def _converted(self, obs: Any) -> Any:
+        return np.array(obs, np.float32) if self.observation_space.dtype == np.float32 else obs
+
+
+def to_space(space: Any) -> gym.Space:
+    """Returns Gymnasium's space for one of another class: a Box for ``low`` and ``high``, Discrete for ``n``.
+
+    Raises:
+        ValueError: if it has neither.
+    """
+    if isinstance(space, gym.Space):
+        return space
+    if hasattr(space, "low") and hasattr(space, "high"):
+        dtype = getattr(space, "dtype", None) or np.float32
+        shape = tuple(getattr(space, "shape", None) or np.shape(space.low))
+        low, high = (np.broadcast_to(np.asarray(bound, dtype), shape) for bound in (space.low, space.high))
+        return gym.spaces.Box(low, high, shape, dtype)
+    if hasattr(space, "n"):
+        return gym.spaces.Discrete(int(space.n))
+    raise ValueError(
+        f"expected a space with low and high, or with n, got {type(space).__name__}; give the environment spaces of "
+        "gymnasium.spaces"
+    )
 
 
 def cart_pole_without_velocities(render_mode: str | None = None) -> gym.Env:
