@@ -20,6 +20,7 @@ from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Tu
 from rejeu import demonstrations
 from rejeu.demonstrations import dataset
 from rejeu.demonstrations.recording import Recording
+from rejeu.errors import CheckpointError
 from rejeu.spaces import same
 from tests.full_disk import FullDisk
 
@@ -412,4 +413,30 @@ def test_a_dataset_without_spaces_runs_no_code_to_find_them(tmp_path: Path, monk
         del file.attrs["observation_space"]
     with pytest.raises(ValueError, match="does not describe the spaces"):
         demonstrations.read(data)
+    assert "rejeu_test_evil" not in sys.modules
+
+
+@pytest.mark.parametrize(
+    ("env_id", "kwargs"),
+    [
+        ("rejeu_test_evil:Env-v0", {}),
+        ("FrozenLake-v1", {"map_name": "rejeu_test_evil:Env"}),
+        ("Ant-v5", {"xml_file": "/rejeu_test_evil.xml"}),
+    ],
+)
+def test_a_clone_imports_no_environment_that_a_dataset_names(
+    env_id: str, kwargs: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Gymnasium imports what an id has before a colon."""
+    from rejeu.cli.clone import environment_of
+    from rejeu.cli.commands import Clone
+
+    (tmp_path / "rejeu_test_evil.py").write_text("raise SystemExit('code of a file was run')")
+    monkeypatch.syspath_prepend(tmp_path)
+    data = plain(tmp_path)
+    spec = json.dumps({"id": env_id, "entry_point": "rejeu_test_evil:Env", "kwargs": kwargs})
+    change_metadata(data, lambda metadata: metadata.update(env_spec=spec))
+    with pytest.raises(CheckpointError, match=r"no file may .*: *--env") as caught:
+        environment_of(demonstrations.read(data), Clone(dataset=data))
+    assert "\n" not in str(caught.value)
     assert "rejeu_test_evil" not in sys.modules
