@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -499,6 +501,24 @@ def test_an_environment_of_other_spaces_is_refused_and_the_old_one_kept():
     with pytest.raises(ValueError, match="the new environment has the action space"):
         agent.set_env(Counter(low=[-3.0], high=[3.0]))
     assert agent.env is old
+
+
+def test_an_agent_learns_in_one_thread_at_a_time():
+    agent, failed = small_sac(counters(1), learning_starts=NEVER), []
+
+    def learn():
+        with pytest.raises(RuntimeError, match="learning already, in another thread") as caught:
+            agent.learn(5)
+        failed.append(caught.value)
+
+    def callback(agent, progress):
+        thread = threading.Thread(target=learn)
+        thread.start()
+        thread.join()
+
+    assert agent.learn(3, callback).num_timesteps == 3
+    assert len(failed) == 3
+    assert agent.learn(2, reset_num_timesteps=False).num_timesteps == 5
 
 
 def test_hindsight_rewards_come_from_the_new_environment():

@@ -72,6 +72,7 @@ class Agent(BaseAgent):
 
         Raises:
             ValueError: without an environment or a limit.
+            RuntimeError: if the agent is learning, in a callback or another thread.
         """
         call = training.start_call(self, total_timesteps, episodes, minutes, log_interval, reset_num_timesteps)
         with devices.chosen(self.device):

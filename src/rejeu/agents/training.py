@@ -157,7 +157,13 @@ def start_call(
 
     Raises:
         ValueError: without an environment; without a limit, unless the agent resumes an unfinished ``learn``.
+        RuntimeError: if the agent is learning.
     """
+    if agent.is_learning:
+        raise RuntimeError(
+            "this agent is learning already, in another thread or around a callback; let that learn return first, or "
+            "give each thread an agent of its own"
+        )
     run = agent.run
     if run.env is None:
         raise ValueError("this agent has no environment to learn in; give one to load(path, env=...) or set_env(env)")
