@@ -1296,9 +1296,9 @@ def both(peer: str, only: list[str]) -> tuple[dict[str, Any], dict[str, Any]]:
 
 DIFFERENT: dict[str, str] = {
     "normalize_advantage": "divided by the standard deviation over n, there over n - 1 (Training)",
-    "PPO_Discrete_clip_range1": "the schedule is read when the update begins; there the progress is that of the step before",
-    "clip_range1": "the schedule is read when the update begins, as is that of the learning rate",
-    "sub_sampling_factor": "which steps are left out is drawn at random",
+    "PPO_Discrete_clip_range1": "a clip range of 0 at the end of the schedule: the ratio 1 passes 0.625 of the gradient, there all of it",
+    "clip_range1": "as PPO_Discrete_clip_range1",
+    "sub_sampling_factor": "every k-th step in the order of the rollout, there after shuffling",
     "TRPO_Box": "target_kl and cg_damping bound the sum over action dimensions, there their mean",
     "TRPO": "conjugate gradients in another precision",
     "RecurrentPPO": "not explained yet; a critic without LSTM is refused. Perhaps the memory of the first steps of each rollout",
