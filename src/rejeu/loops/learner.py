@@ -184,8 +184,7 @@ class Learner:
         state = jax.lax.optimization_barrier(xla.one_kernel(self.packing.pack, self.packing.longest)(after))
         td_error = td_error_of(metrics, batches)
         metrics.pop(TD_ERROR, None)
-        vectors = state[: len(self.packing.groups)]  # large arrays are checked by the monitor
-        return state, readings(vectors, metrics), td_error
+        return state, readings(state[: len(self.packing.groups)], metrics), td_error  # the monitor checks large arrays
 
     def _init(self, key: Array) -> PackedState:
         """Returns the state before learning."""
