@@ -5,7 +5,7 @@ The equations are those of :mod:`rejeu.algorithms.flashsac`, from which it diffe
 map, batch normalization and ReLU), by what is projected (the weights, not the gains), by the actor, whose log standard
 deviation is clipped and which normalizes by the batch's observations alone, and by the settings: rewards are divided by the
 standard deviation of the returns alone, the target entropy is minus half the number of action dimensions, and noise is not
-held.
+held. Unlike in the authors' code, the actor's learning rate falls with that of the critics, not with its own, fewer steps.
 """
 
 from __future__ import annotations
