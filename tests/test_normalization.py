@@ -178,18 +178,20 @@ def test_only_continuous_parts_of_nested_observations_are_scaled_each_by_itself(
         assert np.array_equal(one, other)
 
 
-def test_achieved_and_desired_goals_share_their_statistics():
+@pytest.mark.parametrize("shared", [True, False])
+def test_achieved_and_desired_goals_share_their_statistics_unless_told_otherwise(shared):
     rng = np.random.default_rng(3)
     obs = {
         "achieved_goal": rng.normal(0.0, 1.0, (9, 1)).astype(np.float32),
         "desired_goal": rng.normal(6.0, 2.0, (9, 1)).astype(np.float32),
         "observation": rng.normal(-9.0, 3.0, (9, 1)).astype(np.float32),
     }
-    algorithm = showing(spaces.Dict({key: box(1) for key in obs}))
+    algorithm = showing(spaces.Dict({key: box(1) for key in obs}), share_goals=shared)
     shown = algorithm.exploit(algorithm.actor(after_seeing(algorithm, obs)), obs)
     both = np.concatenate([obs["achieved_goal"], obs["desired_goal"]])
-    for key, seen in (("achieved_goal", both), ("desired_goal", both), ("observation", obs["observation"])):
-        np.testing.assert_allclose(shown[key], zscore(obs[key], seen), atol=1e-4)
+    seen = {**obs, "achieved_goal": both, "desired_goal": both} if shared else obs
+    for key, values in seen.items():
+        np.testing.assert_allclose(shown[key], zscore(obs[key], values), atol=1e-4)
 
 
 def test_a_mask_beside_the_observation_is_left_alone():

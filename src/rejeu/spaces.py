@@ -290,7 +290,7 @@ def check_not_empty(space: spaces.Box) -> None:
 def bounded(space: spaces.Box) -> np.ndarray:
     """Returns which components have two bounds that are finite, also for practical purposes; others are not scaled.
 
-    >>> bounded(spaces.Box(np.array([-1.0, -3e38, 0.0]), np.array([1.0, 3e38, np.inf]))).tolist()
+    >>> bounded(spaces.Box(np.float32([-1.0, -3e38, 0.0]), np.float32([1.0, 3e38, np.inf]))).tolist()
     [True, False, False]
     """
     return (np.abs(space.low.astype(np.float64)) < UNBOUNDED) & (np.abs(space.high.astype(np.float64)) < UNBOUNDED)

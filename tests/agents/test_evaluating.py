@@ -273,11 +273,12 @@ def test_eval_callback_keeps_to_the_masks(masked):
     assert callback.best_mean_reward == 6.0
 
 
-def test_an_evaluation_whose_masks_cannot_be_reached_is_refused_before_training(masked):
+def test_an_evaluation_finds_the_masks_behind_a_wrapper_of_the_vector(masked):
     from rejeu.sb3.common.vec_env import VecMonitor
 
-    with pytest.raises(TypeError, match="the masks of VecEnvAdapter cannot be accessed"):
-        masked.learn(12, callback=EvalCallback(VecMonitor(DummyVecEnv([One])), eval_freq=12))
+    env = One()
+    masked.learn(12, callback=EvalCallback(VecMonitor(DummyVecEnv([lambda: env])), eval_freq=12, n_eval_episodes=3))
+    assert (env.taken, env.illegal) == (18, 0)
 
 
 def test_a_masked_agent_may_be_evaluated_in_its_own_environment_while_it_learns(masked):

@@ -10,8 +10,6 @@ import pytest
 import rejeu
 from rejeu.algorithms import config as configs, crossq, ppo
 from rejeu.algorithms.actor_critic.network import ActorCritic
-from rejeu.callbacks import Checkpoint
-from rejeu.io import checkpoint
 from rejeu.spaces import leaves
 from tests.environments import Sampled
 from tests.tiers import exhaustive
@@ -77,42 +75,6 @@ def test_a_network_without_hidden_layers_learns():
     agent.learn(10)
     after = agent.get_parameters()
     assert all((before[key] != after[key]).any() for key in before if key.startswith("network."))
-
-
-# Files say the widths. Those written before left them to the default, which was that of numbers for images too.
-
-
-def as_written_before(path, kind):
-    """Rewrites a file as it was before it said the widths of hidden layers."""
-    header, arrays = checkpoint.read(path, kind)
-    assert header["config"]["policy_kwargs"]["net_arch"] is not None
-    header["config"]["policy_kwargs"]["net_arch"] = None
-    checkpoint.write(path, kind, arrays, {key: header[key] for key in header if key not in checkpoint.RESERVED})
-
-
-@pytest.mark.parametrize(("name", "space"), [("DQN", IMAGE), ("PPO", IMAGE), ("DDPG", IMAGE), ("TD3", VECTOR)])
-def test_a_model_saved_before_is_loaded_with_the_layers_that_it_had(tmp_path, name, space):
-    env = Sampled(space, DISCRETE if name == "DQN" else BOX)
-    settings = {"policy_kwargs": {"net_arch": SB3[name][1]}, "seed": 0}
-    agent = rejeu.AGENTS[name]("CnnPolicy" if space is IMAGE else "MlpPolicy", env, **settings)
-    path = agent.save(tmp_path / "model")
-    as_written_before(path, "agent")
-    loaded = rejeu.load(path)
-    obs = np.stack([space.sample() for _ in range(5)])
-    np.testing.assert_array_equal(loaded.predict(obs, deterministic=True)[0], agent.predict(obs, deterministic=True)[0])
-    assert rejeu.load(loaded.save(tmp_path / "again")).config == loaded.config == agent.config
-
-
-def test_a_run_saved_before_is_resumed_with_the_layers_that_it_had(tmp_path):
-    env = lambda: Sampled(IMAGE, DISCRETE)  # noqa: E731
-    agent = rejeu.DQN("CnnPolicy", env(), buffer_size=99, policy_kwargs={"net_arch": [64, 64]}, seed=0)
-    agent.learn(8, Checkpoint(tmp_path))
-    for path in tmp_path.glob("run_*.safetensors"):
-        as_written_before(path, "run")
-    with pytest.warns(UserWarning, match="new episodes"):
-        resumed = rejeu.DQN.resume(tmp_path, env())
-    assert resumed.config == agent.config
-    resumed.learn(8)
 
 
 def test_a_file_says_the_widths_so_that_no_other_default_changes_them():

@@ -417,7 +417,7 @@ def test_an_old_version_that_gymnasium_lists_and_cannot_make_names_the_new_one(c
 
 
 def test_a_folder_that_is_no_run_is_an_error(capsys, tmp_path):
-    assert "holds no best.safetensors" in error_of(capsys, "evaluate", str(tmp_path))
+    assert "is a folder without a model" in error_of(capsys, "evaluate", str(tmp_path))
 
 
 def test_a_run_folder_is_never_overwritten(capsys, run):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
+from pathlib import Path
 
 import pytest
 
@@ -65,7 +66,7 @@ def test_a_curve_takes_the_place_of_a_link(link):
 
 def test_a_file_that_a_reader_holds_is_replaced_when_it_is_closed(tmp_path, monkeypatch):
     """As on Windows, where another process that reads a file keeps it from being replaced."""
-    new, old, tries, rename = tmp_path / "new", tmp_path / "old", [], os.replace
+    new, old, tries, rename = tmp_path / "new", tmp_path / "old", [], Path.replace
     new.write_text("new")
     old.write_text("old")
 
@@ -75,10 +76,10 @@ def test_a_file_that_a_reader_holds_is_replaced_when_it_is_closed(tmp_path, monk
             raise PermissionError
         rename(source, target)
 
-    monkeypatch.setattr(os, "replace", held)
-    atomic.replace_patiently(new, old, (0.0, 0.0))
+    monkeypatch.setattr(Path, "replace", held)
+    atomic.replace(new, old, (0.0, 0.0))
     assert (old.read_text(), len(tries)) == ("new", 3)
     new.write_text("newer")
     tries.clear()
     with pytest.raises(PermissionError):
-        atomic.replace_patiently(new, old, (0.0,))
+        atomic.replace(new, old, (0.0,))

@@ -175,7 +175,7 @@ def test_a_symbolic_link_to_itself_is_no_file(tmp_path):
         path.symlink_to(path)
     except (OSError, NotImplementedError):
         pytest.skip("symbolic links cannot be made here")
-    with pytest.raises(FileNotFoundError, match="there is no file"):
+    with pytest.raises(FileNotFoundError, match="there is no"):
         rejeu.load(path)
 
 

@@ -192,5 +192,5 @@ def test_the_callback_is_called_after_every_step_that_counts_with_what_it_may_wa
 
 
 def test_a_mean_below_the_threshold_is_an_error():
-    with pytest.raises(ValueError, match=r"mean return 3.00 is not above reward_threshold=5.00"):
+    with pytest.raises(AssertionError, match=r"mean return 3.00 is not above reward_threshold=5.00"):
         rejeu.evaluate_policy(Still(), Counter(), 1, reward_threshold=5.0)

@@ -73,7 +73,7 @@ def test_frames_of_other_types_are_taken_if_their_values_fit(frame):
 class Still:
     """An agent that does nothing and remembers whether it was asked for its deterministic policy."""
 
-    env = None
+    run = SimpleNamespace(env=None)
 
     def __init__(self):
         self.asked = []

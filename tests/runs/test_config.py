@@ -11,11 +11,11 @@ import pytest
 import rejeu
 from rejeu.cli import commands, main, parsing
 from rejeu.errors import CheckpointError
-from rejeu.runs import config, folder
+from rejeu.runs import config
 from rejeu.runs.config import DecidedRun, RunConfig, Task, read_task, write_task
 from tests.cli.test_cli import FEWER_FILES, TINY
 
-EARLIER = {
+CONTENT = {
     "env": "Pendulum-v1",
     "algorithm": "SAC",
     "preset": True,
@@ -27,7 +27,7 @@ EARLIER = {
     "steps": 850,
     "minutes": None,
     "success_threshold": None,
-    "film_every": 700,
+    "video_every": 700,
     "evaluate_every": 400,
     "evaluate_episodes": 2,
     "checkpoint_minutes": None,
@@ -62,19 +62,6 @@ RUNS = {
 pytestmark = pytest.mark.usefixtures("learners_are_shared")
 
 
-def test_files_of_earlier_versions_are_read(tmp_path):
-    path = tmp_path / "config.json"
-    path.write_text(json.dumps(EARLIER))
-    found = config.read(path)
-    assert (found.video_every, found.device, found.wrappers, found.n_envs) == (700, "auto", (), 1)
-    config.write(path, found)
-    assert config.read(path) == found
-    run = folder.RunFolder(tmp_path)
-    assert run.videos == tmp_path / "videos"
-    (tmp_path / "films").mkdir()
-    assert run.videos == tmp_path / "films"
-
-
 @pytest.mark.parametrize(
     "changed",
     [
@@ -91,7 +78,7 @@ def test_files_of_earlier_versions_are_read(tmp_path):
         {"env_kwargs": []},
         {"n_envs": 0},
         {"evaluate_every": 0},
-        {"film_every": -1},
+        {"video_every": -1},
         {"steps": 0},
         {"minutes": -1.0, "steps": None},
         {"checkpoint_minutes": float("nan")},
@@ -101,7 +88,7 @@ def test_files_of_earlier_versions_are_read(tmp_path):
 )
 def test_what_is_out_of_range_is_damaged(tmp_path, changed):
     path = tmp_path / "config.json"
-    path.write_text(json.dumps({**EARLIER, **changed}))
+    path.write_text(json.dumps({**CONTENT, **changed}))
     with pytest.raises(CheckpointError, match=r"config\.json is damaged"):
         config.read(path)
 

@@ -14,7 +14,7 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import gymnasium as gym
 import jax
@@ -159,6 +159,9 @@ class BaseAgent(ABC):
     """Folders that contain its checkpoints, by path."""
     failed_writes: FailedWrites
     """What ``learn`` could not write, such as checkpoints and log rows when the disk is full."""
+    notes: list[str]
+    """What :func:`rejeu.sb3.load_zip` says of the file; only of agents that it read."""
+    predict: Callable[..., Any]
     last_saved: Path | None = None
     """The newest file that :meth:`save` wrote."""
     report_folder: Path | None = None
@@ -247,15 +250,17 @@ class BaseAgent(ABC):
             check_fits(noise, action_space)
         self.learner = Learner(self.algorithm_of(self.config), noise, self.config.nonfinite == "skip")
 
-    def __getattr__(self, name: str) -> Any:
-        """Returns a hyperparameter."""
-        known = validation.field_names(type(self).algorithm.Config)
-        if name in known and "config" in self.__dict__:
-            return getattr(self.config, name)
-        public = [one for one in dir(type(self)) if not one.startswith("_")]
-        near = difflib.get_close_matches(name, [*known, *public], 1)
-        hint = f"; did you mean {near[0]}?" if near else ""
-        raise AttributeError(f"{type(self).__name__} has no attribute {name!r}{hint}")
+    if not TYPE_CHECKING:  # so that a misspelt name is found by a type checker
+
+        def __getattr__(self, name: str) -> Any:
+            """Returns a hyperparameter."""
+            known = validation.field_names(type(self).algorithm.Config)
+            if name in known and "config" in self.__dict__:
+                return getattr(self.config, name)
+            public = [one for one in dir(type(self)) if not one.startswith("_")]
+            near = difflib.get_close_matches(name, [*known, *public], 1)
+            hint = f"; did you mean {near[0]}?" if near else ""
+            raise AttributeError(f"{type(self).__name__} has no attribute {name!r}{hint}")
 
     def __setattr__(self, name: str, value: Any) -> None:
         """Sets an attribute; one that agents do not have by :meth:`assign`."""

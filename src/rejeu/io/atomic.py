@@ -33,17 +33,18 @@ ADVICE = {
 """What to do about each error."""
 
 
-def replace_patiently(source: Path, target: Path, waits: Iterable[float] = (0.01, 0.04, 0.2, 0.75)) -> None:
-    """Renames a file over another one, which on Windows fails while a reader holds it: waits up to a second for that."""
+WAITS = () if os.name == "posix" else (0.01, 0.04, 0.2, 0.75)
+"""Seconds to wait before each further attempt to rename, which on Windows fails while a reader holds the file."""
+
+
+def replace(source: Path, target: Path, waits: Iterable[float] = WAITS) -> None:
+    """Renames a file over another one."""
     for seconds in waits:
         with contextlib.suppress(PermissionError):
-            return os.replace(source, target)
+            source.replace(target)
+            return
         time.sleep(seconds)
-    return os.replace(source, target)
-
-
-replace = os.replace if os.name == "posix" else replace_patiently
-"""Renames a file over another one."""
+    source.replace(target)
 
 
 @contextlib.contextmanager

@@ -221,7 +221,7 @@ class Contents:
             CheckpointError: if one is damaged; it says which.
         """
         arrays = {}
-        with _explained(self.path):
+        with explained(self.path):
             for name in self.specs:
                 if name.startswith(prefix):
                     arrays[name] = array = self._file.read(name)
@@ -246,7 +246,7 @@ def opened(path: str | Path, kind: str) -> Iterator[Contents]:
         CheckpointError: if it is not a complete rejeu file of that kind; it says what is wrong.
     """
     with contextlib.ExitStack() as stack:
-        with _explained(path):
+        with explained(path):
             path = existing(path)
             file = stack.enter_context(TensorFile(path))
             header, sums = _head(path, file, kind)
@@ -305,21 +305,8 @@ def within(found: Mapping[str, Any], prefix: str) -> dict[str, Any]:
     return {name.removeprefix(prefix): value for name, value in found.items() if name.startswith(prefix)}
 
 
-def existing(path: str | Path) -> Path:
-    """Returns the path of an existing file, of another suffix of models if it has none."""
-    path = resolve(path)
-    if path.suffix in (SUFFIX, *FOREIGN) and not path.exists():
-        others = (path.with_suffix(suffix) for suffix in (SUFFIX, *FOREIGN))
-        path = next((other for other in others if other.exists()), path)
-    if not path.exists():
-        raise FileNotFoundError(f"there is no file {path}")
-    if not path.is_file():
-        raise CheckpointError(f"{path} is not a file but a folder or a device; give the path of a file")
-    return path
-
-
 @contextlib.contextmanager
-def _explained(path: str | Path) -> Iterator[None]:
+def explained(path: str | Path) -> Iterator[None]:
     """Turns errors of reading into ``CheckpointError`` with the path of the file."""
     shown_path = atomic.shortened(path)
     try:
@@ -337,6 +324,25 @@ def _explained(path: str | Path) -> Iterator[None]:
         raise CheckpointError(f"{shown_path} holds more than fits in memory") from None
     except ValueError as error:
         raise CheckpointError(str(error)) from None
+
+
+def existing(path: str | Path) -> Path:
+    """Returns the path of an existing file, of another suffix of models if it has none.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        CheckpointError: if it is the path of something else.
+    """
+    with explained(path):
+        path = resolve(path)
+        if path.suffix in (SUFFIX, *FOREIGN) and not path.exists():
+            others = (path.with_suffix(suffix) for suffix in (SUFFIX, *FOREIGN))
+            path = next((other for other in others if other.exists()), path)
+        if not path.exists():
+            raise FileNotFoundError(f"there is no file {path}")
+        if not path.is_file():
+            raise CheckpointError(f"{path} is not a file but a folder or a device; give the path of a file")
+        return path
 
 
 def _head(path: Path, file: TensorFile, kind: str) -> tuple[Header, dict[str, int] | None]:

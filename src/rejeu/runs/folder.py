@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import time
 from dataclasses import dataclass
@@ -122,9 +123,9 @@ def find_model(run: str | Path, which: Literal["best", "last"] = "best") -> Path
         FileNotFoundError: if there is none.
     """
     path = Path(run)
-    if path.is_file():
+    if os.path.isfile(path):  # unlike Path.is_file, False for a name that is too long
         return path
-    if not path.is_dir() or (path.name not in ("", "..") and checkpoint.resolve(path).is_file()):
+    if not os.path.isdir(path) or (path.name not in ("", "..") and checkpoint.resolve(path).is_file()):
         try:
             return checkpoint.existing(path)
         except FileNotFoundError:

@@ -277,9 +277,10 @@ class VecNormalize(VecEnvWrapper):
             FileNotFoundError: if there is no such file.
             CheckpointError: if the file is damaged or belongs to other observations.
         """
-        with Path(load_path).open("rb") as found:
+        path = checkpoint.existing(load_path)
+        with path.open("rb") as found:
             if found.read(3) in PICKLES:
-                return of_original(Path(load_path), venv)
+                return of_original(path, venv)
         with checkpoint.opened(load_path, KIND) as file:
             try:
                 header = convert(file.header, Header)
