@@ -77,9 +77,9 @@ def test_a_file_that_a_reader_holds_is_replaced_when_it_is_closed(tmp_path, monk
         rename(source, target)
 
     monkeypatch.setattr(Path, "replace", held)
-    atomic.replace(new, old, (0.0, 0.0))
+    atomic.replace_patiently(new, old, (0.0, 0.0))
     assert (old.read_text(), len(tries)) == ("new", 3)
     new.write_text("newer")
     tries.clear()
     with pytest.raises(PermissionError):
-        atomic.replace(new, old, (0.0,))
+        atomic.replace_patiently(new, old, (0.0,))

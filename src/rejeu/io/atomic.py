@@ -33,12 +33,8 @@ ADVICE = {
 """What to do about each error."""
 
 
-WAITS = () if os.name == "posix" else (0.01, 0.04, 0.2, 0.75)
-"""Seconds to wait before each further attempt to rename, which on Windows fails while a reader holds the file."""
-
-
-def replace(source: Path, target: Path, waits: Iterable[float] = WAITS) -> None:
-    """Renames a file over another one."""
+def replace_patiently(source: Path, target: Path, waits: Iterable[float] = (0.01, 0.04, 0.2, 0.75)) -> None:
+    """Renames a file over another one, which on Windows fails while a reader holds it: waits up to a second for that."""
     for seconds in waits:
         with contextlib.suppress(PermissionError):
             source.replace(target)
@@ -69,7 +65,7 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
                 yield file
                 file.flush()
                 os.fsync(file.fileno())
-            replace(temporary, path)
+            (Path.replace if os.name == "posix" else replace_patiently)(temporary, path)
         except BaseException:
             with contextlib.suppress(OSError):
                 temporary.unlink(missing_ok=True)

@@ -327,12 +327,7 @@ def explained(path: str | Path) -> Iterator[None]:
 
 
 def existing(path: str | Path) -> Path:
-    """Returns the path of an existing file, of another suffix of models if it has none.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        CheckpointError: if it is the path of something else.
-    """
+    """Returns the path of an existing file, of another suffix of models if it has none; raises as :func:`opened` does."""
     with explained(path):
         path = resolve(path)
         if path.suffix in (SUFFIX, *FOREIGN) and not path.exists():

@@ -98,7 +98,7 @@ class VideoFile:
         if self._process is None:
             raise ValueError(f"{self.path} has no frames")
         self._finish(self._process)
-        atomic.replace(self._partial, self.path)
+        atomic.replace_patiently(self._partial, self.path)
         return self.path
 
     def discard(self) -> None:
