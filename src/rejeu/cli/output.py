@@ -31,12 +31,11 @@ class Stopwatch:
     """Measures wall time and compilation time since it was made."""
 
     def __init__(self) -> None:
-        self._began, self._clock = time.perf_counter(), xla.clock()
+        self._began, self._compiled = time.perf_counter(), xla.seconds()
 
     def seconds(self) -> tuple[float, float]:
         """Returns wall time, and how much of it was compilation."""
-        wall = time.perf_counter() - self._began
-        return wall, wall - (xla.clock() - self._clock)
+        return time.perf_counter() - self._began, xla.seconds() - self._compiled
 
 
 def header(config: DecidedRun, environment: Environment, backend: str, folder: RunFolder) -> str:
