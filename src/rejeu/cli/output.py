@@ -31,11 +31,12 @@ class Stopwatch:
     """Measures wall time and compilation time since it was made."""
 
     def __init__(self) -> None:
-        self._began, self._compiled = time.perf_counter(), xla.seconds()
+        self._began, self._clock = time.perf_counter(), xla.clock()
 
     def seconds(self) -> tuple[float, float]:
         """Returns wall time, and how much of it was compilation."""
-        return time.perf_counter() - self._began, xla.seconds() - self._compiled
+        wall = time.perf_counter() - self._began
+        return wall, max(wall - (xla.clock() - self._clock), 0.0)  # which rounds below 0 where nothing was compiled
 
 
 def header(config: DecidedRun, environment: Environment, backend: str, folder: RunFolder) -> str:
