@@ -16,10 +16,18 @@ COMMIT = "0" * 39 + "1"
 TOKEN = "hf_of_a_test"
 
 
+class Repositories(dict[str, dict[str, bytes]]):
+    """The contents of the files of each repository by name."""
+
+    def __init__(self) -> None:
+        self.private: dict[str, bool] = {}
+        """Whether each was created as a private one."""
+
+
 @contextmanager
-def served() -> Iterator[tuple[str, dict[str, dict[str, bytes]]]]:
-    """Yields the address of a hub, and its repositories: the contents of their files by name."""
-    repos: dict[str, dict[str, bytes]] = {}
+def served() -> Iterator[tuple[str, Repositories]]:
+    """Yields the address of a hub, and its repositories."""
+    repos = Repositories()
 
     class Hub(BaseHTTPRequestHandler):
         protocol_version = "HTTP/1.1"
@@ -50,6 +58,7 @@ def served() -> Iterator[tuple[str, dict[str, dict[str, bytes]]]]:
                     self.refuse(403, "Forbidden")
                     return
                 is_new = repo not in repos
+                repos.private.setdefault(repo, given.get("private") or given.get("visibility") == "private")
                 repos.setdefault(repo, {".gitattributes": b""})
                 self.answer({"url": f"{address}/{repo}"}, 200 if is_new else 409)
             elif path == "/api/validate-yaml":

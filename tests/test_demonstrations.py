@@ -239,8 +239,12 @@ def test_answers_to_actions_that_were_not_taken_are_cloned_and_not_replayed(take
 
 
 def test_an_expert_that_never_answers_labels_nothing() -> None:
-    agent = rejeu.PPO("MlpPolicy", Target(), **SMALL)
-    assert str(dagger(agent, lambda obs: None, Target(), rounds=1, steps=5)) == "0 episodes, 0 steps, mean return nan"
+    agent, env, seeds = rejeu.PPO("MlpPolicy", Target(), **SMALL), Target(), []
+    reset = env.reset
+    env.reset = lambda *, seed=None, options=None: (seeds.append(seed), reset(seed=seed))[1]  # type: ignore[method-assign]
+    found = dagger(agent, lambda obs: None, env, rounds=2, steps=11, seed=7)
+    assert str(found) == "0 episodes, 0 steps, mean return nan"
+    assert seeds == [1007, 1008, 1009, 2007, 2008, 2009]  # no episode is played twice
 
 
 def test_a_dataset_is_read_as_it_was_recorded(tmp_path: Path) -> None:

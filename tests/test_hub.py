@@ -36,7 +36,7 @@ def run(tmp_path):
     folder.mkdir()
     agent = rejeu.DQN("MlpPolicy", "CartPole-v1", policy_kwargs={"net_arch": [8]}, seed=0)
     agent.save(folder / "agent")
-    agent.save(folder / "best")
+    rejeu.DQN("MlpPolicy", "CartPole-v1", policy_kwargs={"net_arch": [8]}, seed=1).save(folder / "best")
     (folder / "config.json").write_text(json.dumps({"env_id": "CartPole-v1", "algorithm": "DQN", "seed": 0}))
     (folder / "evaluations.csv").write_text(
         "step,episodes,mean_return,std_return,mean_length,success_rate\n100,10,20,3,20,\n200,10,30,3,30,\n"
@@ -46,13 +46,19 @@ def run(tmp_path):
     return folder
 
 
-def test_a_model_is_pushed_with_its_card_and_pulled_again(server, run, capsys):
+def test_a_model_is_pushed_with_its_card_and_pulled_again(server, run, capsys, monkeypatch):
+    monkeypatch.setattr(rejeu.DQN, "export", lambda agent, path: Path(path).write_bytes(b"onnx"))
     assert main(["push", str(run), "me/cart"]) == 0
     assert "/me/cart" in capsys.readouterr().out
     found = server["me/cart"]
-    assert {"agent.safetensors", "config.json", "evaluations.csv", "curve.png", "README.md"} <= {*found}
+    assert {"agent.safetensors", "config.json", "evaluations.csv", "curve.png", "README.md", "policy.onnx"} <= {*found}
+    assert server.private == {"me/cart": False}
     assert "secrets.txt" not in found
-    assert found["agent.safetensors"] == (run / "best.safetensors").read_bytes()
+    assert (
+        found["agent.safetensors"]
+        == (run / "best.safetensors").read_bytes()
+        != (run / "agent.safetensors").read_bytes()
+    )
     card = found["README.md"].decode()
     # The interval of 10 episodes: 30 -+ 2.262 * 3 / sqrt(9), with the 97.5 % quantile of Student's t at 9 degrees of freedom
     assert "return 30.00 ± 3.00 (95 % confidence interval of the mean 27.74 to 32.26), 10 episodes" in card
@@ -67,6 +73,10 @@ def test_a_model_is_pushed_with_its_card_and_pulled_again(server, run, capsys):
     pulled = {path.relative_to("cart").as_posix() for path in Path("cart").rglob("*")}
     assert pulled == {*found} - {".gitattributes", "train.py", "inner/other.zip", "../../evil.zip"}
     assert Path("cart/agent.safetensors").read_bytes() == found["agent.safetensors"]
+    hub.push(run / "agent.safetensors", "me/last", private=True)
+    assert server.private["me/last"]
+    assert server["me/last"]["agent.safetensors"] == (run / "agent.safetensors").read_bytes()
+    assert "config.json" not in server["me/last"]
 
 
 def test_models_of_stable_baselines3_are_pulled(server, capsys):
@@ -103,6 +113,7 @@ def test_refusals_are_one_line_and_leave_nothing(server, run, tmp_path, monkeypa
 
 def test_a_hub_that_cannot_be_reached_is_one_line(server, monkeypatch):
     monkeypatch.setattr("huggingface_hub.constants.ENDPOINT", "http://127.0.0.1:9")
+    monkeypatch.setattr("time.sleep", lambda seconds: None)  # before each retry
     with pytest.raises(OSError, match="the hub cannot be reached: ") as error:
         hub.pull("away/x")
     assert "\n" not in str(error.value)

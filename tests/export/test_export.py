@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import shutil
 import subprocess
+from types import SimpleNamespace
 
 import gymnasium as gym
 import jax
@@ -220,6 +222,27 @@ def test_uniform_noise_samples_the_policy(name, action, tmp_path):
         np.testing.assert_allclose(actions.std(axis=0), again.std(axis=0), rtol=0.1)
 
 
+@pytest.mark.parametrize(
+    ("space", "expected"),
+    [
+        (gym.spaces.Discrete(3, start=-1), (-1, 1)),
+        (gym.spaces.MultiDiscrete([3, 2], start=[1, 5]), ([1, 5], [3, 6])),
+        (gym.spaces.MultiBinary(3), (0, 1)),
+        (gym.spaces.Box(np.array([-2, 0], np.float32), np.array([2, 5], np.float32)), ([-2, 0], [2, 5])),
+    ],
+)
+def test_bounds_are_the_smallest_and_the_largest_values(space, expected):
+    assert contract.bounds(space) == expected
+
+
+def test_the_duration_of_a_step_is_that_of_the_environment():
+    durations = [
+        exporting.seconds_per_step(SimpleNamespace(unwrapped=SimpleNamespace(**given)))
+        for given in ({"config": {"policy_frequency": 5}}, {"tau": 0.02}, {"dt": 0.05, "config": {}}, {"dt": "slow"})
+    ]
+    assert durations == [0.2, 0.02, 0.05, None]
+
+
 def test_a_policy_without_chance_has_no_noise(tmp_path):
     with pytest.raises(ValueError, match="always returns the same action"):
         agent_of("TD3", "Box").export(tmp_path / "policy.onnx", noise=True)
@@ -244,6 +267,8 @@ def test_the_contract_is_in_the_file_and_beside_it(tmp_path):
 def test_c_compiles_as_c_and_is_included_by_cpp(tmp_path):
     agent_of("RecurrentPPO", "Box", "Dict").export(tmp_path / "my-policy.c")
     header = (tmp_path / "my-policy.h").read_text()
+    card = json.loads((tmp_path / "my-policy.c.json").read_text())
+    assert card["sha256"] == hashlib.sha256((tmp_path / "my-policy.c").read_bytes()).hexdigest()
     assert "#define MY_POLICY_SPEED_SIZE 3" in header
     assert "void my_policy_act(const int8_t bits[2], const uint8_t camera_left[432]" in header
     assert "void my_policy_reset(void);" in header
@@ -284,13 +309,19 @@ def test_choices_that_differ_must_be_equally_good():
     agent = agent_of("PPO", "Discrete")
     one = exporting.policy_for(agent, False, 1)
     recording, *_ = exporting.record(agent, one, None)
-    run = lambda inputs: (recording.actions % 3 + 1, np.ones(100))  # noqa: E731
-    assert check.compare(one, recording, run).difference == 1.0
+    seconds = 1e-6 * np.linspace(1, 101, 100)
+    run = lambda inputs: (recording.actions % 3 + 1, seconds)  # noqa: E731
+    found = check.compare(one, recording, run)
+    assert (found.difference, found.ties, found.n) == (1.0, 0, 100)
+    assert (found.p50, found.p99) == pytest.approx((51, 100))  # microseconds
     equal = jax.tree.map(np.zeros_like, agent.state)
     agent.run.state = agent.learner.pack(equal)
     one = exporting.policy_for(agent, False, 1)
     found = check.compare(one, recording, run)
     assert (found.difference, found.ties) == (0.0, 100)
+    if has_compiler:  # of equally good choices predict takes the first
+        run = check.c_run(one, *c_file.write(one, exporting.card_of(agent, one, "c", "", None), "policy"), "policy")
+        assert check.compare(one, recording._replace(actions=np.ones(100, np.int64)), run)[2:4] == (0.0, 0)
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,8 @@ import pytest
 
 import rejeu
 from rejeu.errors import CheckpointError
-from rejeu.export.numpy_policy import load_policy
+from rejeu.export.numpy_policy import ACTIVATIONS, load_policy
+from rejeu.networks import layers
 from tests import hostile_files
 from tests.export.policies import KINDS, agent_of, observations
 from tests.export.test_export import OTHERS
@@ -49,6 +50,13 @@ def test_numpy_acts_as_predict(name, action, observation, normalize, tmp_path):
 def test_numpy_acts_as_predict_with_other_networks_and_actions(kind, tmp_path):
     name, action, settings = OTHERS[kind]
     check(agent_of(name, action, **settings), tmp_path / "model")
+
+
+def test_activations_are_those_of_the_networks():
+    x = np.linspace(-4, 4, 41, dtype=np.float32)
+    assert ACTIVATIONS.keys() == layers.ACTIVATIONS.keys()
+    for name, activation in ACTIVATIONS.items():
+        np.testing.assert_allclose(activation(x), layers.ACTIVATIONS[name](x), atol=1e-6, err_msg=name)
 
 
 def test_goals_share_their_statistics(tmp_path):

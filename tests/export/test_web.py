@@ -74,6 +74,15 @@ def test_the_policy_of_a_page_acts_as_predict(env_id, tmp_path, monkeypatch):
     assert not re.search(r"https?:|src=|import\(", text)
 
 
+def test_no_text_of_a_card_ends_the_script_of_a_page():
+    agent = agent_for("CartPole-v1")
+    one = exporting.policy_for(agent, False, 1)
+    card = exporting.card_of(agent, one, "web", "</script><!--", None)
+    script = web_file.script(one, web_file.environment("CartPole-v1", {}), card)
+    assert "<" not in next(line for line in script.splitlines() if line.startswith("const ABOUT"))
+    assert node(script + "\nconsole.log(JSON.stringify(ABOUT.card.source));", None) == "</script><!--"
+
+
 def test_a_policy_with_memory_acts_as_predict(tmp_path, monkeypatch):
     monkeypatch.setattr(check, "OBSERVATIONS", 100)
     agent = rejeu.RecurrentPPO("MlpPolicy", "Pendulum-v1", seed=0, policy_kwargs={"lstm_hidden_size": 8})

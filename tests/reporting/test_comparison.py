@@ -70,9 +70,13 @@ def test_two_algorithms(runs):
 def test_steps_to_the_threshold_are_the_median_of_the_runs(tmp_path):
     for seed, level in enumerate((10.0, 20.0)):
         write_run(tmp_path / str(seed), seed=seed, level=level)
-    one, other = (compare(tmp_path / str(seed), threshold=9.0, samples=10).groups[0].reached[1] for seed in range(2))
-    assert compare(tmp_path, threshold=9.0, samples=10).groups[0].reached == (2, (one + other) / 2)
-    assert other < one
+    # the mean of the last 50 steps is the return 20 steps before, and curves have a point each 10 steps
+    for folder, expected in ((tmp_path / "0", 470.0), (tmp_path / "1", 250.0)):
+        assert compare(folder, threshold=8.9, samples=10).groups[0].reached == (1, expected)
+        assert compare(folder, x="time", threshold=8.9, samples=10).groups[0].reached[1] == pytest.approx(
+            expected / 100
+        )
+    assert compare(tmp_path, threshold=8.9, samples=10).groups[0].reached == (2, 360.0)
     assert compare(tmp_path, threshold=15.0, samples=10).groups[0].reached == (1, math.inf)
 
 
@@ -265,13 +269,34 @@ def test_outputs(runs, tmp_path):
     )  # every group reaches a threshold made from its own scores
     comparison = compare(runs, threshold=12, samples=20)
     table = list(csv.DictReader(io.StringIO(comparison.to_csv())))
-    assert [row["group"] for row in table] == ["DQN", "PPO"]
+    assert [[*row.values()][:3] for row in table] == [["DQN", "CartPole-v1", "5"], ["PPO", "CartPole-v1", "5"]]
+    assert [*table[0]][3:] == [
+        "iqm",
+        "iqm_low",
+        "iqm_high",
+        "mean",
+        "median",
+        "threshold",
+        "reached",
+        "steps_to_threshold",
+    ]
+    dqn = comparison.groups[0]
+    expected = [*dqn.score, dqn.mean, dqn.median, 12, *dqn.reached]
+    assert [float(one) for one in [*table[0].values()][3:]] == expected
+    assert dqn.score[1] < dqn.score[0] < dqn.score[2]
     assert "| DQN | CartPole-v1 | 5 |" in comparison.to_markdown()
     assert "steps to 12" in comparison.to_markdown()
     assert "(5 of 5)" in comparison.to_markdown()
     content = json.loads(comparison.to_json())
-    assert content["groups"][0]["curve"]["value"][0] is None
-    assert len(list(csv.DictReader(io.StringIO(comparison.curves_csv())))) == 202
+    curve = content["groups"][0]["curve"]
+    assert curve["value"][0] is None
+    rows = list(csv.DictReader(io.StringIO(comparison.curves_csv())))
+    assert len(rows) == 202
+    for i in (50, 100):
+        point = [curve[name][i] for name in ("x", "value", "low", "high")]
+        assert point == [float(rows[i][name]) for name in ("steps", "value", "low", "high")]
+        assert point == [10.0 * i, *dqn.curve[:, i]]
+        assert point[2] < point[1] < point[3]
     assert "final score" in repr(comparison)
     (path,) = comparison.save(tmp_path / "out" / "table.md")
     assert path.read_text(encoding="utf-8") == comparison.to_markdown()

@@ -25,6 +25,7 @@ def history():
 
 
 def test_columns_come_by_name_in_order():
+    assert repr(history()) == ("<History: 4 episodes in 40 steps; mean of the last 4: return 4.00, length 10.0>")
     table = history()
     assert len(table) == 4
     assert table["step"].tolist() == [10, 20, 25, 40]
@@ -118,6 +119,9 @@ def test_a_summary_has_the_means_of_all_and_of_the_last_episodes():
     assert summary.all.success_rate == pytest.approx(2 / 3)  # of the three that are known
     assert (summary.last.n, summary.last.mean_return, summary.last.std_return) == (2, 4.5, 1.5)
     assert summary.last.success_rate == 1.0
+    longer = history().summary(window=2)
+    assert (longer.all.mean_length, longer.last.mean_length, longer.last.lengths.tolist()) == (10.0, 10.0, [5, 15])
+    assert (longer.last.returns.tolist(), longer.last.successes.tolist()) == ([5, 7], [0, 1])
     assert (summary.best.step, summary.best.episode_return) == (30, 6.0)
 
 

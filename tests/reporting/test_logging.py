@@ -40,6 +40,18 @@ def test_json_lines_that_are_continued_keep_the_complete_rows_up_to_a_step(tmp_p
     assert lines(path) == [{"step": 1}, {"step": 2}, {"step": 3, "a": 1.0}]
 
 
+def test_rows_that_add_columns_leave_empty_cells_in_the_rows_before_them(tmp_path):
+    log = CsvFile(tmp_path / "rows.csv")
+    for step, row in ((1, {"a": 1.0}), (2, {"c": 2.0, "b": 3.0, "d": 4.0}), (3, {"d": 5.0, "a": 6.0})):
+        log.write(step, row)
+    assert log.path.read_text(encoding="utf-8").splitlines() == [
+        "step,a,c,b,d",
+        "1,1.0,,,",
+        "2,,2.0,3.0,4.0",
+        "3,6.0,,,5.0",
+    ]
+
+
 @pytest.mark.parametrize(
     "content",
     [b"stfp,a\r\n1,2\r\n", b"2" * 200_000 + b"\r\n1,2\r\n", b'"step,a\r\n1,2\r\n'],

@@ -10,7 +10,7 @@ import pytest
 from filelock import FileLock
 
 from rejeu.agents import BUILT_IN
-from rejeu.reporting.runs import default_hyperparameters, read_run
+from rejeu.reporting.runs import best_row, default_hyperparameters, read_run
 from rejeu.runs import config
 
 CONFIG = {
@@ -89,6 +89,28 @@ def test_command_has_wrappers_nulls_and_long_values(folder):
     assert [words[i + 1] for i, word in enumerate(words) if word == "--wrapper"] == ["my_env:Shaped", "a b"]
     given = config.apply(words[words.index("--set") + 1 :], {})
     assert (given["max_grad_norm"], given["action_noise"]) == (None, noise)
+
+
+def test_the_best_evaluation_has_the_highest_success_rate_and_then_the_highest_return(folder):
+    rows = [
+        "step,success_rate,mean_return",
+        "10,0.5,9",
+        "20,0.75,1",
+        "30,0.75,2",
+        "40,0.75,nan",
+        "50,nan,10",
+        "60,0.25,8",
+    ]
+    (folder / "evaluations.csv").write_text("\n".join([*rows, ""]), encoding="utf-8")
+    assert best_row(read_run(folder).evaluations) == 2
+    (folder / "evaluations.csv").write_text("step,mean_return\n10,1\n20,3\n30,2\n", encoding="utf-8")
+    assert best_row(read_run(folder).evaluations) == 1
+
+
+def test_a_run_of_minutes_is_finished_when_nearly_all_of_them_are_over(folder):
+    for seconds, state in ((1.27, "finished"), (1.30, "interrupted")):  # it trained for 1.25 s
+        (folder / "config.json").write_text(json.dumps({**CONFIG, "steps": None, "minutes": seconds / 60}))
+        assert read_run(folder).state == state
 
 
 def test_interrupted_and_crashed_run(folder):

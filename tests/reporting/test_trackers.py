@@ -15,6 +15,7 @@ import pytest
 
 import rejeu
 from rejeu.callbacks import Evaluate, RecordVideo
+from rejeu.reporting import trackers
 from tests.helpers import small_sac
 
 pytestmark = pytest.mark.filterwarnings("ignore", "error::UserWarning:rejeu")  # the packages' own warnings
@@ -183,6 +184,69 @@ def test_trackio_holds_what_the_csv_file_holds(tmp_path):
     assert_close(given, expected)
     assert [row["step"] for row in rows if "video" in row] == [50, 100]
     assert SQLiteStorage.get_run_config("rejeu", name)["learning_rate"] == agent.config.learning_rate
+
+
+def test_rows_configurations_and_videos_are_given_to_the_packages_as_they_document_them(monkeypatch):
+    """Stand-ins that note the calls, where the packages are not installed: units, columns and how runs continue."""
+    import sys
+    import time
+    from pathlib import Path
+    from types import SimpleNamespace
+    from unittest.mock import MagicMock
+
+    monkeypatch.setattr(time, "time", lambda: 1234.5678)
+    monkeypatch.delenv("WANDB_MODE")
+    path = Path("video.mp4")
+    packages = {name: MagicMock() for name in ("wandb", "mlflow", "trackio")}
+    for name, package in packages.items():
+        monkeypatch.setitem(sys.modules, name, package)
+    entities = packages["mlflow"].entities
+    entities.Metric = entities.Param = lambda *given: given
+
+    for given, resume in (("r1", "allow"), (None, None)):
+        wandb = trackers.WandB("one", given, Path("local"))
+        wandb.write_config({"gamma": 0.9})
+        wandb.write(7, {"a": 1.0})
+        wandb.write_video(8, path)
+        init = packages["wandb"].init
+        assert (
+            init.call_args.kwargs.items() >= {"project": "rejeu", "name": "one", "id": given, "resume": resume}.items()
+        )
+        init.return_value.config.update.assert_called_with({"gamma": 0.9}, allow_val_change=True)
+        assert [one.kwargs["step"] for one in init.return_value.log.call_args_list[-2:]] == [7, 8]
+        wandb.close()
+    assert (init.call_count, init.return_value.finish.call_count) == (2, 2)
+    assert init.call_args.kwargs["dir"] == Path("local")
+
+    client = packages["mlflow"].MlflowClient.return_value
+    client.search_runs.return_value = []
+    client.create_run.return_value.info.run_id = "new"
+    client.get_run.return_value.data.params = {"p0": "kept"}
+    mlflow = trackers.MLflow("one", "r1")
+    mlflow.write_config({f"p{i}": "x" * 600 for i in range(151)})
+    batches = [one.kwargs["params"] for one in client.log_batch.call_args_list]
+    assert [len(one) for one in batches] == [100, 50]
+    assert (batches[0][0], batches[1][-1]) == (("p1", "x" * 500), ("p150", "x" * 500))
+    mlflow.write(7, {"a": 1.0, "b": 2.0})
+    client.log_batch.assert_called_with("new", metrics=[("a", 1.0, 1234567, 7), ("b", 2.0, 1234567, 7)])
+    mlflow.write_video(8, path)
+    client.log_artifact.assert_called_once_with("new", "video.mp4", "videos")
+    mlflow.close()
+    client.set_terminated.assert_called_once_with("new")
+    assert client.create_run.call_args.kwargs == {"tags": {"rejeu.run_id": "r1"}, "run_name": "one"}
+    client.search_runs.return_value = [SimpleNamespace(info=SimpleNamespace(run_id="earlier"))]
+    trackers.MLflow("one", "r1").write(9, {})
+    client.update_run.assert_called_once_with("earlier", status="RUNNING")
+    assert client.log_batch.call_args.args == ("earlier",)
+
+    for name, resume in (("one", "allow"), (None, "never")):
+        trackio = trackers.Trackio(name)
+        trackio.write_config({"policy_kwargs": {"net_arch": [8]}})
+        trackio.write(7, {"a": 1.0})
+        init = packages["trackio"].init
+        assert init.call_args.args == ("rejeu", name)
+        assert init.call_args.kwargs == {"config": {"policy_kwargs.net_arch": [8]}, "resume": resume, "embed": False}
+        init.return_value.log.assert_called_with({"a": 1.0}, step=7)
 
 
 def test_without_its_package_a_log_names_the_command_that_installs_it(monkeypatch):

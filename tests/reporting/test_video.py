@@ -169,6 +169,8 @@ def test_recording_is_of_the_deterministic_policy_and_ends_after_max_steps_over_
     assert len(decode(path).frames) == 9 + 3
     assert agent.asked == [True] * 6
     assert lamp.seeds == [7, None]
+    found = decode(record_video(agent, tmp_path / "slow.mp4", lamp, episodes=1, fps=4))
+    assert (found.fps, len(found.frames)) == (4, 5 + 2)
 
 
 def test_suffix_and_folders_are_supplied_and_only_environments_made_here_are_closed(lamp, tmp_path):

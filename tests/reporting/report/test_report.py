@@ -19,7 +19,7 @@ from rejeu.reporting import charts, runs
 from rejeu.reporting.evaluation import Evaluation
 from rejeu.reporting.report import page, sections, write_report
 from rejeu.reporting.runs import Episodes
-from rejeu.reporting.tables import EMPTY
+from rejeu.reporting.tables import EMPTY, Table
 from tests.reporting.report.folders import CONFIG, EVIL, MP4, write, write_hostile
 
 
@@ -196,12 +196,35 @@ def test_legend_and_note_name_the_same_number_of_episodes():
 
 def test_moving_average_and_its_interval():
     values = np.array([1.0, 3.0, 2.0, 6.0, np.nan, 4.0])
-    episodes = Episodes(np.arange(6.0), *[np.zeros(6)] * 5)
+    episodes = Episodes(np.arange(6.0), *[np.zeros(6)] * 4, 60.0 * np.arange(6))
     curve = charts.smooth(episodes, values)  # a window of 3
     np.testing.assert_allclose(curve.mean, [1, 2, 2, 11 / 3, 4])
     deviation = np.std([2.0, 6.0, 4.0], ddof=1) / np.sqrt(3)
     np.testing.assert_allclose(curve.high[-1] - curve.mean[-1], 1.959964 * deviation)
+    np.testing.assert_allclose(curve.low[-1] + curve.high[-1], 2 * curve.mean[-1])
     np.testing.assert_array_equal(curve.step, [0, 1, 2, 3, 5])
+    np.testing.assert_array_equal(curve.minutes, [0, 1, 2, 3, 5])
+
+
+def test_charts_have_minutes_and_the_range_of_each_bin(tmp_path):
+    run = runs.read_run(write(tmp_path / "run"))  # a step takes 0.01 s
+    found = [charts.time_chart(run.metrics), *charts.metric_charts(run.metrics).values()]
+    found += [charts.episode_chart(run.episodes, run.evaluations, column) for column in ("return", "success", "length")]
+    drawn = [one for chart in found for one in chart["series"]]
+    assert {one["kind"] for one in drawn} == {"area", "line", "points", "dots", "band"}
+    for one in drawn:
+        np.testing.assert_allclose(one["t"], np.array(one["x"]) / 100 / 60, rtol=1e-5)
+    assert [one["name"] for one in found[0]["series"]] == ["environment", "replay buffer", "update", "rest"]
+    assert [one["y"][0] for one in found[0]["series"]] == [0.2, 0.1, 0.6, 0.1]
+    rates = next(one for one in found[4]["series"] if one["kind"] == "points")
+    assert rates["y"] == [0.25, 0.5, 0.45]
+    assert all(low < rate < high for low, rate, high in zip(rates["low"], rates["y"], rates["high"], strict=True))
+    n = 2 * charts.MAX_POINTS  # each bin has two values
+    step = np.arange(n) * 1.0
+    table = Table({"step": step, "time/time_elapsed": 60 * step, "train/loss": np.where(step % 2, 5.0, step)})
+    band, mean = charts.metric_charts(table)["train/loss"]["series"]
+    assert (band["x"][:2], band["t"][:2]) == ([1, 3], [1, 3])
+    assert (band["low"][4:6], mean["y"][4:6], band["high"][4:6]) == ([5, 5], [6.5, 7.5], [8, 10])
 
 
 def test_interval_of_a_single_episode_is_unknown_and_large_returns_keep_their_deviation():
