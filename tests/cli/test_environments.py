@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import io
 import json
+import os
 import random
 import shlex
 import shutil
@@ -264,7 +265,12 @@ def test_output_to_a_pipe_whose_encoding_lacks_a_character(registered_run, monke
     assert b" ? " in pipe.buffer.getvalue()
 
 
-def test_a_folder_of_runs_names_the_newest_inside(registered_run, capsys):
+def test_a_folder_of_runs_names_the_newest_inside(registered_run, tmp_path, capsys):
+    for name, time in (("a", 2.0), ("newest", 3.0), ("z", 1.0)):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "config.json").touch()
+        os.utime(tmp_path / name / "config.json", (time, time))
+    assert f"the newest of the 3 in it is {tmp_path / 'newest'}" in error_of(capsys, "evaluate", str(tmp_path))
     assert f"the newest of the 1 in it is {registered_run}" in error_of(capsys, "evaluate", str(registered_run.parent))
     assert f"the newest of the 1 in it is {registered_run}" in error_of(capsys, "resume", str(registered_run.parent))
 

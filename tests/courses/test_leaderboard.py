@@ -3,11 +3,13 @@
 import json
 import zipfile
 
+import numpy as np
 import pytest
 
 import rejeu
 from rejeu.cli import main
 from rejeu.courses import leaderboard
+from rejeu.reporting.evaluation import Evaluation
 
 HOSTILE = "<script>alert(1)<_script> | *x*"
 
@@ -47,6 +49,17 @@ def test_models_are_ranked_and_other_files_get_one_line_each(folder, tmp_path, c
     assert reasons.keys() == {"cut", "empty", "flipped", "other"}
     assert reasons["other"] == "it was trained on MountainCar-v0, not on CartPole-v1"
     assert "checksum" in reasons["flipped"]
+
+
+def test_the_places_of_a_model_are_those_that_the_intervals_allow():
+    def model(name, *returns):
+        returns = np.array(returns)
+        return leaderboard.Model(name, "DQN", 0, 0, Evaluation(returns, returns, returns))
+
+    wide, high, low = model("wide", 0.0, 10.0, 20.0), model("high", 14.0, 15.0, 16.0), model("low", 1.0, 2.0, 3.0)
+    assert wide.interval[0] < low.interval[0] < low.interval[1] < high.interval[0] < high.interval[1] < wide.interval[1]
+    places = [(one.name, one.first, one.last) for one in leaderboard.ranked([low, wide, high, model("one", 30.0)])]
+    assert places == [("one", 1, 2), ("high", 2, 3), ("wide", 1, 4), ("low", 3, 4)]
 
 
 @pytest.fixture

@@ -24,6 +24,7 @@ policy_kwargs.net_arch = [
 
 [settings.fast.DQN]
 train_freq = 8
+learning_rate = 1e-2
 
 [resources]
 memory = "2 GB"
@@ -47,7 +48,7 @@ def test_environments_algorithms_settings_and_seeds(tmp_path):
     assert (last.name, last.run.seed, last.run.algorithm) == ("Acrobot-v1-PPO-fast-seed1", 1, "PPO")
     assert last.run.hyperparameters == {"learning_rate": 1e-3, "policy_kwargs.net_arch": [8]}
     fast = next(job for job in plan.jobs if job.run.algorithm == "DQN" and job.setting == "fast")
-    assert fast.run.hyperparameters["train_freq"] == 8
+    assert (fast.run.hyperparameters["train_freq"], fast.run.hyperparameters["learning_rate"]) == (8, 1e-2)
     assert (first.run.steps, first.run.evaluate_every, first.run.minutes) == (1000, 500, None)
 
 
@@ -55,19 +56,30 @@ def test_a_dict_is_a_plan_too():
     plan, text = read_plan({"environments": "CartPole-v1", "seeds": [3, 5], "steps": 100})
     assert text is None
     assert [job.name for job in plan.jobs] == ["CartPole-v1-DQN-seed3", "CartPole-v1-DQN-seed5"]
+    plan, _ = read_plan({"environments": "CartPole-v1", "seeds": 2, "first_seed": 3})
+    assert [job.run.seed for job in plan.jobs] == [3, 4]
 
 
 def test_options_of_one_environment():
     tables = {
         "easy": {"id": "FrozenLake-v1", "env_kwargs": {"map_name": "4x4", "is_slippery": False}, "steps": 100},
-        "CartPole-v1": {"algorithms": ["PPO"]},
+        "CartPole-v1": {"algorithms": ["PPO"], "evaluate_every": 7, "no_report": True},
     }
-    plan, _ = read_plan({"environments": tables, "algorithms": ["DQN", "PPO"], "minutes": 1})
+    common = {"minutes": 1, "evaluate_every": 50, "no_video": True, "env_kwargs": {"map_name": "8x8"}}
+    with pytest.raises(PlanError, match="map_name"):  # which CartPole does not take
+        read_plan({"environments": tables, **common})
+    common["env_kwargs"] = {}
+    plan, _ = read_plan({"environments": tables, "algorithms": ["DQN", "PPO"], **common})
     assert [job.name for job in plan.jobs] == ["easy-DQN-seed0", "easy-PPO-seed0", "CartPole-v1-PPO-seed0"]
     easy, cart_pole = plan.jobs[0], plan.jobs[-1]
     assert (easy.run.steps, easy.run.minutes) == (100, None)
     assert (cart_pole.run.steps, cart_pole.run.minutes) == (None, 1.0)
     assert easy.run.env_kwargs == {"map_name": "4x4", "is_slippery": False}
+    assert [job.run.evaluate_every for job in plan.jobs] == [50, 50, 7]
+    assert [(job.no_report, job.no_video) for job in plan.jobs] == [(False, True), (False, True), (True, True)]
+    tables = {"FrozenLake-v1": {"env_kwargs": {"map_name": "4x4"}}}
+    own, _ = read_plan({"environments": tables, "env_kwargs": {"map_name": "8x8", "is_slippery": False}})
+    assert own.jobs[0].run.env_kwargs == {"map_name": "4x4", "is_slippery": False}
 
 
 def test_a_setting_for_some_algorithms():

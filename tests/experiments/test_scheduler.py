@@ -103,11 +103,14 @@ def work(folder, launcher, watch=lambda coordinator: None, **options):
     return {one.job.name: one.state for one in coordinator.outcomes()}, lines
 
 
-def test_every_job_is_trained_once_and_not_more_than_fit_at_once(tmp_path):
-    folder, launcher = make_folder(tmp_path), Launcher(capacity=2)
+def test_every_job_is_trained_once_and_not_more_than_fit_at_once(tmp_path, monkeypatch):
+    folder, launcher, claims = make_folder(tmp_path), Launcher(capacity=2, ends={"job-3": [-9, 0]}), []
+    monkeypatch.setattr(scheduler, "hold", lambda path: (claims.append(hold(path)), claims[-1])[1])
     states, _ = work(folder, launcher)
+    assert len(claims) == 5
+    assert not any(claim.is_locked for claim in claims)
     assert set(states.values()) == {"done"}
-    assert sorted(launcher.started) == [("train", f"job-{i}") for i in range(4)]
+    assert sorted(launcher.started) == [("resume", "job-3"), *(("train", f"job-{i}") for i in range(4))]
     assert launcher.most <= 2
     again = Launcher()
     work(folder, again, retry=True)
@@ -122,6 +125,9 @@ def test_a_failed_run_does_not_stop_the_others_and_only_resume_repeats_it(tmp_pa
     joined = Launcher()
     work(folder, joined)
     assert joined.started == []
+    assert folder.works(("a.py",))[1].task().run.imports == ("a.py",)
+    assert folder.works()[1].exit_status() is None  # that of the attempt before
+    folder.works()[1].write_exit(2)
     resumed = Launcher(ends={"job-1": [2]})
     states, _ = work(folder, resumed, retry=True)
     assert resumed.started == [("resume", "job-1")]

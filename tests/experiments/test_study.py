@@ -213,6 +213,75 @@ def test_difference_says_whether_zero_is_in_the_interval():
     assert value == pytest.approx(0)
 
 
+@pytest.mark.parametrize(
+    ("interval", "verdict"),
+    [
+        ((0.5, 2.0), "better"),
+        ((-0.5, 2.0), "no difference found"),
+        ((-2.0, 0.5), "no difference found"),
+        ((-2.0, -0.5), "worse"),
+    ],
+)
+def test_the_verdict_is_that_of_the_interval_and_not_of_the_difference_alone(interval, verdict, monkeypatch):
+    found = (sum(interval) / 2, *interval)
+    for name, value in {
+        "is_default": False,
+        "difference": found,
+        "compare": None,
+        "finished": [],
+        "last_values": 0,
+    }.items():
+        monkeypatch.setattr(search, name, lambda *_, value=value, **__: value)
+    monkeypatch.setattr(search, "MIN_FINAL_SEEDS", 0)
+    best = studies.Outcome(0, "complete", 1.0, {}, {}, 1.0, "")
+    final = search.compared(SimpleNamespace(plan=make_plan(), folder=StudyFolder(Path()), preset_of=print), best, [])
+    assert (final.verdict, final.difference, final.measure) == (verdict, found, "return")
+
+
+def test_the_best_trial_is_a_complete_one_and_of_equals_the_first():
+    trials = [
+        ("failed", 9.0),
+        ("complete", 1.0),
+        ("complete", 2.0),
+        ("pruned", 5.0),
+        ("complete", 2.0),
+        ("running", 7.0),
+    ]
+    outcomes = [studies.Outcome(i, state, value, {}, {}, 1.0, "") for i, (state, value) in enumerate(trials)]
+    assert studies.best_of(outcomes).index == 2
+    assert studies.best_of([outcomes[0], outcomes[3], outcomes[5]]) is None
+
+
+def test_trainings_are_those_of_the_plan_and_as_many_at_once_as_asked(tmp_path, monkeypatch):
+    begun = []
+    monkeypatch.setattr(tuning, "Search", lambda *given: begun.extend(given) or SimpleNamespace(run=print, scheduler=0))
+    plan = make_plan(checkpoint_minutes=2.0, trial_seeds=2)
+    study, stop = studies.create(StudyFolder(tmp_path), plan), Interrupt()
+    with pytest.raises(AttributeError, match="left"):
+        run(study, workers=3, stop=stop)
+    assert begun == [study, RunConfig(env="Pendulum-v1", checkpoint_minutes=2.0), 3, stop]
+    search = Search(study, begun[1], 3, stop)
+    assert search.scheduler.launcher.capacity == 6
+    search.begin()
+    assert len(search.running) == 3
+    folder = StudyFolder(tmp_path).trial(0)
+    first = search.running[0].trainings[1]
+    assert first.task().run == dataclasses.replace(begun[1], preset=str(folder / "preset.json"), seed=plan.seeds(0)[1])
+    for one in search.running:
+        study.release(one.index)
+
+
+def test_runs_at_once_share_the_cores(monkeypatch):
+    monkeypatch.setattr(process.hardware, "cores", lambda: 8)
+    for name in process.THREADS:
+        monkeypatch.delenv(name, raising=False)
+    assert process.default_workers() == 4
+    assert [process.threads_of(n) for n in (1, 3, 8, 20)] == [8, 2, 1, 1]
+    for threads, expected in ((None, "2"), (5, "5")):
+        environ = process.LocalLauncher(3, threads)._environ
+        assert [environ[name] for name in (*process.THREADS, process.hardware.CORES)] == [expected] * 4
+
+
 def test_more_trials_continue_a_study_and_another_plan_is_refused(tmp_path):
     run(tuning.open_study(make_plan(trials=2, final_seeds=0), tmp_path / "study"))
     result = run(tuning.open_study(make_plan(trials=3, final_seeds=0), tmp_path / "study"))

@@ -5,14 +5,19 @@ from __future__ import annotations
 import os
 import warnings
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
+from rejeu import presets
 from rejeu.cli.output import noted_in
+from rejeu.experiments.folder import JobWork
 from rejeu.experiments.process import Process
 from rejeu.io import atomic
 from rejeu.reporting.history import History
 from rejeu.reporting.logging import CsvFile, JsonLines
+from rejeu.runs import config
+from rejeu.runs.config import DecidedRun, Task
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="links need rights on Windows")
 
@@ -83,3 +88,23 @@ def test_a_file_that_a_reader_holds_is_replaced_when_it_is_closed(tmp_path, monk
     tries.clear()
     with pytest.raises(PermissionError):
         atomic.replace_patiently(new, old, (0.0,))
+
+
+RUN = DecidedRun(env="CartPole-v1", algorithm="DQN", policy="MlpPolicy", seed=0, n_envs=1, backend="gymnasium", preset=True,
+                 hyperparameters={}, evaluate_every=1, evaluate_episodes=1)  # fmt: skip
+WRITERS = {
+    "config.json": lambda path: config.write(path, RUN),
+    "task.json": lambda path: config.write_task(path, Task(folder="run", run=RUN)),
+    "preset.json": lambda path: presets.write(presets.find("CartPole-v1", "DQN"), path),
+    "job.exit": lambda path: JobWork.write_exit(SimpleNamespace(exit=path), 0),
+    "episodes.csv": lambda path: History([]).write_csv(path),
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_new_file_takes_the_place_of_the_old_one_which_is_never_written_to(name, tmp_path):
+    (tmp_path / name).write_text("old")
+    os.link(tmp_path / name, tmp_path / "same")
+    WRITERS[name](tmp_path / name)
+    assert (tmp_path / name).read_text() != "old"
+    assert (tmp_path / "same").read_text() == "old"

@@ -102,6 +102,12 @@ def test_a_run_is_the_same_as_words_of_the_command_line_and_as_data(run, tmp_pat
     command, arguments = commands.of_task(read_task(tmp_path / "task.json"))
     assert {one.name: getattr(arguments, one.name) for one in dataclasses.fields(run)} == dataclasses.asdict(run)
     assert (command, str(arguments.out), arguments.pause) == ("train", "runs/1", 7)
+    task = Task(folder="runs/1", run=run, pause=7, resume=True, no_report=True, changes={"gamma": 0.5})
+    command, arguments = commands.of_task(task)
+    assert (command, str(arguments.run), arguments.steps, arguments.finish) == ("resume", "runs/1", 7, True)
+    assert (arguments.hyperparameters, arguments.no_report, arguments.no_video) == ({"gamma": 0.5}, True, False)
+    assert (arguments.imports, arguments.env_kwargs) == (run.imports, run.env_kwargs if run.names_code else {})
+    assert (arguments.env, arguments.wrappers) == (run.env if run.names_code else None, run.wrappers)
 
 
 def test_every_field_of_a_decided_run_is_one_of_a_run():
