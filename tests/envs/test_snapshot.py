@@ -158,6 +158,30 @@ def test_the_state_taken_out_does_not_move_with_the_environment():
     after = json.dumps(records.encode(state, arrays := {}, "x")), arrays
     np.testing.assert_equal(after, before)
 
+    class Own(gym.Wrapper):
+        """Changes its state in place, and gives it away."""
+
+        own = {"steps": [0]}
+
+        def step(self, action):
+            self.own["steps"][0] += 1
+            return self.env.step(action)
+
+        def give(self):
+            return self.own
+
+        def take(self, state):
+            self.own = state
+
+    for kind in ("", "wrapper_"):
+        kind = type("Saved", (Own,), {f"get_{kind}state": Own.give, f"set_{kind}state": Own.take})
+        env = kind(gym.make("Pendulum-v1"))
+        env.reset(seed=0)
+        before, state = env.own["steps"][0], state_of(env)
+        walk(env, np.zeros((3, 1)))
+        restore(env, state)
+        assert env.own == {"steps": [before]}
+
 
 @pytest.mark.parametrize(
     ("backend", "n_envs"), [("gymnasium", 1), ("gymnasium", 3), ("gymnasium-async", 2), ("envpool", 3)]

@@ -12,6 +12,7 @@ import pytest
 
 import rejeu
 from rejeu.cli import main
+from rejeu.envs.base import success_of
 from rejeu.envs.make import InProcess, make_vector
 from tests.environments import Counter, Reach
 from tests.tiers import exhaustive
@@ -51,6 +52,26 @@ def test_a_return_is_judged_by_what_is_asked_else_by_what_is_declared(declared, 
     vector = InProcess([counter() if declared is None else counter(reward_threshold=declared)])
     judged = vector.judge(last_step(vector), 0, episode_return, threshold)
     assert judged == expected or (math.isnan(judged) and math.isnan(expected))
+
+
+@pytest.mark.parametrize(
+    ("info", "expected"),
+    [
+        ({}, math.nan),
+        ({"is_success": True}, 1.0),
+        ({"success": True}, 1.0),
+        ({"success": 0.0}, 0.0),
+        ({"is_success": False, "success": True}, 0.0),
+        ({"is_success": np.array([True, False])}, 0.0),
+        ({"success": None}, math.nan),
+    ],
+)
+def test_an_info_says_success_by_one_of_two_keys(info, expected):
+    np.testing.assert_equal(success_of(info), expected)
+    shown = Reach()
+    shown.step = lambda action: (*Reach.step(shown, action)[:4], info)
+    vector = InProcess([shown], seed=0)
+    np.testing.assert_equal(vector.success(last_step(vector), 0), expected)
 
 
 def test_what_the_environment_says_goes_first():

@@ -19,6 +19,7 @@ from rejeu.sb3.common.callbacks import (
     EveryNTimesteps,
     ProgressBarCallback,
     StopTrainingOnMaxEpisodes,
+    StopTrainingOnNoModelImprovement,
     StopTrainingOnRewardThreshold,
 )
 from rejeu.sb3.common.env_util import make_vec_env
@@ -169,6 +170,24 @@ def test_evaluation_wants_environments_of_its_own():
         dqn(vector).learn(5, callback=EvalCallback(VecNormalize(vector)))
     with pytest.raises(TypeError, match="got str"):
         EvalCallback("CartPole-v1")
+
+
+@pytest.mark.parametrize(
+    ("stop", "best", "calls"),
+    [
+        (StopTrainingOnNoModelImprovement(1), [5, 5, 6, 6, 6], 5),
+        (StopTrainingOnNoModelImprovement(0), [5, 6, 6], 3),
+        (StopTrainingOnNoModelImprovement(1, min_evals=2), [5, 5, 5, 5], 4),
+        (StopTrainingOnNoModelImprovement(1, min_evals=3), [5, 6, 6, 6, 6], 5),
+        (StopTrainingOnRewardThreshold(5.0), [4.9, 5.0], 2),
+    ],
+)
+def test_an_evaluation_stops_training(stop, best, calls, capsys):
+    stop.parent, stop.verbose = EvalCallback(Walk(1)), 1
+    for call, stop.parent.best_mean_reward in enumerate(best, 1):
+        stop.n_calls = call
+        assert stop._on_step() == (call < calls)
+        assert ("Stopping" in capsys.readouterr().out) == (call == calls)
 
 
 def test_judges_of_evaluations_belong_to_one():

@@ -15,8 +15,15 @@ from gymnasium import spaces
 
 from rejeu import sb3
 from rejeu.algorithms import a2c, optimizers
-from rejeu.sb3.common import base_class, distributions, logger as loggers, save_util, torch_layers, utils
-from rejeu.sb3.common.atari_wrappers import AtariWrapper
+from rejeu.sb3.common import (
+    atari_wrappers,
+    base_class,
+    distributions,
+    logger as loggers,
+    save_util,
+    torch_layers,
+    utils,
+)
 from rejeu.sb3.common.buffers import HerReplayBuffer
 from rejeu.sb3.common.callbacks import LogEveryNTimesteps
 from rejeu.sb3.common.env_util import make_atari_env, make_vec_env
@@ -272,12 +279,12 @@ class Console(gym.Env):
     def step(self, action):
         self.t += 1
         self.ale.left = 3 - self.t // 50
-        return np.full((210, 160, 3), self.t, np.uint8), 7.0, self.ale.left == 0, False, {}
+        return np.full((210, 160, 3), 200 - self.t, np.uint8), 7.0, self.ale.left == 0, False, {}
 
 
 def test_atari_wrappers_by_a_game_that_is_none():
     pytest.importorskip("cv2")
-    env = AtariWrapper(Console(), noop_max=3, screen_size=42)
+    env = atari_wrappers.AtariWrapper(Console(), noop_max=3, screen_size=42)
     obs, _ = env.reset(seed=0)
     assert obs.shape == (42, 42, 1)
     assert env.unwrapped.t in range(
@@ -286,12 +293,89 @@ def test_atari_wrappers_by_a_game_that_is_none():
     before = env.unwrapped.t
     obs, reward, terminated, _, _ = env.step(2)
     assert (env.unwrapped.t - before, reward, terminated) == (4, 1.0, False)
-    assert obs.max() == env.unwrapped.t  # the brightest of the last two frames
+    assert obs.max() == 201 - env.unwrapped.t  # the brighter of the last two frames
     while not terminated:
         terminated = env.step(2)[2]
     assert env.unwrapped.ale.lives() == 2  # an episode ends with a life
     vector = make_atari_env(Console, n_envs=2, wrapper_kwargs={"screen_size": 42})
     assert vector.reset().shape == (2, 42, 42, 1)
+
+
+class Game(gym.Env):
+    """Plays a script of lives, one a step; the game is over some steps after the last life. Keeps the actions."""
+
+    action_space, observation_space = spaces.Discrete(4), spaces.Box(0, 255, (2,), np.uint8)
+
+    def __init__(self, lives=(3,) * 99, over=99):
+        self.script, self.over, self.ale, self.played = lives, over, SimpleNamespace(lives=self.lives), []
+
+    def lives(self):
+        return self.script[self.t]
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t = 0
+        self.played.append("reset")
+        return np.zeros(2, np.uint8), {}
+
+    def step(self, action):
+        self.t += 1
+        self.played.append(action)
+        return np.array([self.t, 100 - self.t], np.uint8), float(self.t), self.t == self.over, False, {}
+
+
+def test_an_episode_of_atari_is_a_life_and_the_game_goes_on():
+    game = Game(lives=(3, 3, 2, 2, 0, 0, 0), over=6)
+    env = atari_wrappers.EpisodicLifeEnv(game)
+    env.reset()
+    assert [env.step(1)[2] for _ in range(2)] == [False, True]  # a life
+    assert env.reset()[0][0] == 3  # a step without action, no reset
+    assert [env.step(2)[2] for _ in range(3)] == [False, False, True]  # no lives are left before the game is over
+    env.reset()
+    assert game.played == ["reset", 1, 1, 0, 2, 2, 2, "reset"]
+    env.step(3)
+    assert env.reset()[0][0] == 2  # no life was lost
+    game.over = 3
+    assert (env.reset()[0][0], env.lives) == (0, 3)  # the game ended in the step without action
+
+
+def test_the_wrappers_of_atari_one_by_one():
+    game = Game(over=5)
+    skips = atari_wrappers.MaxAndSkipEnv(game, skip=3)
+    skips.reset()
+    obs, reward, terminated, _, _ = skips.step(2)
+    assert (obs.tolist(), reward, terminated) == ([3, 98], 6.0, False)  # the maxima of the last two of three frames
+    obs, reward, terminated, _, _ = skips.step(1)
+    assert (obs.tolist(), reward, terminated) == ([5, 96], 9.0, True)  # only two were left
+    assert game.played == ["reset", 2, 2, 2, 1, 1]
+
+    begun = {
+        len((env := atari_wrappers.NoopResetEnv(Game(), 3)).reset(seed=seed) and env.unwrapped.played) - 1
+        for seed in range(20)
+    }
+    assert begun == {1, 2, 3}
+    env = atari_wrappers.NoopResetEnv(Game(over=2))
+    env.override_num_noops = 3
+    assert (env.reset()[0][0], env.unwrapped.played) == (1, ["reset", 0, 0, "reset", 0])
+    env = atari_wrappers.FireResetEnv(Game())
+    assert (env.reset()[0][0], env.unwrapped.played) == (2, ["reset", 1, 2])
+    env = atari_wrappers.FireResetEnv(Game(over=1))
+    assert (env.reset()[0][0], env.unwrapped.played) == (0, ["reset", 1, "reset", 2, "reset"])
+
+    for probability, expected in ((0.0, [3, 1, 2]), (1.0, [0, 0, 0])):
+        env = atari_wrappers.StickyActionEnv(Game(), probability)
+        env.reset(seed=0)
+        for action in (3, 1, 2):
+            env.step(action)
+        assert env.unwrapped.played[1:] == expected
+    env.action_repeat_probability = 0.0
+    env.step(3)
+    env.action_repeat_probability = 1.0
+    env.step(1)
+    env.reset()
+    env.step(1)
+    assert env.unwrapped.played[-4:] == [3, 3, "reset", 0]  # what is repeated is of the same episode
+    assert [atari_wrappers.ClipRewardEnv(Game()).reward(x) for x in (-7.0, 0.0, 0.5)] == [-1.0, 0.0, 1.0]
 
 
 def test_observations_are_prepared_by_their_spaces():
@@ -335,6 +419,45 @@ def test_small_functions(tmp_path):
     logger = utils.configure_logger(1, tmp_path, "run")
     assert (Path(logger.dir).name, type(logger.output_formats[0])) == ("run_1", loggers.HumanOutputFormat)
     logger.close()
+    for name in ("run_2", "run_10", "run_11_old", "rerun_12", "run_", "run_x"):
+        (tmp_path / name).mkdir()
+    assert utils.get_latest_run_id(tmp_path, "run") == 10
+    assert utils.get_latest_run_id(tmp_path, "other") == 0
+    for is_new, name in ((False, "run_10"), (True, "run_11")):
+        assert Path(utils.configure_logger(0, tmp_path, "run", reset_num_timesteps=is_new).dir).name == name
+    assert utils.configure_logger(0).output_formats == []
+
+
+def test_what_tensorboard_shows(tmp_path):
+    accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    from PIL import Image
+
+    logger = loggers.Logger(str(tmp_path), [loggers.TensorBoardOutputFormat(tmp_path)])
+    logger.record("number", np.float64(0.5))
+    values = np.array([[0.0, 1.0], [2.0, 30.0]])
+    logger.record("values", values)
+    pixels = np.arange(2 * 3 * 3, dtype=np.uint8).reshape(2, 3, 3)  # rows, columns, colors
+    logger.record("image", loggers.Image(pixels.transpose(2, 0, 1), "CHW"))
+    logger.record("shares", loggers.Image(np.array([[[0.0], [0.5], [2.0]]]), "HWC"))
+    frames = np.zeros((1, 3, 3, 4, 5), np.uint8)
+    frames[0, 1] = 255
+    logger.record("video", loggers.Video(frames, fps=4))
+    logger.record("left out", 1.0, exclude="tensorboard")
+    logger.dump(7)
+    logger.close()
+    seen = accumulator.EventAccumulator(str(tmp_path), {"images": 0, "histograms": 0}).Reload()
+    assert seen.Tags()["scalars"] == ["number"]
+    assert [(one.step, one.value) for one in seen.Scalars("number")] == [(7, 0.5)]
+    (event,) = seen.Histograms("values")
+    shown = event.histogram_value
+    assert (shown.min, shown.max, shown.num, shown.sum, shown.sum_squares) == (0.0, 30.0, 4, 33.0, 905.0)
+    assert shown.bucket_limit == pytest.approx(range(1, 31))  # the upper end of each
+    assert {limit: n for limit, n in zip(range(1, 31), shown.bucket, strict=True) if n} == {1: 1, 2: 1, 3: 1, 30: 1}
+    images = {tag: Image.open(io.BytesIO(seen.Images(tag)[0].encoded_image_string)) for tag in seen.Tags()["images"]}
+    np.testing.assert_array_equal(np.asarray(images["image"]), pixels)
+    assert np.asarray(images["shares"]).tolist() == [[0, 127, 255]]
+    video = images["video"]
+    assert (video.n_frames, video.size, video.info["duration"], video.info["loop"]) == (3, (5, 4), 250, 0)
 
 
 def test_masks_forbid_choices_and_bits():

@@ -8,15 +8,18 @@ import warnings
 import equinox as eqx
 import gymnasium as gym
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from gymnasium import spaces
 
 from rejeu import sb3
 from rejeu.algorithms.actor_critic.network import sde_std
+from rejeu.distributions import Normal, TanhNormal
 from rejeu.sb3.common import env_checker, logger as loggers, utils
 from rejeu.sb3.common.buffers import HerReplayBuffer
-from rejeu.sb3.common.noise import NormalActionNoise, VectorizedActionNoise
+from rejeu.sb3.common.distributions import Distribution, half_widths
+from rejeu.sb3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise, VectorizedActionNoise
 from rejeu.sb3.common.torch_layers import BaseFeaturesExtractor
 from rejeu.sb3.policy import ActorCriticPolicy
 from tests.sb3 import envs
@@ -127,17 +130,37 @@ def test_policy_parts_agree_with_the_agent():
     assert [q.shape for q in agent.critic(obs[:, :3], np.zeros((5, 1)))] == [(5, 1)] * 2
     state = {name: array + 1 for name, array in agent.policy.state_dict().items()}
     agent.policy.load_state_dict(state)
-    np.testing.assert_array_equal(
-        agent.policy.parameters_to_vector(), np.concatenate([a.ravel() for a in state.values()])
-    )
+    vector = agent.policy.parameters_to_vector()
+    np.testing.assert_array_equal(vector, np.concatenate([a.ravel() for a in state.values()]))
+    name, array = next(iter(state.items()))
+    for given in ({name: array + 1}, {other: value for other, value in state.items() if other != name}, {}):
+        with pytest.raises(RuntimeError, match="missing"):
+            agent.policy.load_state_dict(given)
+    np.testing.assert_array_equal(agent.policy.parameters_to_vector(), vector)
+    agent.policy.load_state_dict({name: array + 1}, strict=False)
+    found = agent.policy.state_dict()
+    np.testing.assert_array_equal(found.pop(name), array + 1)
+    assert all(np.array_equal(value, state[other]) for other, value in found.items())
+    agent.policy.load_from_vector(vector - 2)
+    np.testing.assert_array_equal(agent.policy.parameters_to_vector(), vector - 2)
 
 
 def test_box_distributions_are_in_the_environments_units():
     model = sb3.A2C("MlpPolicy", gym.make("Pendulum-v1"), seed=0)
-    _, log_prob, _ = model.policy.evaluate_actions(
+    _, log_prob, entropy = model.policy.evaluate_actions(
         np.zeros((1, 3), np.float32), model.policy.get_distribution(np.zeros(3)).mode()
     )
     assert float(log_prob[0]) == pytest.approx(-0.5 * np.log(2 * np.pi) - np.log(2), rel=1e-5)  # sigma is 2 there
+    assert float(entropy[0]) == pytest.approx(0.5 * np.log(2 * np.pi * np.e) + np.log(2), rel=1e-5)
+    widths = half_widths(spaces.Box(np.array([0, -1], np.float32), np.array([4, 9], np.float32)))
+    asymmetric = Distribution(Normal(jnp.array([0.5, -1.0]), jnp.log(jnp.array([1e-6, 0.5]))), widths)
+    assert asymmetric.mode().tolist() == [3.0, -1.0]
+    assert asymmetric.sample()[0] == pytest.approx(3.0, abs=1e-4)
+    sigma = np.array([2e-6, 2.5])
+    density = -0.5 * np.square([0.0, 0.8]) - np.log(sigma * np.sqrt(2 * np.pi))
+    assert float(asymmetric.log_prob(np.array([3.0, 1.0]))) == pytest.approx(density.sum(), rel=1e-5)
+    assert float(asymmetric.entropy()) == pytest.approx(np.log(sigma * np.sqrt(2 * np.pi * np.e)).sum(), rel=1e-5)
+    assert Distribution(TanhNormal(jnp.zeros(1), jnp.zeros(1)), None).entropy() is None
 
 
 def test_hyperparameters_are_attributes_that_can_be_set():
@@ -155,6 +178,13 @@ def test_neutral_arguments_are_accepted_and_those_not_followed_warn():
     ppo(**SMALL, use_sde=False, rollout_buffer_class=None, _init_setup_model=True)
     noise = VectorizedActionNoise(NormalActionNoise(np.zeros(1), np.ones(1)), 2)
     assert noise().shape == (2, 1)
+    steady = OrnsteinUhlenbeckActionNoise(np.ones(1), np.zeros(1), theta=0.5, dt=1.0)
+    each = VectorizedActionNoise(steady, 3)
+    assert [each()[:, 0].tolist() for _ in range(2)] == [[0.5] * 3, [0.75] * 3]
+    each.reset([1])
+    assert each()[:, 0].tolist() == [0.875, 0.5, 0.875]
+    each.reset()
+    assert each()[:, 0].tolist() == [0.5] * 3 == [float(steady()[0])] * 3  # the process given has not moved
     model = sac(
         optimize_memory_usage=True, use_sde=False, sde_sample_freq=-1, action_noise=noise, train_freq=(1, "step")
     )
@@ -360,7 +390,16 @@ def test_contrib_modules_and_masks():
     assert get_action_masks(ActionMasker(env, lambda inner: np.ones(6))).tolist() == [True] * 6
     timed = TimeFeatureWrapper(gym.make("Pendulum-v1"))
     assert timed.reset()[0][-1] == 1.0
-    assert timed.step(np.zeros(1))[0][-1] == pytest.approx(1 - 1 / 200)
+    assert [timed.step(np.zeros(1))[0][-1] for _ in range(2)] == pytest.approx([1 - 1 / 200, 1 - 2 / 200])
+    assert timed.reset()[0][-1] == 1.0
+    shown = TimeFeatureWrapper(gym.make("Pendulum-v1"), test_mode=True)
+    assert (shown.reset()[0][-1], shown.step(np.zeros(1))[0][-1]) == (1.0, 1.0)
+    goals = TimeFeatureWrapper(Reach(), max_steps=4)  # which has no limit of its own
+    goals.reset()
+    obs = goals.step(np.zeros(1))[0]
+    assert (obs["observation"].tolist(), obs["achieved_goal"].tolist()) == ([100.0, 0.75], [100.0])
+    assert goals.observation_space.contains(obs)
+    assert goals.observation_space["observation"].low.tolist() == [-200.0, 0.0]
 
 
 def test_files_by_path_or_open(tmp_path):

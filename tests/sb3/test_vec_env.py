@@ -8,6 +8,7 @@ import gymnasium as gym
 import jax
 import numpy as np
 import pytest
+from gymnasium import spaces
 
 import rejeu
 from rejeu.errors import BadEnvironmentError, CheckpointError
@@ -197,6 +198,10 @@ def test_returns_are_counted_beneath_wrappers_that_change_rewards():
     # Walk pays 1 + 2 + 3, with rank 1 in four steps 1.25 + 2.25 + 3.25 + 4.25
     assert {(e["r"], e["l"]) for e in agent.ep_info_buffer} == {(6.0, 3), (11.0, 4)}
     assert rejeu.evaluate_policy(agent, env, 2) == (8.5, 2.5)
+    assert rejeu.evaluate_policy(agent, env, 3, return_episode_rewards=True) == ([6.0, 11.0, 11.0], [3, 4, 4])
+    rejeu.evaluate_policy(agent, env, 2, reward_threshold=8.4)
+    with pytest.raises(AssertionError, match="not above"):
+        rejeu.evaluate_policy(agent, env, 2, reward_threshold=8.5)
     assert sorted(agent.evaluate(2, env=env).returns) == [6.0, 11.0]
     plain = rejeu.DQN("MlpPolicy", Doubled(walks(wrap=lambda env: env)), learning_starts=1000, **SMALL).learn(24)
     assert {e["r"] for e in plain.ep_info_buffer} == {-6.0, -11.0}
@@ -520,6 +525,8 @@ def test_environments_are_monitored_wrapped_and_seeded(tmp_path):
     assert env.render_mode == "rgb_array"
     expected = [gym.make("Pendulum-v1", g=9.0).reset(seed=7 + i)[0] for i in range(2)]
     np.testing.assert_array_equal(env.reset(), expected)
+    for rank, one in zip((3, 4), env.envs, strict=True):
+        assert one.action_space.sample() == spaces.Box(-2, 2, (1,), np.float32, seed=7 + rank).sample()
     assert (env.step(np.zeros((2, 1)))[1] > 0).all()
 
 

@@ -70,6 +70,12 @@ def test_the_point_never_enters_a_wall_and_reaches_every_cell(layout):
     state, _ = jax.vmap(env.reset)(jax.random.split(KEY, n))
     assert not overlaps_a_wall(env, np.asarray(state.position)).any()
     assert not overlaps_a_wall(env, np.asarray(state.goal)).any()
+    places = np.stack([state.position, state.goal]) + np.array(env.walls.shape[::-1]) / 2
+    starts, goals = np.floor(places)
+    assert (starts != goals).any(axis=1).all()
+    assert 0.24 < np.abs(places % 1 - 0.5).max() <= point_maze.SPREAD + 1e-6
+    if layout == "u":  # every start with every goal
+        assert len(np.unique(np.concatenate([starts, goals], axis=1), axis=0)) == 7 * 6
 
     def turn(state, key):
         action = jnp.repeat(jax.random.uniform(key, (n // 2, 2), minval=-1.5, maxval=1.5), 2, axis=0)

@@ -68,6 +68,13 @@ def test_a_running_episode_is_saved_and_restored():
     np.testing.assert_array_equal(other.step(0)[0], env.step(0)[0])
     np.testing.assert_array_equal(other.reset()[0], env.reset()[0])
     assert not snapshot.is_over(other)
+    np.testing.assert_array_equal(other.np_random.random(3), env.np_random.random(3))
+    while not env.step(1)[2]:
+        pass
+    snapshot.restore(other, snapshot.state_of(env))
+    assert snapshot.is_over(other)
+    snapshot.restore(other, snapshot.state_of(gym.make("jax/CartPole-v1")))  # whose first episode has not begun
+    assert snapshot.is_over(other)
 
 
 def test_arguments_reach_the_environment():
