@@ -39,10 +39,10 @@ LAYOUT = {tokenize.NEWLINE, tokenize.NL, tokenize.COMMENT, tokenize.INDENT, toke
 EXCEPTIONS = PUBLIC_IN_SPITE_OF_ITS_NAME | GYMNASIUM_STATE
 
 
-def parse(src: Path) -> dict[str, tuple[Path, ast.Module]]:
-    """Returns path and syntax tree of every module of the package, by dotted name."""
+def parse(src: Path, package: str = PACKAGE) -> dict[str, tuple[Path, ast.Module]]:
+    """Returns path and syntax tree of every module of a package, by dotted name."""
     modules = {}
-    for path in sorted((src / PACKAGE).rglob("*.py")):
+    for path in sorted((src / package).rglob("*.py")):
         parts = path.relative_to(src).with_suffix("").parts
         name = ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
         modules[name] = path, ast.parse(path.read_text(encoding="utf-8"))

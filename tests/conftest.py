@@ -13,6 +13,7 @@ import ctypes
 import gc
 import os
 import re
+import shutil
 import signal
 import tempfile
 from collections.abc import Iterator
@@ -130,6 +131,20 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(Agent, "learn", learn_shortly)
     monkeypatch.setattr(Agent, "evaluate", evaluate_shortly)
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    """Headless Chromium, if it and Playwright are installed. Its event loop ends with the module that asked for it."""
+    driving = pytest.importorskip("playwright.sync_api", reason="needs playwright, which is in the extra test")
+    chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    if chromium is None:
+        pytest.skip("needs Chromium; on Debian: apt-get install chromium")
+    with driving.sync_playwright() as driver:
+        quiet = ["--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-component-update"]
+        started = driver.chromium.launch(executable_path=chromium, args=quiet)
+        yield started
+        started.close()
 
 
 def memory(field: str) -> int:

@@ -9,7 +9,7 @@ Run it with the active python::
     python trials/mutations.py --together           # those that this missed: all of them at once, then one by one
 
 Each mutation is made in a copy of the tracked files, and the default tests run there with ``pytest -x``: first the test that
-the table names, then the files that are about what was changed, then the folders around it. The first test that fails is
+the table names, then the files that ``scripts/changed.py`` finds for what was changed, then all. The first test that fails is
 written beside the bug to ``trials/results/mutations.json``, from which the page "How we check" has its table. A mutation that
 no test notices is *missed*. The lines are in ``trials/mutations.toml``. One that no longer occurs exactly once stops the
 script before anything runs.
@@ -36,6 +36,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 ROOT = Path(__file__).parents[1]
+sys.path.append(str(ROOT / "scripts"))
+
+from changed import tests_of  # noqa: E402  # a script, which is in no package
+
 RESULTS = ROOT / "trials" / "results" / "mutations.json"
 COPIED = ("src", "tests", "scripts", "examples", "docs", "benchmarks", "trials")
 LIMIT = 1200
@@ -63,73 +67,10 @@ MUTATIONS = [
 ]
 """The lines and what takes their place."""
 
-STAGES = {
-    "algorithms/sac/": ["tests/algorithms/test_off_policy_updates.py"],
-    "algorithms/ddpg/": ["tests/algorithms/test_off_policy_updates.py"],
-    "algorithms/td3": ["tests/algorithms/test_off_policy_updates.py"],
-    "algorithms/tqc": ["tests/algorithms/test_tqc.py", "tests/algorithms/test_off_policy_updates.py"],
-    "algorithms/quantile": ["tests/algorithms/test_tqc.py"],
-    "algorithms/actor_critic/gae": ["tests/algorithms/test_gae.py"],
-    "algorithms/actor_critic/": ["tests/buffers/test_rollout.py", "tests/algorithms/test_ppo.py"],
-    "algorithms/dqn": ["tests/algorithms/test_dqn.py", "tests/algorithms/test_recorded_updates.py"],
-    "algorithms/": ["tests/algorithms/test_NAME.py"],
-    "buffers/ring": ["tests/buffers/test_uniform.py"],
-    "buffers/uniform": ["tests/buffers/test_uniform.py", "tests/test_offline.py"],
-    "buffers/": ["tests/buffers/test_NAME.py"],
-    "loops/device/": ["tests/loops/device", "tests/test_schedules.py"],
-    "loops/on_policy": ["tests/test_normalization.py", "tests/test_schedules.py"],
-    "loops/": ["tests/test_schedules.py", "tests/agents/test_agent.py"],
-    "agents/": ["tests/test_schedules.py", "tests/agents/test_agent.py"],
-    "core": ["tests/algorithms/test_off_policy_updates.py"],
-    "exploration/": ["tests/exploration", "tests/algorithms/test_keys.py"],
-    "networks/memory": ["tests/algorithms/test_memory.py"],
-    "networks/": ["tests/networks/test_NAME.py"],
-    "envs/functional/": ["tests/envs/functional/test_NAME.py"],
-    "callbacks/": ["tests/callbacks"],
-    "": ["tests/ROOM/**/test_NAME*.py", "tests/test_NAME*.py"],
-}
-"""By the first characters of the file: the tests that are about it. NAME stands for the file's own, or that of the folder
-of an ``__init__.py``; ROOM for the first folder."""
-KINDS = {
-    "sac/continuous": "SAC",
-    "sac/discrete": "SAC",
-    "ddpg/continuous": "DDPG",
-    "quantile_loss": "TQC",
-    "actor_critic/steps": "PPO or A2C",
-    "actor_critic/gae": "PPO or A2C",
-}
-"""By the file in ``algorithms/``, the algorithms whose settings are tried; elsewhere the file has their name."""
-WIDER = {
-    "algorithms/": ["tests/algorithms/test_every_setting.py", "-k", "KIND"],
-    "core": ["tests/algorithms/test_every_setting.py"],
-    "distributions": ["tests/algorithms"],
-    "buffers/": ["tests/buffers"],
-}
-WIDEST = [
-    "tests/algorithms",
-    "tests/buffers",
-    "tests/loops",
-    "tests/agents",
-    "tests/exploration",
-    "tests/test_schedules.py",
-]
-
 
 def stages(mutation: Mutation) -> list[list[str]]:
-    """Returns the tests to run one after the other."""
-    path = Path(mutation.file)
-    name, room = path.parent.name if path.stem == "__init__" else path.stem, path.parts[0]
-    prefix = "" if mutation.room is not None else mutation.file
-    first = next(tests for start, tests in STAGES.items() if prefix.startswith(start))
-    first = [test.replace("NAME", name).replace("ROOM", room) for test in first]
-    first = sorted({found.relative_to(ROOT).as_posix() for test in first for found in ROOT.glob(test)})
-    if mutation.room is not None:
-        return [first, [f"tests/{room}"] if (ROOT / "tests" / room).is_dir() else [], ["tests"]]
-    wider = [tests for prefix, tests in WIDER.items() if mutation.file.startswith(prefix)]
-    of_algorithm = mutation.file.removeprefix("algorithms/").removesuffix(".py")
-    kind = KINDS.get(of_algorithm, name)
-    wider = [[kind if test == "KIND" else test for test in tests] for tests in wider]
-    return [first, *wider, WIDEST]
+    """Returns the tests to run one after the other: those of the changed file, then all."""
+    return [tests_of([f"src/rejeu/{mutation.file}"]), ["tests"]]
 
 
 def check() -> None:
@@ -201,12 +142,12 @@ def run(mutation: Mutation, folder: Path, n_stages: int, limit: float) -> dict[s
     row, began, done = as_row(mutation), time.monotonic(), list[str]()
     numbered = [*enumerate(stages(mutation)[:n_stages], 1)]
     known = table().get(key(mutation), row)
-    if known["caught_by"] is not None and "::" in known["caught_by"] and known["stage"] <= n_stages:
+    if known["caught_by"] is not None and "::" in known["caught_by"]:
         numbered.insert(0, (known["stage"], [known["caught_by"]]))
     with planted([mutation], folder):
         for number, tests in numbered:
             tests = [test for test in tests if test not in done]
-            done += [] if "-k" in tests else tests
+            done += tests
             if not tests:
                 continue
             try:
@@ -238,7 +179,7 @@ def run_together(mutations: Sequence[Mutation], folder: Path, tests: Sequence[st
         began = time.monotonic()
         with planted([mutation], folder):
             caught = failed(pytest(found, folder, limit, "-x").stdout)
-        about = {"caught_by": caught[0].partition("[")[0] if caught else None, "stage": 3 if caught else None}
+        about = {"caught_by": caught[0].partition("[")[0] if caught else None, "stage": 2 if caught else None}
         print(f"{mutation.file}  {mutation.kind}: {about['caught_by'] or 'MISSED'}", flush=True)
         write({key(mutation): as_row(mutation) | about | {"seconds": round(time.monotonic() - began)}})
 
@@ -249,7 +190,9 @@ def main() -> None:
     parser.add_argument("--only", default="", help="text in the file or in the changed line")
     parser.add_argument("--again", action="store_true", help="also those that the table has")
     parser.add_argument("--missed", action="store_true", help="those that the table has as missed")
-    parser.add_argument("--stages", type=int, default=3, help="how far around what was changed tests are run, 1 to 3")
+    parser.add_argument(
+        "--stages", type=int, default=2, choices=(1, 2), help="1: only the tests of what was changed; 2: then all"
+    )
     parser.add_argument("--part", default="0/1", help="i/n: every n-th mutation, from the i-th")
     parser.add_argument("--limit", type=float, default=LIMIT, help="seconds for the tests of one stage")
     parser.add_argument("--together", nargs="*", metavar="TESTS", help="those missed, at once, by these tests or all")

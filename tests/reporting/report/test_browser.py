@@ -1,6 +1,5 @@
 """Pages about runs in headless Chromium: drawn, interactive, silent, and never running what a run folder contains."""
 
-import shutil
 import threading
 import time
 
@@ -10,21 +9,7 @@ from rejeu.reporting.comparison import compare
 from rejeu.reporting.report import make_server, write_report
 from tests.reporting.report.folders import write, write_hostile
 from tests.reporting.test_comparison import write_run
-
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-playwright = pytest.importorskip("playwright.sync_api", reason='needs playwright; pip install "rejeu[browser]"')
-pytestmark = [
-    pytest.mark.exhaustive,  # a browser takes seconds to start and to draw
-    pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium; on Debian: apt-get install chromium"),
-]
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", "--disable-gpu"])
-        yield browser
-        browser.close()
+from tests.tiers import crossed, exhaustive
 
 
 class Opened:
@@ -53,8 +38,7 @@ def report(tmp_path_factory):
     return write_report(folder).as_uri()
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("width", [1400, 390])
+@pytest.mark.parametrize(("width", "scheme"), crossed([1400, 390], ["light", "dark"]))
 def test_page_is_drawn_without_errors_and_requests(browser, report, width, scheme):
     with Opened(browser, report, width, scheme) as opened:
         page = opened.page
@@ -165,6 +149,7 @@ def test_live_page_follows_the_run(browser, tmp_path):
         server.shutdown()
 
 
+@exhaustive
 def test_million_episodes_are_drawn_quickly(browser, tmp_path):
     path = write_report(write(tmp_path / "run", episodes=1_000_000, videos=False))
     assert path.stat().st_size < 3e6

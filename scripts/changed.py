@@ -1,0 +1,106 @@
+"""Prints the test files of a change: what ``scripts/test --changed`` runs.
+
+    python scripts/changed.py [COMMIT] [--files FILE ...]
+
+The change is what differs from COMMIT (default: ``main``), including what is not committed yet. The tests of a changed module
+are the files that have its name, and those that import it, directly or through modules of ``tests``. If there are none, they
+are those of the modules that import it, and so on. A test file that has changed is one of them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import subprocess
+import sys
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from structure import imports, parse  # beside this file
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def definitions(modules: dict[str, tuple[Path, ast.Module]]) -> dict[tuple[str, str], str]:
+    """Returns the module behind each name that a module imports from another one, for example behind ``rejeu.SAC``."""
+    return {
+        (module, alias.asname or alias.name): source
+        for module, (path, tree) in modules.items()
+        for source, node in imports(module, path, tree, set(modules))
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    } | {
+        ("rejeu", alias.name): node.module
+        for node in ast.walk(modules["rejeu"][1])
+        if isinstance(node, ast.ImportFrom) and node.module in modules
+        for alias in node.names
+    }
+
+
+def used(
+    module: str, path: Path, tree: ast.Module, known: set[str], behind: dict[tuple[str, str], str]
+) -> Iterator[str]:
+    """Yields each module that a test file imports, with those behind the names that it takes from packages."""
+    for source, node in imports(module, path, tree, known):
+        yield source
+        if isinstance(node, ast.ImportFrom):
+            yield from (behind[source, alias.name] for alias in node.names if (source, alias.name) in behind)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and ("rejeu", node.attr) in behind and ast.unparse(node.value) == "rejeu":
+            yield behind["rejeu", node.attr]
+
+
+def reached(start: Iterable[str], edges: dict[str, set[str]]) -> set[str]:
+    """Returns the names that can be reached, with those at the start."""
+    found, left = set(start), list(start)
+    while left:
+        new = edges[left.pop()] - found
+        found |= new
+        left += new
+    return found
+
+
+def tests_of(changed: Iterable[str]) -> list[str]:
+    """Returns the test files of changed files, as paths below the repository, sorted."""
+    package, tests = parse(ROOT / "src"), parse(ROOT, "tests")
+    behind, known = definitions(package), {*package, *tests}
+    edges: dict[str, set[str]] = defaultdict(set)
+    for name, (path, tree) in tests.items():
+        edges[name] = set(used(name, path, tree, known, behind))
+    importers: dict[str, set[str]] = defaultdict(set)
+    for name, (path, tree) in package.items():
+        for source, _ in imports(name, path, tree, set(package)):
+            importers[source].add(name)
+    within_tests = {name: {one for one in found if one in tests} for name, found in edges.items()}
+    needs = {
+        name: set[str]().union(*(edges[one] for one in reached([name], defaultdict(set, within_tests)))) | {name}
+        for name in tests
+        if name.rpartition(".")[2].startswith("test_")
+    }
+    paths = {path.relative_to(ROOT).as_posix(): name for name, (path, _) in {**package, **tests}.items()}
+    found: set[str] = set()
+    for module in (paths[one] for one in changed if one in paths):
+        found |= {name for name in needs if f"test_{module.rpartition('.')[2]}" == name.rpartition(".")[2]}
+        ring, seen = {module}, {module}
+        while ring and not (of_ring := {name for name, modules in needs.items() if modules & ring}):
+            ring = set[str]().union(*(importers[one] for one in ring)) - seen
+            seen |= ring
+        found |= of_ring if ring else set()
+    return sorted(tests[name][0].relative_to(ROOT).as_posix() for name in found)
+
+
+def main() -> None:
+    """Runs the command."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("commit", nargs="?", default="main", help="what the change is compared with")
+    parser.add_argument("--files", nargs="+", help="these files instead, as paths below the repository")
+    given = parser.parse_args()
+    git = ["git", "-C", str(ROOT)]
+    commands = [[*git, "diff", "--name-only", given.commit], [*git, "ls-files", "--others", "--exclude-standard"]]
+    changed = given.files or [line for one in commands for line in subprocess.check_output(one, text=True).splitlines()]
+    print("\n".join(tests_of(changed)))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
