@@ -19,11 +19,13 @@ from rejeu.agents import AGENTS
 from rejeu.algorithms.dqn import FOR_NEW
 from rejeu.callbacks import Evaluate
 from rejeu.cli import main, one_line
+from rejeu.cli.session import Session
 from rejeu.cli.train import untuned
 from rejeu.reporting.logging import CsvFile
 from rejeu.reporting.report.page import plotly_script
 from rejeu.runs import config, folder
 from tests.full_disk import FullDisk
+from tests.helpers import assert_same_parameters
 from tests.tiers import exhaustive
 
 FILES = {
@@ -169,13 +171,19 @@ def test_train_stops_after_the_minutes_given(tmp_path):
     assert {path.name for path in out.iterdir()} == FILES
 
 
+@pytest.fixture
+def untrained(monkeypatch):
+    """Ends commands before they train."""
+    monkeypatch.setattr(Session, "run", lambda self, stop, stopwatch: (0, {}))
+
+
+@pytest.mark.usefixtures("untrained")
 def test_goal_environments_are_trained_with_hindsight(tmp_path):
-    assert train(tmp_path / "run", "--envs", "2", "--no-video", env="parking-v0", steps=120) == 0
+    assert train(tmp_path / "run", "--envs", "2", env="parking-v0") == 0
     config = json.loads((tmp_path / "run" / "config.json").read_text())
     assert config["policy"] == "MultiInputPolicy"
     assert config["hyperparameters"]["replay_buffer_class"] == "HerReplayBuffer"
     assert (config["n_envs"], config["backend"]) == (2, "envpool")
-    assert {path.name for path in (tmp_path / "run").iterdir()} == FILES - {"video.mp4"}
 
 
 def test_without_a_name_the_run_folder_is_new_each_time(tmp_path, monkeypatch):
@@ -248,11 +256,7 @@ def test_evaluate_takes_the_last_model_or_a_file_as_well(run, capsys):
     assert capsys.readouterr().out.count("agent.safetensors") == 2
 
 
-def test_record_writes_a_video_where_asked(run, tmp_path):
-    assert main(["record", str(run), "--out", str(tmp_path / "v.mp4"), "--episodes", "1", "--seed", "0"]) == 0
-    assert (tmp_path / "v.mp4").stat().st_size
-
-
+@pytest.mark.usefixtures("untrained")
 def test_a_preset_says_what_a_success_is_where_the_environments_threshold_ranks_by_luck(tmp_path):
     out = tmp_path / "run"
     argv = ["train", "Taxi-v4", "--steps", "8", "--out", str(out), "--evaluate-episodes", "1", *FEWER_FILES]
@@ -325,6 +329,7 @@ def test_set_leaves_the_preset_as_it_was():
     assert preset.hyperparameters["policy_kwargs"]["net_arch"] != [1]
 
 
+@pytest.mark.usefixtures("untrained")
 def test_without_a_preset_dqn_has_values_of_its_own_but_on_images(tmp_path):
     few, pixels = SimpleNamespace(n_envs=1, observation_space=CUBE), gym.spaces.Box(0, 255, (36, 36, 3), np.uint8)
     assert untuned("DQN", few) == FOR_NEW
@@ -449,40 +454,34 @@ def table(path):
     return [{k: v for k, v in row.items() if "seconds" not in k and not k.startswith("time/")} for row in rows(path)]
 
 
-@pytest.mark.skipif(os.name != "posix", reason="signals are POSIX's")
-def test_a_run_that_was_killed_goes_on_to_the_same_end(tmp_path):
-    arguments = ["--steps", "900", "--seed", "3", "--evaluate-every", "300", "--evaluate-episodes", "2", *FEWER_FILES]
-    argv = ["train", "rejeu/Ball-v0", *arguments, "--set", *TINY, "--checkpoint-minutes", "0.002"]
-    assert main([*argv, "--out", str(tmp_path / "whole")]) == 0
-    script = """if True:
-        import os, signal, sys
-        from rejeu.callbacks import Evaluate
-        from rejeu.cli import main
-        evaluate = Evaluate.__call__
-        def call(self, agent, progress):
-            evaluate(self, agent, progress)
-            if progress.step >= 500:
-                os.kill(os.getpid(), signal.SIGKILL)
-        Evaluate.__call__ = call
-        main(sys.argv[1:])
-    """
-    killed = subprocess.run([sys.executable, "-c", script, *argv, "--out", str(tmp_path / "cut")], capture_output=True)
-    assert killed.returncode == -signal.SIGKILL
+def test_a_run_that_was_killed_goes_on_to_the_same_end(tmp_path, capsys, monkeypatch):
+    argv = ["train", "rejeu/Ball-v0", "--steps", "500", "--seed", "3", "--evaluate-every", "150", *FEWER_FILES]
+    evaluate = Evaluate.__call__
+
+    def call(self, agent, progress):
+        evaluate(self, agent, progress)
+        if progress.step == 320:  # what a process leaves that is killed here
+            shutil.copytree(tmp_path / "whole", tmp_path / "cut")
+
+    monkeypatch.setattr(Evaluate, "__call__", call)
+    argv += ["--evaluate-episodes", "2", "--checkpoint-minutes", "0.0001", "--out", str(tmp_path / "whole")]
+    assert main([*argv, "--set", *TINY]) == 0
+    monkeypatch.undo()
     assert not (tmp_path / "cut" / "agent.safetensors").exists()
-    resume = [
-        sys.executable,
-        "-m",
-        "rejeu",
-        "resume",
-        str(tmp_path / "cut"),
-        *FEWER_FILES,
-    ]  # this process may have another thread count
-    resumed = subprocess.run(resume, capture_output=True, text=True, check=True)
-    assert re.search(r"resumed at step [\d,]+, exactly as it was saved", resumed.stdout), resumed.stdout
+    assert main(["resume", str(tmp_path / "cut"), *FEWER_FILES]) == 0
+    assert re.search(r"resumed at step 3\d\d, exactly as it was saved", capsys.readouterr().out)
     for name in ("episodes.csv", "evaluations.csv", "metrics.csv"):
         assert table(tmp_path / "cut" / name) == table(tmp_path / "whole" / name), name
-    one, two = (rejeu.load(tmp_path / run / "agent.safetensors").get_parameters() for run in ("whole", "cut"))
-    assert all(np.array_equal(one[key], two[key]) for key in one)
+    assert_same_parameters(*(rejeu.load(tmp_path / run / "agent.safetensors") for run in ("whole", "cut")))
+
+
+def test_the_files_of_a_complete_run_are_written_once_more(run, tmp_path):
+    out = shutil.copytree(run, tmp_path / "run")
+    before = {name: (out / name).read_bytes() for name in ("agent.safetensors", "episodes.csv", "evaluations.csv")}
+    for name in ("agent.safetensors", "episodes.csv"):
+        (out / name).unlink()
+    assert main(["resume", str(out), "--finish", *FEWER_FILES]) == 0
+    assert {name: (out / name).read_bytes() for name in before} == before
 
 
 def test_a_complete_run_can_be_trained_further(run, tmp_path, capsys):
@@ -504,6 +503,9 @@ def test_resume_with_steps_pauses_and_keeps_the_goal(run, tmp_path, capsys):
         patch.setattr(rejeu.callbacks.Evaluate, "__call__", kill)
         arguments = ["train", "Pendulum-v1", "--steps", "850", "--out", str(out), "--evaluate-episodes", "2", *argv]
         assert main([*arguments, "--set", *TINY]) == 130
+    assert "stopped by Ctrl-C; everything is saved" in capsys.readouterr().out
+    assert {path.name for path in out.iterdir()} == FILES - {"video.mp4", "report.html"}
+    assert rejeu.load(out / "agent.safetensors").num_timesteps == 100
     assert main(["resume", str(out), "--steps", "1e2", *FEWER_FILES]) == 0
     text = capsys.readouterr().out
     assert f"paused; everything is saved; rejeu resume {out} continues" in text
@@ -512,8 +514,7 @@ def test_resume_with_steps_pauses_and_keeps_the_goal(run, tmp_path, capsys):
     assert main(["resume", str(out), *FEWER_FILES]) == 0
     one, two = (rejeu.load(path / "agent.safetensors") for path in (run, out))
     assert one.num_timesteps == two.num_timesteps == 850
-    weights = [agent.get_parameters() for agent in (one, two)]
-    assert all(np.array_equal(weights[0][name], weights[1][name]) for name in weights[0])
+    assert_same_parameters(one, two)
 
 
 @exhaustive
@@ -610,27 +611,6 @@ def test_a_warning_is_one_line_on_the_command_line(capsys):
 
 def test_an_error_of_many_lines_becomes_one():
     assert one_line(ValueError("first,\n   then second")) == "first, then second"
-
-
-@pytest.mark.skipif(os.name != "posix", reason="signals are POSIX's")
-def test_ctrl_c_saves_everything_and_exits_130(tmp_path):
-    out = tmp_path / "run"
-    argv = ["train", "Pendulum-v1", "--steps", "100000000", "--out", str(out), "--seed", "0"]
-    argv += ["--evaluate-every", "500", "--evaluate-episodes", "1", "--set", *TINY]
-    process = subprocess.Popen([sys.executable, "-m", "rejeu", *argv], stdout=subprocess.PIPE, text=True)
-    try:
-        assert any(line.startswith("step") for line in process.stdout)
-        process.send_signal(signal.SIGINT)
-        text, _ = process.communicate(timeout=100)
-    finally:
-        process.kill()
-        process.wait()
-    assert process.returncode == 130
-    assert "stopped by Ctrl-C" in text
-    assert {path.name for path in out.iterdir()} == FILES - {"video.mp4"}
-    steps = rejeu.load(out / "agent.safetensors").num_timesteps
-    assert steps >= 500
-    assert len(rows(out / "episodes.csv")) == steps // 200
 
 
 def test_report_replays_the_episodes_that_record_and_watch_show(run, tmp_path):

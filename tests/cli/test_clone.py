@@ -14,6 +14,7 @@ from rejeu.cli import main
 from rejeu.demonstrations import record
 from rejeu.reporting.tables import read_table
 from tests.playing import error_of
+from tests.tiers import exhaustive
 
 pytest.importorskip("minari")
 pytestmark = pytest.mark.usefixtures("learners_are_shared")
@@ -56,6 +57,7 @@ def test_a_clone_is_a_run_that_is_evaluated_and_trained_on(shown, tmp_path, caps
     assert resumed["steps"] == 64
 
 
+@exhaustive
 def test_critics_learn_after_cloning_and_training_goes_on(shown, tmp_path, capsys):
     actors, steps = [], []
     for n in (0, 3):
@@ -70,6 +72,7 @@ def test_critics_learn_after_cloning_and_training_goes_on(shown, tmp_path, capsy
     assert printed(capsys, "resume", out, "--steps", 110, "--no-report", "--no-video")["steps"] == 110
 
 
+@exhaustive
 def test_an_expert_labels_what_the_clone_does(shown, tmp_path, capsys):
     expert = rejeu.PPO("MlpPolicy", "CartPole-v1", seed=0).save(tmp_path / "expert")
     how = ["--algo", "PPO", "--updates", 5, "--seed", 0, "--expert", expert, "--rounds", 2, "--round-steps", 30]
@@ -95,6 +98,7 @@ def test_what_does_not_fit_is_one_line(shown, tmp_path, capsys):
     assert "give demonstrations" in error_of(capsys, "train", "Pendulum-v1", "--algo", "IQL", "--set", "offline=true")
 
 
+@exhaustive
 def test_a_run_without_an_environment_is_a_run(tmp_path, capsys):
     with_random = rejeu.SAC("MlpPolicy", "Pendulum-v1", seed=0)
     record(with_random, "Pendulum-v1", 1, tmp_path / "shown", seed=0)

@@ -66,7 +66,7 @@ def run(tmp_path_factory):
 
 def test_train_prints_its_summary(capsys, tmp_path):
     argv = ["train", BALL, "--steps", "60", "--seed", "3", "--out", str(tmp_path / "run"), "--evaluate-episodes", "1"]
-    result, messages = document(capsys, *argv, "--set", *TINY)
+    result, messages = document(capsys, *argv, *FEWER_FILES, "--set", *TINY)
     assert result.keys() == documented_keys("train")
     assert (result["complete"], result["signal"], result["steps"], result["not_written"]) == (True, None, 60, [])
     assert result["best"]["episodes"] == 1
@@ -101,6 +101,7 @@ def test_record_prints_the_path(run, capsys, tmp_path):
     result, _ = document(capsys, *argv)
     assert result.keys() == documented_keys("record")
     assert result["video"] == str(tmp_path / "v.mp4")
+    assert (tmp_path / "v.mp4").stat().st_size
 
 
 def test_list_prints_algorithms_and_presets(capsys):

@@ -16,14 +16,15 @@ import pytest
 
 from rejeu import demonstrations, hub, play
 from rejeu.agents.together import sibling
-from rejeu.cli import clone, courses, main, models, resume, runs, sweep, tune
+from rejeu.cli import clone, courses, main, models, resume, runs, sweep, train, tune
+from rejeu.cli.commands import Train
 from rejeu.cli.environment import Environment
 from rejeu.cli.session import Limits, Session
 from rejeu.courses.leaderboard import Leaderboard
 from rejeu.experiments import study_plan
 from rejeu.interrupt import Interrupt
 from rejeu.reporting.evaluation import Evaluation
-from rejeu.runs.config import DecidedRun, RunConfig
+from rejeu.runs.config import DecidedRun, RunConfig, Task, write_task
 from rejeu.runs.folder import RunFolder
 from rejeu.sb3 import zip_files
 
@@ -251,10 +252,32 @@ def test_train(sessions, tmp_path):
     assert siblings.call_args.args[2] == 9
 
 
+def test_workers_and_datasets_of_train(spy):
+    made, shown = spy(Environment, "vector"), Train(env=TYPED, offline=Path("shown"))
+    given = Train(env=TYPED, n_envs=3, backend="gymnasium-async", restart_workers=2, wait_for=1)
+    environment = models.environment.from_arguments(TYPED, given)
+    train.make_env(given, environment, None, 5)
+    assert includes(made, n_envs=3, backend="gymnasium-async", seed=5)
+    assert (made[-1]["workers"].restart_workers, made[-1]["workers"].wait_for) == (2, 1)
+    train.make_env(dataclasses.replace(given, backend="ray", ray="auto", env_cpus=0.5), environment, None, 5)
+    assert made[-1]["workers"].ray == {"address": "auto", "num_cpus": 0.5}
+    given = train.with_dataset(shown)
+    assert (given.algorithm, given.offline) == ("IQL", None)
+    assert given.hyperparameters == {"demonstrations": "shown", "offline": True}
+    assert train.with_dataset(dataclasses.replace(shown, preset="p.json")).algorithm is None
+    assert train.with_dataset(dataclasses.replace(shown, algorithm="SAC")).algorithm == "SAC"
+
+
 def test_train_for_minutes_with_the_report_and_the_video(sessions, tmp_path):
     argv = ["train", TYPED, "--algo", "DQN", "--minutes", "2", "--seed", "5", "--checkpoint-minutes", "0"]
-    assert main([*argv, "--backend", "gymnasium", "--out", str(tmp_path), *SMALL]) == 0
-    (session,) = sessions
+    assert main([*argv, "--backend", "gymnasium", "--out", str(tmp_path / "run"), *SMALL]) == 0
+    write_task(
+        tmp_path / "task.json", Task(folder=str(tmp_path / "other"), run=RunConfig(env=TYPED, seed=6), no_video=True)
+    )
+    assert main(["--task", str(tmp_path / "task.json")]) == 0
+    session, other = sessions
+    assert (other.config.seed, other.has_report, other.has_video) == (6, True, False)
+    assert other.folder == RunFolder(tmp_path / "other")
     assert session.limits == Limits(minutes=2.0)
     assert session.has_report
     assert session.has_video

@@ -110,22 +110,6 @@ def test_options_of_a_sweep_and_of_a_run(tmp_path, capsys):
     assert "is a single run; --workers is for the folder of a sweep or a study" in capsys.readouterr().err
 
 
-def test_the_files_of_a_complete_run_are_written_once_more(tmp_path, capsys):
-    out = tmp_path / "run"
-    words = ["--steps", "300", "--seed", "0", "--set", "policy_kwargs.net_arch=[8]", "--evaluate-episodes", "2"]
-    quiet = ["--no-report", "--no-video"]
-    assert cli.main(["train", "CartPole-v1", "--algo", "DQN", *words, *quiet, "--out", str(out)]) == 0
-    before, table = load_file(out / "agent.safetensors"), (out / "evaluations.csv").read_bytes()
-    for name in ("agent.safetensors", "episodes.csv"):
-        (out / name).unlink()
-    assert cli.main(["resume", str(out), *quiet]) == 2
-    assert "the run is complete" in capsys.readouterr().err
-    assert cli.main(["resume", str(out), "--finish", *quiet]) == 0
-    assert_equal({"run": before}, {"run": load_file(out / "agent.safetensors")})
-    assert (out / "episodes.csv").is_file()
-    assert (out / "evaluations.csv").read_bytes() == table
-
-
 @pytest.mark.exhaustive  # trains in four processes
 def test_a_sweep_is_trained_compared_and_not_repeated(tmp_path, capsys):
     path, out = write_plan(tmp_path, 300), tmp_path / "out"

@@ -7,23 +7,22 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import pytest
 
 from rejeu import cli
 from rejeu.experiments import process
+from tests.experiments.fake_training import Pretended
 
 optuna = pytest.importorskip("optuna")
-FAKE = Path(__file__).parents[1] / "experiments" / "fake_training.py"
 SMALL = ["--steps", "40", "--evaluate-every", "10", "--only", "learning_rate", "--search", "learning_rate=1e-5..4e-3"]
 
 
 @pytest.fixture
 def pretend(monkeypatch):
-    """Lets trainings run a program that pretends."""
-    monkeypatch.setattr(process, "program", lambda task: [sys.executable, "-S", str(FAKE), str(task)])
-    monkeypatch.setattr("rejeu.experiments.scheduler.POLL", 0.03)
+    """Lets trainings pretend, in this process."""
+    monkeypatch.setattr(process.LocalLauncher, "start", lambda self, task, log, lock: Pretended(task, log, lock))
+    monkeypatch.setattr("rejeu.experiments.scheduler.POLL", 0)
 
 
 def tune(*words, out):
@@ -40,6 +39,7 @@ def test_a_study_from_the_command_line(pretend, tmp_path, capsys):
     assert f"preset        {tmp_path / 'study' / 'preset.json'}" in printed
 
 
+@pytest.mark.exhaustive
 def test_the_final_comparison_is_announced_with_its_length(pretend, tmp_path, capsys):
     assert tune("--trials", "2", "--search", "learning_rate=1e-4..9e-4", out=tmp_path / "study") == 0
     printed = capsys.readouterr().out

@@ -5,6 +5,7 @@ from __future__ import annotations
 from rejeu import cli
 from rejeu.runs import folder as run_folder
 from rejeu.runs.folder import RunFolder
+from tests.tiers import exhaustive
 
 SHORT = [
     "--algo=SAC", "--envs=3", "--backend=gymnasium-async", "--seed=0", "--no-report", "--no-video",
@@ -12,6 +13,7 @@ SHORT = [
 ]  # fmt: skip
 
 
+@exhaustive
 def test_a_run_that_waits_for_some_environments_is_resumed(tmp_path):
     out = tmp_path / "run"
     assert cli.main(["train", "Pendulum-v1", "--steps=30", f"--out={out}", "--wait-for=2", *SHORT]) == 0

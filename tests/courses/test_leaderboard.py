@@ -11,6 +11,7 @@ from rejeu.cli import main
 from rejeu.courses import leaderboard
 from rejeu.reporting.evaluation import Evaluation
 
+pytestmark = pytest.mark.usefixtures("learners_are_shared")
 HOSTILE = "<script>alert(1)<_script> | *x*"
 
 
@@ -18,11 +19,11 @@ HOSTILE = "<script>alert(1)<_script> | *x*"
 def folder(tmp_path_factory):
     """A folder with two equal models, one of another environment, and damaged files."""
     folder = tmp_path_factory.mktemp("class")
-    agent = rejeu.DQN("MlpPolicy", "CartPole-v1", seed=0)
+    agent = rejeu.DQN("MlpPolicy", "CartPole-v1", policy_kwargs={"net_arch": [8]}, seed=0)
     agent.save(folder / "anna")
     (folder / "second").mkdir()
     agent.save(folder / "second" / HOSTILE)
-    rejeu.DQN("MlpPolicy", "MountainCar-v0", seed=0).save(folder / "other")
+    rejeu.DQN("MlpPolicy", "MountainCar-v0", policy_kwargs={"net_arch": [8]}, seed=0).save(folder / "other")
     data = (folder / "anna.safetensors").read_bytes()
     (folder / "cut.safetensors").write_bytes(data[: len(data) // 2])
     (folder / "empty.safetensors").write_bytes(b"")

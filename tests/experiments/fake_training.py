@@ -1,4 +1,5 @@
-"""Stands in for ``rejeu --task FILE``: writes the files of a run whose return grows with the steps taken.
+"""Stands in for ``rejeu --task FILE``, as a script or in the process of a test: writes the files of a run whose return
+grows with the steps taken.
 
 It grows by 1 over the whole run with the learning rate 1e-3, and by 1 less for each order of magnitude away from it.
 """
@@ -10,6 +11,7 @@ import signal
 import sys
 import threading
 import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 HEADER = "step,seconds,success_rate,mean_return,std_return,mean_length,episodes,best"
@@ -24,9 +26,8 @@ def rate_of(value):
     return float(value.removeprefix("lin_")) if isinstance(value, str) else value
 
 
-def main(file):
-    threading.Thread(target=stop_at_end, daemon=True).start()
-    task = json.loads(Path(file).read_text())
+def train(task: dict, say: Callable[[str], object] = print) -> Iterator[None]:
+    """Trains, with a turn for each evaluation; returns the exit status."""
     is_new, path = not task["resume"], Path(task["folder"])
     if is_new:
         preset = json.loads(Path(task["run"]["preset"]).read_text())
@@ -49,8 +50,8 @@ def main(file):
     table.write_text("\n".join([HEADER, *rows]) + "\n")
     while state["step"] < end:
         if state["rate"] > 5e-3:
-            print("rejeu: error: at step 20: the loss is NaN", flush=True)
-            sys.exit(2)
+            say("rejeu: error: at step 20: the loss is NaN")
+            return 2
         state["step"] += every
         state["weight"] += (1 - abs(math.log10(state["rate"]) + 3)) * every / steps
         value = state["weight"] + (state["seed"] % 7) / 100
@@ -61,11 +62,42 @@ def main(file):
         checkpoint.with_suffix(".tmp").write_text(json.dumps(state))
         checkpoint.with_suffix(".tmp").replace(checkpoint)
         if is_new and str(state["step"]) == os.environ.get("KILLED_AT"):
-            os.kill(os.getpid(), signal.SIGKILL)
-        time.sleep(0.02)
+            return -signal.SIGKILL
+        yield
     episodes = [f"{step},0,{state['weight']},1,nan,{step / 100}" for step in range(1, state["step"] + 1)]
     (path / "episodes.csv").write_text("\n".join(["step,env,return,length,success,seconds", *episodes]) + "\n")
     (path / "agent.safetensors").write_text(json.dumps(state))
+    return 0
 
 
-main(sys.argv[1])
+class Pretended:
+    """A process that the scheduler looks at: each look is a turn."""
+
+    def __init__(self, task, log, lock):
+        self.turns, self.status = train(json.loads(task.read_text()), lambda text: log.write_text(text + "\n")), None
+
+    def poll(self):
+        if self.status is None:
+            try:
+                next(self.turns)
+            except StopIteration as end:
+                self.status = end.value
+        return self.status
+
+    def stop(self):
+        self.status = 143 if self.status is None else self.status
+
+
+def main(file):
+    threading.Thread(target=stop_at_end, daemon=True).start()
+    turns = train(json.loads(Path(file).read_text()))
+    while True:
+        try:
+            next(turns)
+        except StopIteration as end:
+            sys.exit(end.value)
+        time.sleep(0.02)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import math
-import sys
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,18 +17,17 @@ from rejeu.experiments.search import Search
 from rejeu.experiments.study import StudyFolder
 from rejeu.interrupt import Interrupt
 from rejeu.runs.config import RunConfig
+from tests.experiments.fake_training import Pretended
 
 optuna = pytest.importorskip("optuna")
-
-FAKE = Path(__file__).parent / "fake_training.py"
 RATE = {"learning_rate": LogUniform(1e-5, 4e-3)}
 
 
 @pytest.fixture(autouse=True)
 def pretend(monkeypatch):
-    """Lets trainings run the program that pretends."""
-    monkeypatch.setattr(process, "program", lambda task: [sys.executable, "-S", str(FAKE), str(task)])
-    monkeypatch.setattr("rejeu.experiments.scheduler.POLL", 0.03)
+    """Lets trainings pretend, in this process."""
+    monkeypatch.setattr(process.LocalLauncher, "start", lambda self, task, log, lock: Pretended(task, log, lock))
+    monkeypatch.setattr("rejeu.experiments.scheduler.POLL", 0)
 
 
 def make_plan(**changes):
@@ -365,10 +363,7 @@ def test_processes_are_ended_if_the_search_ends_by_an_error(tmp_path):
     with pytest.raises(OSError, match="the disk is full"):
         search.run(fail)
     assert begun
-    until = time.monotonic() + 20
-    while any(one.poll() is None for one in begun):
-        assert time.monotonic() < until
-        time.sleep(0.02)
+    assert [one.poll() for one in begun] == [143]
 
 
 def test_a_killed_training_continues_and_the_study_is_the_same(tmp_path, monkeypatch):

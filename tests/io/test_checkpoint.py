@@ -140,7 +140,7 @@ def test_a_file_may_be_read_by_whoever_may_read_new_files(trained):
         max_size=4,
     ),
 )
-@settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=12, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_any_arrays_and_any_header_come_back_as_they_were(tmp_path, arrays, header):
     path = checkpoint.write(tmp_path / "any", "rows", arrays, header)
     again, found = checkpoint.read(path, "rows")

@@ -36,7 +36,7 @@ def same(one, two):
     return one == two or (isinstance(one, float) and math.isnan(one) and math.isnan(two))
 
 
-@settings(max_examples=30)
+@settings(max_examples=20)
 @given(DATA)
 def test_everything_comes_back_as_what_it_was(value):
     arrays = {}

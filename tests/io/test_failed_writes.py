@@ -181,7 +181,7 @@ def test_hooks_that_cannot_write_do_not_end_training(tmp_path, disk):
     hooks = [
         CheckpointCallback(10, tmp_path, save_replay_buffer=True),
         EvalCallback(
-            gym.make("Pendulum-v1"),
+            gym.make(BALL),
             n_eval_episodes=1,
             eval_freq=15,
             log_path=tmp_path,
@@ -189,7 +189,7 @@ def test_hooks_that_cannot_write_do_not_end_training(tmp_path, disk):
             verbose=0,
         ),
     ]
-    agent = small_sac("Pendulum-v1")
+    agent = small_sac(BALL)
     with pytest.warns(UserWarning, match="No space left") as record:
         agent.learn(40, [full_between(disk, 14, 25), *hooks])
     assert [

@@ -114,19 +114,15 @@ ANYWHERE = {
 }
 
 
-@pytest.mark.parametrize(
-    ("run", "case"),
-    [("replay", case) for case in ANYWHERE.values()],
-    ids=ANYWHERE,
-    indirect=["run"],
-)
+@pytest.mark.parametrize("case", ANYWHERE.values(), ids=ANYWHERE)
+@pytest.mark.parametrize("run", ["replay"], indirect=True)
 def test_a_run_that_could_not_go_on_is_refused(run, case, tmp_path):
     change, message = case
     with pytest.raises(CheckpointError, match=message):
         resumed(run, tmp_path, change)
 
 
-@pytest.mark.parametrize("run", CASES, indirect=True)
+@pytest.mark.parametrize("run", only(["replay", "rollout"], CASES), indirect=True)
 def test_the_same_run_goes_on_where_nothing_is_changed(run, tmp_path):
     """Else all would be refused for what is wrong with every one of them."""
     agent = resumed(run, tmp_path, lambda header, values, arrays: None)
@@ -184,7 +180,7 @@ def test_a_hostile_file_of_a_run_is_refused_by_our_own_error_alone(run, tmp_path
     for path in files_of(run[1]):
         content = path.read_bytes()
         variants = [*hostile_files.variants(content), *hostile_files.bad_runs(content)]
-        outcomes = [replaced(run, tmp_path / "run", path, one.content) for one in variants[::20]]
+        outcomes = [replaced(run, tmp_path / "run", path, one.content) for one in variants[::60]]
         assert {*outcomes} <= {"refused", "read"}
         assert outcomes.count("refused") > 0.8 * len(outcomes)  # some values may be others, or missing
 

@@ -14,6 +14,7 @@ from rejeu.demonstrations import clone, dagger, read, record
 from rejeu.play.assist import Assist, Expert
 from rejeu.play.window import Window
 from tests.playing import LEVER, Pull, down, error_of, pygame, up
+from tests.tiers import exhaustive
 
 pytestmark = pytest.mark.usefixtures("learners_are_shared")
 SMALL = {"policy_kwargs": {"net_arch": [8]}, "seed": 0}
@@ -113,7 +114,7 @@ class Zero:
         return np.zeros(1, np.float32), None
 
 
-def test_a_run_is_assisted(monkeypatch, tmp_path, capsys):
+def test_a_run_is_assisted(monkeypatch, tmp_path):
     pytest.importorskip("minari")
     at_steps(monkeypatch, {2: lambda: down("d"), 5: lambda: up("d")})
     out = tmp_path / "run"
@@ -121,12 +122,19 @@ def test_a_run_is_assisted(monkeypatch, tmp_path, capsys):
     small = ["--evaluate-episodes", "1", "--import", __name__, "--set", "policy_kwargs.net_arch=[8]", "buffer_size=100"]
     assert main(["train", SLIDE, "--assist", *how, *small]) == 0
     assert read(out / "assisted").n_steps == 3
+
+
+@exhaustive
+def test_a_clone_is_corrected_by_hand(monkeypatch, tmp_path, capsys):
+    pytest.importorskip("minari")
+    record(Zero(), gym.make(SLIDE, render_mode="rgb_array"), 1, tmp_path / "shown", seed=0)
     played = ["--updates", "5", "--by-hand", "--rounds", "1", "--round-steps", "10", "--algo", "PPO", "--seed", "0"]
     rest = ["--no-report", "--no-video", "--evaluate-episodes", "1", "--import", __name__]
     at_steps(monkeypatch, {2: lambda: down("d"), 5: lambda: up("d")})
-    capsys.readouterr()
-    assert main(["clone", str(out / "assisted"), "--env", SLIDE, *played, *rest, "--out", str(tmp_path / "clone")]) == 0
-    assert "round  1      6 labeled steps" in capsys.readouterr().out
+    assert (
+        main(["clone", str(tmp_path / "shown"), "--env", SLIDE, *played, *rest, "--out", str(tmp_path / "clone")]) == 0
+    )
+    assert "round  1      13 labeled steps" in capsys.readouterr().out
 
 
 def test_what_cannot_be_assisted_is_one_line(tmp_path, capsys):

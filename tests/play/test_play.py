@@ -20,6 +20,7 @@ from rejeu.play.game import Player
 from rejeu.play.keys import KNOWN, keys_for
 from rejeu.play.window import HEADER, HELP, MARGIN, Window, legend, message, score_summary
 from tests.playing import LEVER, Pull, down, error_of, hold, lever, perform, pygame, tap, up
+from tests.tiers import exhaustive
 
 
 def box2d(env_id):
@@ -61,8 +62,14 @@ EFFECTS = [
 ]
 
 
+DEAR = [one for one in EFFECTS if one[0].startswith(("Car", "park")) and one[0] != "CartPole-v1" and one[1] != "w"]
+"""What ``test_keys`` says of the actions, in environments that are slow to make."""
+
+
 @pytest.mark.parametrize(
-    ("env_id", "keys", "what", "read", "sign"), EFFECTS, ids=lambda v: v if isinstance(v, str) else ""
+    ("env_id", "keys", "what", "read", "sign"),
+    [pytest.param(*one, marks=[exhaustive] * (one in DEAR)) for one in EFFECTS],
+    ids=lambda v: v if isinstance(v, str) else "",
 )
 def test_keys_held_move_the_environment_as_they_say(env_id, keys, what, read, sign):
     box2d(env_id)
@@ -73,6 +80,7 @@ def test_keys_held_move_the_environment_as_they_say(env_id, keys, what, read, si
     assert np.sign(found[0] - found[1]) == sign, what
 
 
+@exhaustive
 def test_the_brake_slows_the_car_down():
     box2d("CarRacing-v3")
     speeds = []

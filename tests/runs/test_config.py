@@ -14,6 +14,7 @@ from rejeu.errors import CheckpointError
 from rejeu.runs import config
 from rejeu.runs.config import DecidedRun, RunConfig, Task, read_task, write_task
 from tests.cli.test_cli import FEWER_FILES, TINY
+from tests.tiers import exhaustive
 
 CONTENT = {
     "env": "Pendulum-v1",
@@ -114,6 +115,7 @@ def test_every_field_of_a_decided_run_is_one_of_a_run():
     assert [one.name for one in dataclasses.fields(DecidedRun)] == [one.name for one in dataclasses.fields(RunConfig)]
 
 
+@exhaustive
 def test_a_process_trains_and_continues_what_its_file_says(tmp_path):
     settings = {"policy_kwargs.net_arch": [8], "learning_starts": 50, "batch_size": 8, "buffer_size": 5000}
     run = RunConfig(
