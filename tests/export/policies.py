@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from typing import Any
+from unittest import mock
 
 import gymnasium as gym
+import jax
 import numpy as np
 from gymnasium import spaces
 
-from rejeu import agents
+from rejeu import agents, xla
 from tests.sharing import shared_learners
 
 LIMITS = np.array([-2.0, -1.0], np.float32), np.array([2.0, 5.0], np.float32)
@@ -31,6 +33,9 @@ OBSERVATIONS: dict[str, gym.Space] = {
         }
     ),
     "large CNN": spaces.Box(0, 255, (4, 40, 40), np.uint8),
+    "goals Dict": spaces.Dict(
+        {name: spaces.Box(-5.0, 5.0, (2,)) for name in ("achieved_goal", "desired_goal", "observation")}
+    ),
 }
 ACTIONS: dict[str, gym.Space] = {
     "Box": spaces.Box(*LIMITS),
@@ -56,6 +61,8 @@ SMALL: dict[str, dict[str, Any]] = {
 }
 STATISTICS = ("mean", "variance", "n_seen", "scale", "offset")
 """Last parts of the names of what normalizations hold."""
+WEIGHTS = ("weight", "bias", "inputs", "recurrent", "recurrent_bias", "log_std")
+"""Last parts of the names of what layers hold."""
 
 
 class Still(gym.Env[Any, Any]):
@@ -73,17 +80,33 @@ class Still(gym.Env[Any, Any]):
 
 
 def agent_of(name: str, action: str, observation: str = "MLP", **settings: Any) -> agents.Agent:
-    """Returns an agent with random weights, and random statistics and gains of its normalizations."""
+    """Returns an agent of spaces alone; see :func:`made`."""
     policy = "MultiInputPolicy" if "Dict" in observation else "MlpPolicy"
     small = SMALL.get(name, {"policy_kwargs": {"net_arch": [16, 16]}})
-    with shared_learners():
-        agent = agents.AGENTS[name](policy, Still(observation, action), seed=0, **{**small, **settings})
+    return made(name, policy, Still(observation, action), **{**small, **settings})
+
+
+def made(name: str, policy: str, env: Any, **settings: Any) -> agents.Agent:
+    """Returns an agent with random weights, and random statistics and gains of its normalizations.
+
+    They are drawn in NumPy, because the compilation of an initialization would take most of the time of a test.
+    """
+
+    def zeros(function: Any) -> Any:
+        return lambda *given: jax.tree.map(lambda one: np.zeros(one.shape, one.dtype), jax.eval_shape(function, *given))
+
+    with shared_learners(), mock.patch.object(xla, "run_once", zeros):
+        agent = agents.AGENTS[name](policy, env, **{"seed": 0, **settings})
     rng, parameters = np.random.default_rng(0), agent.get_parameters()
-    drawn = [key for key in parameters if key.rpartition(".")[2] in STATISTICS]
-    for key in drawn:
-        parameters[key] = np.asarray(rng.uniform(0.5, 2.0, parameters[key].shape), parameters[key].dtype)
-    if drawn:
-        agent.set_parameters(parameters)
+    for key, array in parameters.items():
+        last, n_inputs = key.rpartition(".")[2], np.prod(array.shape[:-1])
+        if last in STATISTICS:
+            parameters[key] = rng.uniform(0.5, 2.0, array.shape).astype(array.dtype)
+        elif last in WEIGHTS and "optimizer" not in key:
+            parameters[key] = rng.normal(0, (0.05 if n_inputs == 1 else 1.2) / n_inputs**0.5, array.shape).astype(
+                array.dtype
+            )
+    agent.set_parameters(parameters)
     return agent
 
 

@@ -14,13 +14,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import rejeu
 from rejeu.agents import exporting
 from rejeu.agents.exporting import SUFFIXES
 from rejeu.cli import main
 from rejeu.networks import Linear
-from tests.export.policies import agent_of, observations
+from tests.export.policies import agent_of, made, observations
 from tests.full_disk import FullDisk
+from tests.tiers import exhaustive, only
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 WIDTH = 8
@@ -177,7 +177,7 @@ class Convolving(eqx.Module):
         return x.reshape(*obs.shape[:-3], -1)
 
 
-@pytest.mark.parametrize("target", ["onnx", "c"])
+@pytest.mark.parametrize("target", only(["onnx"], ["onnx", "c"]))
 def test_convolutions_of_own_encoders_are_exported(target, tmp_path):
     agent = agent_of("PPO", "Box", "CNN", policy_kwargs={"encoder": Convolving, "net_arch": [8]})
     assert agent.export(tmp_path / "policy", target).check.difference <= 1e-5
@@ -188,7 +188,7 @@ def test_convolutions_of_own_encoders_are_exported(target, tmp_path):
     [
         (Sorting, "onnx", r"to ONNX: .*'sort' \(test_deployment.py, line \d+, in Sorting.__call__\) .* to stablehlo"),
         (Sorting, "c", r"to C: .*'sort' \(test_deployment.py, line \d+, in Sorting.__call__\) .* to stablehlo"),
-        (Calling, "onnx", r"to ONNX: .* \(test_deployment.py, line \d+, in Calling.__call__\)"),
+        pytest.param(Calling, "onnx", r"to ONNX: .* line \d+, in Calling.__call__\)", marks=exhaustive),
         (Calling, "stablehlo", r"to stablehlo \(.*callback\); write the part that calls Python"),
     ],
 )
@@ -201,7 +201,7 @@ def test_own_modules_that_a_format_cannot_express_are_one_line(torso, target, me
 
 
 def test_a_folder_that_cannot_be_written_is_one_line(tmp_path, capsys):
-    rejeu.PPO("MlpPolicy", "CartPole-v1", seed=0, n_steps=32, batch_size=32).save(tmp_path / "model")
+    made("PPO", "MlpPolicy", "CartPole-v1").save(tmp_path / "model")
     (tmp_path / "file").write_text("kept")
     folders = [tmp_path / "file"]
     if os.name == "posix" and os.geteuid() != 0:  # root may write everywhere
@@ -216,7 +216,7 @@ def test_a_folder_that_cannot_be_written_is_one_line(tmp_path, capsys):
     assert (tmp_path / "file").read_text() == "kept"
 
 
-@pytest.mark.parametrize("target", ["c", "onnx", "stablehlo"])
+@pytest.mark.parametrize("target", only(["c"], ["c", "onnx", "stablehlo"]))
 def test_a_full_disk_leaves_nothing_new(target, tmp_path, monkeypatch):
     agent, disk = agent_of("PPO", "Box"), FullDisk(monkeypatch)
     path = tmp_path / f"policy{SUFFIXES[target]}"
