@@ -3,7 +3,8 @@
     python trials/sb3_suite.py FOLDER --packages SITE_PACKAGES
 
 ``FOLDER`` has the tests, such as those in the source distribution of stable-baselines3 2.9.2; they are no part of this
-repository. ``SITE_PACKAGES`` is searched last, for what rejeu does not need and the tests import, such as PyTorch. Each file
+repository. The environments that the original has for them, ``stable_baselines3/common/envs`` beside it, are copied for them
+too. ``SITE_PACKAGES`` is searched last, for what rejeu does not need and the tests import, such as PyTorch. Each file
 runs in a process of its own. The counts, and each failed test with its kind, are written to
 ``trials/results/sb3_suite.json``; with ``--log`` the output of pytest to that folder. ``--original`` runs the tests against
 Stable-Baselines3 itself, in an interpreter that has it, so that the result says how many tests a file has; of a file that
@@ -39,7 +40,11 @@ from provenance import commit, provenance, write
 
 RESULTS = Path(__file__).parent / "results" / "sb3_suite.json"
 SOURCES = Path(__file__).resolve().parents[1] / "src"
-RENAMED = ((r"\bstable_baselines3\b", "rejeu.sb3"), (r"\bsb3_contrib\b", "rejeu.sb3_contrib"))
+RENAMED = (
+    (r"\bstable_baselines3\.common\.envs\b", "original_envs"),
+    (r"\bstable_baselines3\b", "rejeu.sb3"),
+    (r"\bsb3_contrib\b", "rejeu.sb3_contrib"),
+)
 KINDS = (
     ("package", r"No module named '(?!rejeu)|NamespaceNotFound|DependencyNotInstalled|NameNotFound|DeprecatedEnv"),
     ("time", r"Timeout"),
@@ -131,6 +136,9 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary) / "tests"
         shutil.copytree(arguments.folder, folder)
+        envs = arguments.folder.parent / "stable_baselines3" / "common" / "envs"
+        if envs.is_dir() and not arguments.original:
+            shutil.copytree(envs, folder / "original_envs")
         for path in folder.rglob("*.py"):
             text = path.read_text(encoding="utf-8")
             for old, new in () if arguments.original else RENAMED:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from collections import deque
 
 import gymnasium as gym
 import numpy as np
@@ -46,6 +47,26 @@ def test_the_environments_of_an_id_have_the_methods_of_the_original():
     assert env.env_method("get_wrapper_attr", "gravity") == [5.0]
     with pytest.raises(AttributeError, match="use set_env"):
         model.env = env
+
+
+def test_a_gymnasium_environment_gets_one_monitor():
+    for env in (Endless(), Monitor(Endless())):
+        model = A2C("MlpPolicy", env, n_steps=8, **TINY)
+        assert model.env.env_is_wrapped(Monitor) == [True]
+        assert isinstance(model.env.envs[0].env, Endless)
+
+
+def test_the_recent_episodes_are_saved_and_forgotten_by_a_new_run(tmp_path):
+    model = A2C("MlpPolicy", Endless(), n_steps=8, stats_window_size=2, **TINY)
+    model.ep_info_buffer.extend([{"r": 1.5, "l": 3, "t": 0.25}] * 3)
+    model.ep_success_buffer.append(1.0)
+    model.save(tmp_path / "model")
+    model.save(tmp_path / "without", exclude=["ep_info_buffer"])
+    loaded = A2C.load(tmp_path / "model", Endless())
+    assert (loaded.ep_info_buffer, loaded.ep_success_buffer) == (model.ep_info_buffer, model.ep_success_buffer)
+    assert A2C.load(tmp_path / "without").ep_info_buffer == deque()
+    lengths = [len(loaded.learn(1, reset_num_timesteps=reset).ep_info_buffer) for reset in (False, True)]
+    assert lengths == [2, 0]
 
 
 def test_callbacks_can_render_the_training_environments():

@@ -56,9 +56,10 @@ def test_a_callback_stops_training_and_knows_the_agent():
     assert note.seen[-1] == (4, 4)
 
 
-def test_returning_nothing_is_an_error():
-    with pytest.raises(TypeError, match=r"Note._on_step returned None; return True to continue"):
-        dqn().learn(5, callback=Note(goes_on=lambda self: None))
+@pytest.mark.parametrize("callback", [Note(goes_on=lambda self: None), ConvertCallback(lambda _locals, _globals: None)])
+def test_returning_nothing_stops_training_as_in_the_original(callback):
+    with pytest.warns(UserWarning, match="_on_step returned None"):
+        assert dqn().learn(5, callback=callback).num_timesteps == 1
 
 
 def test_a_callback_with_hooks_and_functions_of_rejeu_go_together():

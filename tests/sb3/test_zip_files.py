@@ -6,6 +6,7 @@ import os
 import pickle
 import shutil
 import tracemalloc
+from collections import deque
 from itertools import islice
 from pathlib import Path
 
@@ -225,6 +226,20 @@ def test_hyperparameters_are_those_of_the_file_and_can_be_replaced():
     her = load_zip(FOLDER / "sac-her.zip")
     assert her.config.replay_buffer_class == "HerReplayBuffer"
     assert her.config.hindsight.n_sampled_goal == 4
+
+
+def test_recent_episodes_and_outputs_are_those_of_the_file(tmp_path):
+    episodes = [{"r": np.float32(1.5), "l": 3, "t": 0.25}] * 5
+    data = {"_stats_window_size": 4, "verbose": 1, "tensorboard_log": "logs"}
+    data |= {"ep_info_buffer": serialized(deque(episodes, 4)), "ep_success_buffer": serialized(deque(["no"], 4))}
+    path = write(tmp_path, changed(PPO, data))
+    agent = algorithms.PPO.load(path)
+    assert agent.ep_info_buffer == deque([{"r": 1.5, "l": 3, "t": 0.25}] * 4)
+    assert not agent.ep_success_buffer
+    assert (agent.stats_window_size, agent.verbose, agent.tensorboard_log) == (4, 1, "logs")
+    agent = algorithms.PPO.load(path, verbose=0, tensorboard_log=None, stats_window_size=2)
+    assert (agent.ep_info_buffer.maxlen, agent.verbose, agent.tensorboard_log) == (2, 0, None)
+    assert load_zip(path).tensorboard_log is None
 
 
 def test_hostile_files_end_soon_in_little_memory_and_run_nothing(tmp_path):

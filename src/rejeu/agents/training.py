@@ -91,6 +91,7 @@ def statistics_row(agent: BaseAgent) -> dict[str, float]:
     if agent.ep_info_buffer:
         numbers["rollout/ep_len_mean"] = float(np.mean([e["l"] for e in agent.ep_info_buffer]))
         numbers["rollout/ep_rew_mean"] = float(np.mean([e["r"] for e in agent.ep_info_buffer]))
+    if len(agent.history):
         numbers["rollout/ep_rew_best"] = agent.history.best_return
     if agent.ep_success_buffer:
         numbers["rollout/success_rate"] = float(np.mean(agent.ep_success_buffer))

@@ -43,14 +43,15 @@ from rejeu.loops import finite
 from rejeu.reporting import logging
 from rejeu.sb3 import arguments, policy as policies
 from rejeu.sb3.common import base_callback, buffers, logger as loggers, utils
-from rejeu.sb3.common.env_util import make_vec_env
+from rejeu.sb3.common.env_util import is_wrapped, make_vec_env
+from rejeu.sb3.common.monitor import Monitor
 from rejeu.sb3.common.noise import VectorizedActionNoise
 from rejeu.sb3.common.preprocessing import is_image_space, is_image_space_channels_first
 from rejeu.sb3.common.torch_layers import encoder_of, register_again
 from rejeu.sb3.common.vec_env.vec_normalize import VecNormalize
 from rejeu.sb3.common.vec_env.vec_transpose import VecTransposeImage
 from rejeu.sb3.policy import BasePolicy
-from rejeu.sb3.zip_files import load_zip
+from rejeu.sb3.zip_files import load_zip, restore_windows
 from rejeu.sb3.zoo import statistics_beside
 
 __all__ = [
@@ -362,13 +363,15 @@ class Original(Agent):
         return shown
 
     def make_envs(self, env: Any, *args: Any, **kwargs: Any) -> Any:
-        """Returns vector environments; an id is made with ``render_mode="rgb_array"`` in a ``Monitor``.
+        """Returns vector environments; Gymnasium environments are in a ``Monitor``, ids with ``render_mode="rgb_array"``.
 
         Of those that :meth:`get_env` returned, the images are as they were given before.
         """
         mine = self.__dict__.get("observation_space")
         if isinstance(env, str) and args in ((), (1,)) and {*kwargs} <= {"seed"} and register(env):
             env = make_vec_env(env)  # as the original: Gymnasium's, which can be rendered to images
+        if isinstance(env, gym.Env) and not is_wrapped(env, Monitor):
+            env = Monitor(env)
         if isinstance(env, VecTransposeImage) and mine is not None and env.venv.observation_space == mine:
             env = env.venv
         return super().make_envs(env, *args, **kwargs)  # type: ignore[safe-super]
@@ -478,7 +481,7 @@ class Original(Agent):
     ) -> Self:
         """Trains, and returns the agent; see :meth:`Agent.learn`.
 
-        Functions as ``callback`` are called with ``(locals, globals)``; only ``False`` stops training.
+        Functions as ``callback`` are called with ``(locals, globals)``; a false value stops training.
 
         Raises:
             ValueError: with ``use_masking=False``: use PPO.
@@ -496,6 +499,9 @@ class Original(Agent):
             if only and not logger.output_formats:  # statistics that nothing shows need not be computed
                 logger.outputs = []
         self.exploration_rate_set = None
+        if reset_num_timesteps:
+            self.ep_info_buffer.clear()
+            self.ep_success_buffer.clear()
         callbacks = [as_callback(one) for one in given]
         flags = (reset_num_timesteps, progress_bar)
         super().learn(total_timesteps, callbacks, interval, tb_log_name, *flags, **limits)
@@ -577,6 +583,8 @@ class Original(Agent):
         others = {*OUTPUTS, *include} - {*exclude} - defaults.keys()
         folder = {"tensorboard_log": self.tensorboard_log and str(self.tensorboard_log)}
         header["attributes"] = {key: folder.get(key, getattr(self, key)) for key in sorted(others)}
+        windows = {"ep_info_buffer", "ep_success_buffer"} - {*exclude}
+        header["attributes"] |= {key: [*getattr(self, key)] for key in sorted(windows)}
 
         def write() -> Path:
             self.last_saved = checkpoint.write(path, "agent", arrays, header)
@@ -647,6 +655,7 @@ class Original(Agent):
                 register_again(shape.get("encoder") if isinstance(shape, dict) else None)
                 agent = load_agent(cls, found, env, changes)
                 attributes = header["attributes"] if isinstance(header.get("attributes"), dict) else {}
+                restore_windows(agent, attributes.get)
                 for name in attributes.keys() - {*OUTPUTS}:
                     if not hasattr(agent, name):
                         setattr(agent, name, attributes[name])

@@ -185,6 +185,9 @@ def add(target: Any, items: list[Any], pairs: bool) -> None:
             target[key] = value
     elif isinstance(target, list) and not pairs:
         target.extend(items)
+    elif isinstance(target, Record) and target.name == "collections.deque" and not pairs:
+        target.state = target.state or []
+        target.state.extend(items)
 
 
 def named(value: Any) -> str:

@@ -486,13 +486,14 @@ def load_zip(
     cls = kind or BUILT_IN[algorithm]
     agent: Agent = cls.__new__(cls)
     agent.notes = notes  # before it is built, when only known attributes can be set
-    own = {
-        key: changes.pop(key) for key in [*changes] if key in ("seed", "device", "verbose", "log", "tensorboard_log")
-    }
+    own_names = ("seed", "device", "stats_window_size", "verbose", "log", "tensorboard_log")
+    own = {key: changes.pop(key) for key in [*changes] if key in own_names}
     outputs = {key: own.pop(key) for key in [*own] if key in ("verbose", "log", "tensorboard_log")}
     with explained(path):
         seed = model.value("seed")
         own.setdefault("seed", seed if isinstance(seed, int) and 0 <= seed < 2**32 else None)
+        if isinstance(window := model.readable("_stats_window_size"), int) and 0 < window < 2**31:
+            own.setdefault("stats_window_size", window)
         file_space, keys = space_of(model, "observation_space")
         action_space, _ = space_of(model, "action_space")
         kwargs = model.readable("policy_kwargs")
@@ -528,6 +529,11 @@ def load_zip(
         agent.start_run(None)
         agent.set_parameters(arrays, exact_match=False)
         restore_counters(agent, model, found)
+    restore_windows(agent, model.readable)
+    if kind is not None:  # as the original's load does
+        texts = {key: model.readable(key) for key in ("verbose", "tensorboard_log")}
+        wanted = {"verbose": int, "tensorboard_log": str}
+        agent.set_outputs(**{key: x for key, x in texts.items() if type(x) is wanted[key]} | outputs)
     if vector is not None:
         agent.set_env(vector)
         agent.made_from_id = isinstance(env, str)
@@ -570,6 +576,16 @@ def checked(shapes: Any, arrays: Mapping[str, np.ndarray], fields: list[str]) ->
     result = {name: np.asarray(array, expected[name].dtype) for name, array in arrays.items()}
     checkpoint.require_finite(result, "its weights")
     return result
+
+
+def restore_windows(agent: Agent, value: Callable[[str], Any]) -> None:
+    """Fills the buffers of recent episodes from what ``value`` says a file has by a name; it ends at what is no episode."""
+    for name in ("ep_info_buffer", "ep_success_buffer"):
+        found, number = value(name), lambda x: array_of(x).item()
+        with contextlib.suppress(*UNREADABLE):
+            for one in (found.state if isinstance(found, Record) else found) or ():
+                entry = {key: number(one[key]) for key in "rlt"} if name == "ep_info_buffer" else number(one)
+                getattr(agent, name).append(entry)
 
 
 def restore_counters(agent: Agent, model: Model, found: Mapping[str, np.ndarray]) -> None:

@@ -10,6 +10,7 @@ last step are called. Import the classes from :mod:`rejeu.sb3.common.callbacks`,
 
 from __future__ import annotations
 
+import warnings
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, ClassVar
@@ -147,16 +148,13 @@ class BaseCallback(TrainingCallback):
         self._on_rollout_start()
 
     def on_step(self) -> bool:
-        """Called after each step of the environments; returns whether to continue.
-
-        Raises:
-            TypeError: if ``_on_step`` returns None.
-        """
+        """Called after each step of the environments; returns whether to continue. None stops, with a warning."""
         self.n_calls += 1
         self.num_timesteps = self.model.num_timesteps
         continues = self._on_step()
         if continues is None:
-            raise TypeError(f"{type(self).__name__}._on_step returned None; return True to continue, False to stop")
+            text = "returned None, which stops training as False does; return True to continue"
+            warnings.warn(f"{type(self).__name__}._on_step {text}", UserWarning, 2)
         return bool(continues)
 
     def on_rollout_end(self) -> None:
@@ -284,7 +282,7 @@ class CallbackList(BaseCallback):
 
 
 class ConvertCallback(BaseCallback):
-    """A function of ``(locals, globals)`` as a callback; only ``False`` stops training.
+    """A function of ``(locals, globals)`` as a callback; a false value stops training, None with a warning.
 
     ``learn`` calls a plain function as ``callback(agent, progress)``; wrap one of ``(locals, globals)`` in this class.
 
@@ -298,7 +296,7 @@ class ConvertCallback(BaseCallback):
         self.callback = callback
 
     def _on_step(self) -> bool:
-        return self.callback is None or self.callback(self.locals, self.globals) is not False
+        return self.callback is None or self.callback(self.locals, self.globals)
 
 
 def to_callback(callback: BaseCallback | Callable[..., Any]) -> BaseCallback:

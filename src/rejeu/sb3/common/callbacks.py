@@ -306,10 +306,11 @@ class LogEveryNTimesteps(EveryNTimesteps):
     def __init__(self, n_steps: int) -> None:
         super().__init__(n_steps, ConvertCallback(self._log))
 
-    def _log(self, locals_: dict[str, Any], globals_: dict[str, Any]) -> None:
+    def _log(self, locals_: dict[str, Any], globals_: dict[str, Any]) -> bool:
         for name, value in self.model.statistics().items():
             self.logger.record(name, value)
         self.logger.dump(self.num_timesteps)
+        return True
 
 
 class ProgressBarCallback(BaseCallback):
