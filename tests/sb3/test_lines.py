@@ -423,8 +423,9 @@ def test_small_functions(tmp_path):
         (tmp_path / name).mkdir()
     assert utils.get_latest_run_id(tmp_path, "run") == 10
     assert utils.get_latest_run_id(tmp_path, "other") == 0
-    for is_new, name in ((False, "run_10"), (True, "run_11")):
-        assert Path(utils.configure_logger(0, tmp_path, "run", reset_num_timesteps=is_new).dir).name == name
+    for is_new, name in ((False, "run_10"), (True, "run_11"), (False, "other_0")):  # what continues keeps its folder
+        kind = name.partition("_")[0]
+        assert Path(utils.configure_logger(0, tmp_path, kind, reset_num_timesteps=is_new).dir).name == name
     assert utils.configure_logger(0).output_formats == []
 
 

@@ -254,7 +254,7 @@ def configure_logger(
     folder, kinds = os.getenv("SB3_LOGDIR"), ["stdout"] * (verbose >= 1)
     if tensorboard_log is not None:
         k = get_latest_run_id(tensorboard_log, tb_log_name) + reset_num_timesteps
-        folder, kinds = str(Path(tensorboard_log) / f"{tb_log_name}_{max(k, 1)}"), [*kinds, "tensorboard"]
+        folder, kinds = str(Path(tensorboard_log) / f"{tb_log_name}_{k}"), [*kinds, "tensorboard"]
     return loggers.Logger(folder, [loggers.make_output_format(kind, folder or ".") for kind in kinds])
 
 
