@@ -162,7 +162,25 @@ def constant_noise(lib: Library) -> Iterator[None]:
             def zeros(x: Any, **_: Any) -> Any:
                 return torch.zeros_like(x)
 
+            from stable_baselines3.common.distributions import StateDependentNoiseDistribution as OfStates
+
+            own = OfStates.sample
+
+            def by_state(self: Any) -> Any:
+                """One noise for each state of a batch, instead of one matrix for all of them: equal for each alone."""
+                if self.distribution.mean.shape[0] == 1:
+                    return own(self)
+                drawn = self.distribution.mean + SHARE * self.distribution.stddev
+                return drawn if self.bijector is None else self.bijector.forward(drawn)
+
+            drawn_numbers = np.random.randint
+
+            def first(*limits: Any, **options: Any) -> Any:  # of RecurrentPPO's batches the first step is the rollout's
+                return drawn_numbers(*limits, **options) if options else 0
+
+            stack.enter_context(mock.patch.object(np.random, "randint", first))
             for one, name, value in (
+                (OfStates, "sample", by_state),
                 (Categorical, "sample", likeliest),
                 (Normal, "sample", shifted),
                 (Normal, "rsample", shifted),

@@ -299,6 +299,17 @@ def test_the_gradient_reaches_through_time(kind):
         assert sum(jax.tree.leaves(products)) == pytest.approx(expected, rel=2e-3, abs=2e-5)
 
 
+def test_the_value_does_not_train_a_memory_that_both_share():
+    """As in sb3-contrib. With advantages of 0 only the value's loss has a gradient."""
+    config, _, state = made(shared=True, ent_coef=0.0)
+    rollout = drawn_rollout(network=state.network)
+    data, started = recurrent_ppo.unrolled_samples(state.network, rollout, config.gae_lambda)
+    data = data._replace(advantage=np.zeros_like(data.advantage))
+    slope = jax.grad(lambda n: recurrent_ppo.loss(n, (data, started, rollout.carry), config, CLOCK)[0])(state.network)
+    assert not any(x.any() for x in jax.tree.leaves(slope.cells))
+    assert all(x.any() for x in jax.tree.leaves(slope.readers.value_torso))
+
+
 def batches_of(monkeypatch, n_envs, **settings):
     """The environments of every minibatch of an update, as rows of epochs, told apart by their observations."""
     _config, algorithm, state = made(**settings)

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 import rejeu
-from rejeu.algorithms import ppo
+from rejeu.algorithms import ppo, sac
 from rejeu.algorithms.actor_critic.config import ActorCriticConfig
 from rejeu.algorithms.actor_critic.network import ActorCritic, action_kind, explorer_of, sde_explorer
+from rejeu.algorithms.sac.continuous import SdeActor
 from rejeu.core import Clock
 from rejeu.envs.make import InProcess
 from rejeu.spaces import leaves
@@ -64,6 +65,16 @@ def test_the_noise_that_is_drawn_has_that_deviation():
     variance = hidden(net, OBS) ** 2 @ np.exp(2.0 * np.float64(net.log_std))
     np.testing.assert_allclose(drawn.mean(axis=0), 0.0, atol=4 * np.sqrt(variance.max() / 4000))
     np.testing.assert_allclose(drawn.var(axis=0), variance, rtol=0.12)  # five deviations, sqrt(2 / 4000) each
+
+
+def test_the_deviation_of_sac_trains_the_hidden_layer():
+    """d log(sqrt(v)) / dh_i = h_i sigma_ij^2 / v_j with v_j = sum_i h_i^2 sigma_ij^2, summed over j; as in the original."""
+    actor = SdeActor(
+        jax.random.PRNGKey(0), leaves(OBS_SPACE), 2, sac.Config(use_sde=True, policy_kwargs={"net_arch": [WIDTH]})
+    )
+    h, squares = np.random.default_rng(0).normal(size=(N, WIDTH)), np.exp(2.0 * np.float64(actor.log_std))
+    slope = jax.grad(lambda h: actor.distribution(h).log_std.sum())(h.astype(np.float32))
+    np.testing.assert_allclose(slope, h * ((1.0 / (h**2 @ squares + 1e-6)) @ squares.T), rtol=1e-3)
 
 
 @pytest.mark.parametrize("squash", [False, True])

@@ -50,7 +50,8 @@ class RecurrentConfig(ActorCriticConfig):
     lstm_hidden_size: int = 256
     """Size of its hidden state; an LSTM has a cell state of the same size."""
     shared_lstm: bool = False
-    """Policy and value read the same memory; otherwise each has its own."""
+    """Policy and value read the same memory, which only the policy's loss trains unless ``share_layers``; otherwise each has
+    its own."""
 
     def __post_init__(self) -> None:
         ActorCriticConfig.__post_init__(self)
@@ -285,4 +286,6 @@ def loss(
     batch, started, memory = minibatch
     after = flat(network.unroll(memory, batch.obs, started))
     distribution = network.policy(after, flat(unmasked(batch.obs)[1]))
-    return loss_of(distribution, network.value(after), flat(batch._replace(obs=())), config, clock)
+    shape = config.policy_kwargs
+    read = jax.lax.stop_gradient(after) if shape.shared_lstm and not shape.share_layers else after
+    return loss_of(distribution, network.value(read), flat(batch._replace(obs=())), config, clock)

@@ -189,9 +189,8 @@ class ActorCritic(eqx.Module):
         """Returns the distribution that the last hidden layer ``(batch, width)`` asks for."""
         outputs, log_std = forbid(self.head(hidden), mask), None
         if self.log_std is not None:
-            log_std = (
-                self.log_std[None] if self.log_std.ndim == 1 else sde_log_std(self.log_std, hidden, self.use_expln)
-            )
+            read = jax.lax.stop_gradient(hidden)
+            log_std = self.log_std[None] if self.log_std.ndim == 1 else sde_log_std(self.log_std, read, self.use_expln)
             if not self.shape.learn_std:
                 log_std = jax.lax.stop_gradient(log_std)
         elif self.action.n_stds:
@@ -231,10 +230,10 @@ def sde_log_std(log_std: Array, hidden: Array, use_expln: bool = False) -> Array
     """Returns the log standard deviation of state-dependent noise at hidden layers ``(batch, width)``.
 
     The noise is ``hidden @ E`` with a matrix ``E`` of independent normals of standard deviations :func:`sde_std` (Raffin et
-    al. 2020, "Smooth Exploration for Robotic Reinforcement Learning", arXiv 2005.05719, equation 8). No gradient reaches
-    the hidden layer this way.
+    al. 2020, "Smooth Exploration for Robotic Reinforcement Learning", arXiv 2005.05719, equation 8). As in
+    Stable-Baselines3, gradients reach the hidden layer this way in SAC and TQC, and not in PPO and A2C.
     """
-    variance = jnp.square(jax.lax.stop_gradient(hidden)) @ jnp.square(sde_std(log_std, use_expln))
+    variance = jnp.square(hidden) @ jnp.square(sde_std(log_std, use_expln))
     return 0.5 * jnp.log(variance + SDE_EPSILON)
 
 
