@@ -531,9 +531,9 @@ def load_zip(
         restore_counters(agent, model, found)
     restore_windows(agent, model.readable)
     if kind is not None:  # as the original's load does
-        texts = {key: model.readable(key) for key in ("verbose", "tensorboard_log")}
-        wanted = {"verbose": int, "tensorboard_log": str}
-        agent.set_outputs(**{key: x for key, x in texts.items() if type(x) is wanted[key]} | outputs)
+        wanted: dict[str, Any] = {"verbose": int, "tensorboard_log": str}
+        said: dict[str, Any] = {key: model.readable(key) for key in wanted}
+        agent.set_outputs(**{key: x for key, x in said.items() if type(x) is wanted[key]} | outputs)
     if vector is not None:
         agent.set_env(vector)
         agent.made_from_id = isinstance(env, str)
