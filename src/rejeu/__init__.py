@@ -55,7 +55,11 @@ if TYPE_CHECKING:
     from rejeu.core import Algorithm as Algorithm, Clock as Clock, Rollout as Rollout, Transition as Transition
     from rejeu.envs.checker import check_env as check_env
     from rejeu.envs.make import make_vec as make_vec, make_vector as make_vector
-    from rejeu.envs.wrappers import OldEnvironment as OldEnvironment, TimeLimitTerminates as TimeLimitTerminates
+    from rejeu.envs.wrappers import (
+        FlatGoals as FlatGoals,
+        OldEnvironment as OldEnvironment,
+        TimeLimitTerminates as TimeLimitTerminates,
+    )
     from rejeu.errors import (
         BadEnvironmentError as BadEnvironmentError,
         CheckpointError as CheckpointError,
@@ -95,7 +99,7 @@ _MODULES = {
     "rejeu.envs.make": "make_vec make_vector",
     "rejeu.sb3.common.evaluation": "evaluate_policy",
     "rejeu.sb3.common.monitor": "Monitor",
-    "rejeu.envs.wrappers": "OldEnvironment TimeLimitTerminates",
+    "rejeu.envs.wrappers": "FlatGoals OldEnvironment TimeLimitTerminates",
     "rejeu.errors": "BadEnvironmentError CheckpointError MissingExtra NonFiniteError RunInUseError WorkerError",
     "rejeu.export.numpy_policy": "load_policy",
     "rejeu.exploration.noise": "NormalActionNoise OrnsteinUhlenbeckActionNoise",

@@ -187,8 +187,11 @@ def check_policy(policy: str, space: spaces.Space, normalize_images: bool = True
         raise ValueError(f"policy='CnnPolicy' needs a uint8 image observation, got {space}; use 'MlpPolicy'")
 
 
-def check_goal_space(space: spaces.Space) -> None:
-    """Raises ``ValueError`` unless ``space`` is a goal environment's: hindsight needs the two goals, each one array."""
+def check_goal_space(space: spaces.Space, nested: bool = False) -> None:
+    """Raises ``ValueError`` unless ``space`` is a goal environment's: hindsight needs the two goals, each one array.
+
+    With ``nested`` goals may be a Dict or Tuple.
+    """
     keys = list(space.spaces) if isinstance(space, spaces.Dict) else None
     missing = [key for key in GOAL_KEYS if keys is None or key not in keys]
     if missing:
@@ -198,15 +201,15 @@ def check_goal_space(space: spaces.Space) -> None:
             f"is missing from {has}; use a goal environment or replay_buffer_class=None"
         )
     assert isinstance(space, spaces.Dict)
-    if isinstance(space["achieved_goal"], spaces.Dict | spaces.Tuple):
-        raise ValueError(
-            f"achieved_goal is {space['achieved_goal']}, and hindsight needs goals that are one array; put the parts of a "
-            "goal into one Box, from which compute_reward takes them"
-        )
     if space["achieved_goal"] != space["desired_goal"]:
         raise ValueError(
             f"achieved_goal {space['achieved_goal']} and desired_goal {space['desired_goal']} must be the same space, "
             "because hindsight puts the one in the other's place"
+        )
+    if isinstance(space["achieved_goal"], spaces.Dict | spaces.Tuple) and not nested:
+        raise ValueError(
+            f"achieved_goal is {space['achieved_goal']}, and hindsight needs goals that are one array; wrap the environment "
+            "with rejeu.FlatGoals, which keeps compute_reward as it is: rejeu.FlatGoals(env), or --wrapper rejeu:FlatGoals"
         )
 
 

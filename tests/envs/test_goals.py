@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import abc
+import contextlib
 
 import gymnasium as gym
 import numpy as np
 import pytest
 
+import rejeu
 from rejeu.envs import checker
 from rejeu.envs.goals import goal_functions, over_batches, parking_reward
 from rejeu.envs.make import GymnasiumVector, InProcess, make_vector
 from tests.environments import Counter, Reach
+from tests.helpers import small_sac
+from tests.tiers import only
 
 
 def goals(n, dim=2, seed=0):
@@ -163,3 +167,59 @@ def test_envpool_and_highway_env_reward_parking_alike():
         make_vector("parking-v0", backend=b).goals().reward(achieved, desired) for b in ("envpool", "gymnasium")
     )
     np.testing.assert_allclose(one, two, rtol=1e-5)
+
+
+class ReachNested(Reach):
+    """Goals are a position and whether a gripper is open."""
+
+    goal_space = gym.spaces.Dict(
+        {"at": gym.spaces.Box(-20.0, 20.0, (1,)), "open": gym.spaces.Tuple([gym.spaces.Discrete(2)])}
+    )
+    observation_space = gym.spaces.Dict(
+        {"observation": gym.spaces.Box(-20.0, 20.0, (1,)), "achieved_goal": goal_space, "desired_goal": goal_space}
+    )
+
+    def compute_reward(self, achieved, desired, info):
+        if isinstance(achieved, np.ndarray):  # in this class's own step
+            return super().compute_reward(achieved, desired, info)
+        assert achieved.keys() == desired.keys() == {"at", "open"}
+        is_reached = (np.abs(achieved["at"] - desired["at"])[..., 0] < 0.5) & (
+            achieved["open"][0] == desired["open"][0]
+        )
+        return is_reached.astype(np.float32) - 1.0
+
+    def _observe(self):
+        goals = {
+            key: {"at": at, "open": (1,)} for key, at in (("achieved_goal", self.position), ("desired_goal", self.goal))
+        }
+        return {"observation": self.position, **goals}
+
+
+def flat_reach():
+    return rejeu.FlatGoals(ReachNested())
+
+
+def test_flat_goals_give_compute_reward_the_goals_of_the_environment():
+    env = flat_reach()
+    assert [*env.observation_space.spaces] == [*ReachNested.observation_space.spaces]
+    obs, _ = env.reset(seed=0)
+    assert obs in env.observation_space
+    np.testing.assert_array_equal(obs["achieved_goal"], [obs["observation"][0], 0.0, 1.0])
+    assert not [finding for finding in checker.findings(env) if "goal" in finding.text]
+    goals = goal_functions(env)
+    assert goals.terminated is None
+    achieved, desired = np.float32([[0, 1, 0], [0, 1, 0], [0, 1, 0]]), np.float32([[0.4, 1, 0], [0.4, 0, 1], [9, 1, 0]])
+    np.testing.assert_array_equal(goals.reward(achieved, desired), [0.0, -1.0, -1.0])
+    with pytest.raises(ValueError, match="achieved_goal, desired_goal is missing"):
+        rejeu.FlatGoals(Counter())
+
+
+@pytest.mark.parametrize("backend", only((), ["gymnasium", "gymnasium-async"]))
+def test_flat_goals_are_relabeled_in_this_process_and_in_workers(backend):
+    with contextlib.closing(make_vector(flat_reach, 2, backend, seed=0)) as vector:
+        agent = small_sac(vector, replay_buffer_class="HerReplayBuffer", learning_starts=100)
+        buffer = agent.learn(60).replay_buffer
+    batch = buffer.sample(np.random.default_rng(0), (256,))
+    own = np.abs(batch.next_obs["achieved_goal"] - batch.obs["desired_goal"])[:, 0] < 0.5
+    np.testing.assert_array_equal(batch.reward, own - 1.0)
+    assert own.mean() > 0.2

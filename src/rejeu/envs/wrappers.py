@@ -1,13 +1,18 @@
-"""Wrappers for time limits and old environments, and ``rejeu/CartPoleNoVelocity-v0``, which is partially observable."""
+"""Wrappers for time limits, goals and old environments, and ``rejeu/CartPoleNoVelocity-v0``, which is partially observable."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.envs.classic_control import CartPoleEnv
 from gymnasium.wrappers import TransformObservation
+
+from rejeu.envs import snapshot
+from rejeu.envs.goals import attribute
+from rejeu.spaces import check_goal_space, leaves
 
 
 class TimeLimitTerminates(gym.Wrapper, gym.utils.RecordConstructorArgs):
@@ -31,6 +36,69 @@ class TimeLimitTerminates(gym.Wrapper, gym.utils.RecordConstructorArgs):
         """Steps the environment, and reports truncation as termination."""
         obs, reward, terminated, truncated, info = self.env.step(action)
         return obs, reward, terminated or truncated, False, info
+
+
+class FlatGoals(gym.ObservationWrapper, gym.utils.RecordConstructorArgs):
+    """Makes goals that are nestings of Dict and Tuple one array, as hindsight replay needs them.
+
+    The environment's ``compute_reward`` and ``compute_terminated`` receive goals as the environment returns them, or in
+    place of each array one with a leading axis for a batch of goals. Choices of a Discrete or MultiDiscrete goal are one-hot
+    encoded.
+
+    Raises:
+        ValueError: if it is not a goal environment.
+        TypeError: if a part of the goals is not a fixed-size array.
+    """
+
+    def __init__(self, env: gym.Env) -> None:
+        gym.utils.RecordConstructorArgs.__init__(self)
+        gym.ObservationWrapper.__init__(self, env)
+        check_goal_space(env.observation_space, nested=True)
+        assert isinstance(env.observation_space, gym.spaces.Dict)
+        self._goal = env.observation_space["achieved_goal"]
+        leaves(self._goal)
+        flat: Any = gym.spaces.flatten_space(self._goal)
+        flat = gym.spaces.Box(flat.low.astype(np.float32), flat.high.astype(np.float32), dtype=np.float32)
+        goals = dict.fromkeys(("achieved_goal", "desired_goal"), flat)
+        self.observation_space = gym.spaces.Dict({**env.observation_space.spaces, **goals})
+
+    def observation(self, observation: Any) -> dict[str, Any]:
+        """Returns an observation with flat goals."""
+        flat = {key: gym.spaces.flatten(self._goal, observation[key]) for key in ("achieved_goal", "desired_goal")}
+        return {**observation, **{key: np.asarray(goal, np.float32) for key, goal in flat.items()}}
+
+    @property
+    def compute_reward(self) -> Callable[..., Any]:
+        """The environment's function of this name, for flat goals."""
+        return self._of_flat("compute_reward")
+
+    @property
+    def compute_terminated(self) -> Callable[..., Any]:
+        """The environment's function of this name, for flat goals."""
+        return self._of_flat("compute_terminated")
+
+    def _of_flat(self, name: str) -> Callable[..., Any]:
+        function = attribute(self.env, name)
+        if function is None:
+            raise AttributeError(f"the environment has no {name}")
+        return lambda achieved, desired, info: function(*(unflat(self._goal, x) for x in (achieved, desired)), info)
+
+
+def unflat(space: gym.Space, flat: np.ndarray) -> Any:
+    """Returns the elements of ``space`` whose flat arrays ``(..., n)`` are given, each leaf with the same leading axes.
+
+    >>> space = gym.spaces.Dict(at=gym.spaces.Box(-1.0, 1.0, (2,)), open=gym.spaces.Discrete(2))
+    >>> unflat(space, np.eye(2, 4))["at"].shape
+    (2, 2)
+    """
+    if isinstance(space, gym.spaces.Dict | gym.spaces.Tuple):
+        spaces = [*space.spaces.values()] if isinstance(space, gym.spaces.Dict) else [*space.spaces]
+        split = np.split(flat, np.cumsum([gym.spaces.flatdim(part) for part in spaces])[:-1], axis=-1)
+        parts = [unflat(part, numbers) for part, numbers in zip(spaces, split, strict=True)]
+        return dict(zip(space.spaces, parts, strict=True)) if isinstance(space, gym.spaces.Dict) else (*parts,)
+    if isinstance(space, gym.spaces.Box):
+        return flat.reshape(*flat.shape[:-1], *space.shape).astype(space.dtype)
+    return np.apply_along_axis(lambda one: np.asarray(gym.spaces.unflatten(space, one)), -1, flat)
 
 
 class OldEnvironment(gym.Env):
@@ -114,3 +182,6 @@ def cart_pole_without_velocities(render_mode: str | None = None) -> gym.Env:
     assert isinstance(space, gym.spaces.Box)
     shown = gym.spaces.Box(space.low[::2], space.high[::2], dtype=np.float32)
     return TransformObservation(env, lambda obs: obs[::2], shown)
+
+
+snapshot.REMEMBERED |= {TimeLimitTerminates: {}, FlatGoals: {}}
