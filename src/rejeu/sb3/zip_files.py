@@ -40,6 +40,7 @@ from rejeu.sb3.pickled import (
     read_normalization,
     tensors_of,
 )
+from rejeu.validation import build
 
 MOST_DATA = 16 * 2**20
 """Upper limit on the bytes of ``data``."""
@@ -459,6 +460,7 @@ def load_zip(
     Raises:
         FileNotFoundError: if there is no such file.
         CheckpointError: if the file is damaged, names code, or its policy cannot be expressed; the message says which part.
+        TypeError, ValueError: for unknown or invalid ``changes``.
     """
     path = Path(path)
     path = path if path.suffix or path.is_dir() else path.with_name(f"{path.name}.zip")
@@ -478,7 +480,7 @@ def load_zip(
             notes.append(
                 "these statistics may be of the end of training, and the model is not: it can act worse than it did"
             )
-    notes += zoo.notes_beside(path, vecnormalize or None)
+    notes += zoo.notes_beside(path, vecnormalize or None, changes)
     state = None
     if vecnormalize:
         with explained(Path(vecnormalize)):
@@ -509,8 +511,9 @@ def load_zip(
         with explained(Path(vecnormalize or path)):
             settings["normalize"], arrays = statistics_of(state, policy.leaves, notes)
     with explained(path):
-        config = cls.algorithm.Config(**settings | changes)
-        check_depths(config)
+        check_depths(cls.algorithm.Config(**settings))
+    config: Any = build(cls.algorithm.Config, settings | changes)
+    check_depths(config)
     name = spaces.POLICIES[1] if keys else spaces.POLICIES[2 if policy.leaves[0].kind == "image" else 0]
     agent.configure(name, config, **own)
     agent.set_outputs(**outputs)

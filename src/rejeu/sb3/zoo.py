@@ -7,6 +7,7 @@ hyperparameters ``config.yml`` and the command line ``args.yml``. On the hub all
 from __future__ import annotations
 
 import re
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any, Literal
 
@@ -57,12 +58,13 @@ def statistics_beside(path: Path) -> Path | None:
     return next((place for place in places if place.is_file()), None)
 
 
-def notes_beside(path: Path, used: Any) -> list[str]:
+def notes_beside(path: Path, used: Any, given: Collection[str] = ()) -> list[str]:
     """Returns what the files beside a zip file say that rejeu does not do by itself, and which of them are not read.
 
     Args:
         path: of the zip file.
         used: the file of the ``VecNormalize`` that is used; None if there is none.
+        given: names of hyperparameters that replace those of the file.
     """
     notes = []
     unread = {file.name for folder in folders(path)[:-1] for file in folder.glob("*.pkl") if file != used}
@@ -97,7 +99,7 @@ def notes_beside(path: Path, used: Any) -> list[str]:
         notes.append(
             f"config.yml: its observations are stacks of {n} frames; wrap the environment in FrameStackObservation"
         )
-    schedules = {key: found[key] for key in ("learning_rate", "clip_range", "delta_std") if key in found}
+    schedules = {key: found[key] for key in ("learning_rate", "clip_range", "delta_std") if key in {*found} - {*given}}
     if schedules:
         written = " ".join(f"{key}={shown(value, 40)}" for key, value in schedules.items())
         notes.append(f"config.yml: it began with {written}; to train on so: --set {written}")
