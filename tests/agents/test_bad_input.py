@@ -122,3 +122,11 @@ def test_after_a_bad_reward_the_agent_can_still_be_saved_and_trained(tmp_path):
     agent.learn(3, reset_num_timesteps=False)
     assert agent.replay_buffer.size() == 10
     assert rejeu.SAC.load(agent.save(tmp_path / "model")).predict(np.zeros(3))[0].shape == (1,)
+
+
+def test_what_an_agent_does_not_have_is_said(tmp_path):
+    with pytest.raises(ValueError, match="ARS learns no values"):
+        rejeu.ARS("MlpPolicy", Counter(), seed=0).value(np.zeros(3))
+    loaded = rejeu.SAC.load(small_sac(Counter()).save(tmp_path / "model"))
+    with pytest.raises(ValueError, match="no environment and so no replay buffer"):
+        loaded.save_replay_buffer(tmp_path / "buffer")

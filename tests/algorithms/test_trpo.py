@@ -177,3 +177,9 @@ def test_settings_that_are_refused(settings, message):
 def test_settings_without_meaning_are_unknown():
     with pytest.raises(TypeError, match="ent_coef"):
         rejeu.TRPO("MlpPolicy", "CartPole-v1", ent_coef=0.1)
+
+
+def test_a_factor_that_leaves_environments_out_is_warned_of():
+    with pytest.warns(UserWarning, match="from 2 of the 4 environments only"):
+        trpo.warn_of_unused(2, 4)
+    trpo.warn_of_unused(3, 4)

@@ -5,11 +5,14 @@ from __future__ import annotations
 import re
 import shutil
 
+import gymnasium as gym
 import jax
 import numpy as np
 import pytest
 
+import rejeu
 from rejeu.agents import exporting
+from rejeu.cli import main
 from rejeu.export import check, web_file
 from rejeu.export.check import node
 from tests.export.policies import made
@@ -155,9 +158,16 @@ def test_what_a_page_cannot_contain_is_one_line(tmp_path):
     assert not [*tmp_path.iterdir()]
     for env_id, kwargs, message in (
         ("Acrobot-v1", {}, "cannot contain Acrobot-v1; it can contain CartPole-v1"),
-        (None, {}, "an environment without id"),
+        (None, {}, "given as an object; name it by agent.set_env"),
         ("rejeu/Ball-v0", {"dimension": 3}, "in two dimensions"),
         ("CartPole-v1", {"speed": 3}, "CartPole-v1 with the arguments speed"),
     ):
         with pytest.raises(ValueError, match=message):
             web_file.environment(env_id, kwargs)
+
+
+def test_export_names_the_environment_of_a_page(tmp_path, capsys):
+    model = rejeu.PPO("MlpPolicy", gym.make("CartPole-v1"), seed=0).save(tmp_path / "model")
+    assert main(["export", str(model), "--to", "web"]) == 2
+    assert "--env ID" in capsys.readouterr().err
+    assert main(["export", str(model), "--to", "web", "--env", "CartPole-v1"]) == 0

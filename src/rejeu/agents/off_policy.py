@@ -55,9 +55,10 @@ class OffPolicyAgent(Agent):
         """Writes the replay buffer to one safetensors file and returns its path.
 
         Raises:
-            ValueError: if the agent has no steps to write, and there is such a file: that of an earlier buffer, perhaps.
+            ValueError: if the agent has no buffer, or an empty one for a file that exists: that of an earlier buffer, perhaps.
         """
-        if (self.run.replay is None or not self.run.replay.size()) and checkpoint.resolve(path).exists():
+        self._require_replay()
+        if not self.run.replay.size() and checkpoint.resolve(path).exists():
             raise ValueError(
                 f"{path} exists, and the replay buffer of this {self.name} is empty; load_replay_buffer comes first, or give "
                 "another path"
@@ -78,8 +79,7 @@ class OffPolicyAgent(Agent):
         Raises:
             CheckpointError: if the file is damaged, or its spaces or size do not match; the buffer is then unchanged.
         """
-        if self.run.replay is None:
-            raise ValueError("this agent has no environment and so no replay buffer; give one to load(path, env=...)")
+        self._require_replay()
         try:
             with checkpoint.opened(path, "replay") as file:
                 for kind, own in (("observation", self.observation_space), ("action", self.action_space)):
@@ -94,6 +94,10 @@ class OffPolicyAgent(Agent):
         self.run.learn_from = self.config.learning_starts
         self.run.td_errors = []  # of transitions that are gone
         self.abandon_episodes()
+
+    def _require_replay(self) -> None:
+        if self.run.replay is None:
+            raise ValueError("this agent has no environment and so no replay buffer; give one to load(path, env=...)")
 
     q_values = policy.q_values
 

@@ -47,13 +47,15 @@ class OnPolicyAgent(Agent):
             ``(batch,)``, or one number if the observation has no batch axis.
 
         Raises:
-            ValueError: if the observation or ``state`` has the wrong structure or shape.
+            ValueError: if the observation or ``state`` has the wrong structure or shape, or if the algorithm has no critic.
 
         >>> import gymnasium as gym, rejeu
         >>> agent = rejeu.PPO("MlpPolicy", gym.make("CartPole-v1"), seed=0)
         >>> agent.value(np.zeros((50, 4), np.float32)).shape
         (50,)
         """
+        if self.learner.algorithm.state_value is None:
+            raise ValueError(f"{self.name} learns no values, only a policy")
         if self.takes_masks:
             observation, _ = split(observation, None)
         obs, single = spaces.as_batch(observation, self.observation_space, self.obs_leaves)

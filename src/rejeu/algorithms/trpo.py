@@ -19,6 +19,8 @@ sb3-contrib has the reversed one; to second order the two are equal.
 
 from __future__ import annotations
 
+import math
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
@@ -69,7 +71,8 @@ class Config(OnPolicyConfig):
     n_critic_updates: int = 10
     """Passes of the value over every rollout."""
     sub_sampling_factor: int = 1
-    """Every so many steps of the rollout count for the policy's step. A larger number computes less."""
+    """Every so many steps of the rollout count for the policy's step. A larger number computes less. With several
+    environments it should have no divisor in common with their number, because they lie side by side."""
     max_grad_norm: float | None = None
     """Limit of the norm of the value's gradient. None: no limit."""
     # Class variables in place of inherited fields take the fields away: they have no meaning here.
@@ -138,6 +141,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         return State(network, optimizer.init(network), update_key, jnp.int32(0), jnp.int32(0))
 
     def update(state: State, rollout: Rollout, clock: Clock) -> tuple[State, Metrics]:
+        warn_of_unused(config.sub_sampling_factor, rollout.reward.shape[1])
         data = samples(state.network, rollout, config.gae_lambda)
         network, taken = policy_step(state.network, data, config)
         order_key = nth(state.key, state.n_rollouts)
@@ -169,6 +173,17 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         return State(network, optimizer_state, state.key, n_updates, state.n_rollouts + 1), metrics
 
     return algorithm_of(config, kind, init, update)
+
+
+def warn_of_unused(factor: int, n_envs: int) -> None:
+    """Warns if every ``factor``-th step is always one of the same environments, as they are side by side in a rollout."""
+    if (shared := math.gcd(factor, n_envs)) > 1:
+        warnings.warn(
+            f"with sub_sampling_factor={factor} the policy learns from {n_envs // shared} of the {n_envs} environments only; "
+            f"take a factor without a divisor in common with {n_envs}",
+            UserWarning,
+            stacklevel=2,
+        )
 
 
 def policy_step(network: ActorCritic, data: Samples, config: Config) -> tuple[ActorCritic, Step]:

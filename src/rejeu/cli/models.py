@@ -61,15 +61,18 @@ def run_export(arguments: Export) -> tuple[int, dict[str, Any]]:
         beside = model.parent / "policy" if arguments.run.is_dir() else model.with_suffix("")
         out = (beside if out is None else out / beside.name).with_suffix(SUFFIXES[to])
     target_of(out, to)  # an error before the agent is loaded
-    make_env = None
+    made = None
     try:
-        make_env = environment.environment_of(model, arguments).make
+        made = environment.environment_of(model, arguments)
     except (CheckpointError, ImportError, ValueError) as error:
         if arguments.env is not None:
             raise
         echo(f"the observations are sampled from the observation space, because there is no environment: {error}")
-    agent, settings = load(model), (arguments.noise, arguments.batch)
-    found = export(agent, out, to, *settings, make_env, str(arguments.run), arguments.frame_stack)
+    agent, make_env = load(model), None if made is None else made.make
+    if arguments.env is not None and made is not None and not made.wrappers:
+        agent.trained_on = made.env_id, made.kwargs
+    settings = (arguments.noise, arguments.batch, make_env, str(arguments.run), arguments.frame_stack)
+    found = export(agent, out, to, *settings)
     echo(found)
     return 0, found.to_dict()
 

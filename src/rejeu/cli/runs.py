@@ -24,11 +24,11 @@ from rejeu.runs.folder import RunFolder, find_model
 from rejeu.validation import whole
 
 WINDOW = 100
-"""``rejeu runs``, ``status``, ``compare`` and ``report``: lists of runs, how far one is, groups side by side, and pages."""
+"""Training episodes in the mean that is shown."""
 EXIT = {"running": 0, "finished": 0, "unknown": 0, "interrupted": 3, "crashed": 4}
-"""``rejeu runs``, ``status``, ``compare`` and ``report``: lists of runs, how far one is, groups side by side, and pages."""
+"""Exit status of ``rejeu status`` by the state of a run."""
 WIDE = 10_000
-"""``rejeu runs``, ``status``, ``compare`` and ``report``: lists of runs, how far one is, groups side by side, and pages."""
+"""Columns of a table that is not written to a terminal, so that no cell is folded."""
 
 
 def run_runs(arguments: Runs) -> tuple[int, dict[str, Any]]:

@@ -45,9 +45,10 @@ def environment(env_id: str | None, kwargs: Mapping[str, Any]) -> FunctionalEnv:
     """
     name = env_id if env_id in ENVIRONMENTS.values() else ENVIRONMENTS.get(env_id or "")
     if name is None or kwargs.get("dimension", 2) != 2:
+        fix = "; name it by agent.set_env(ID) or --env ID"
+        said = f"{env_id}{dict(kwargs) or ''}" if env_id else "an environment that was given as an object"
         raise ValueError(
-            f"a page cannot contain {env_id or 'an environment without id'}{dict(kwargs) or ''}; it can contain "
-            f"{', '.join(ENVIRONMENTS)} in two dimensions"
+            f"a page cannot contain {said}{'' if env_id else fix}; it can contain {', '.join(ENVIRONMENTS)} in two dimensions"
         )
     try:
         return functional.make(name, **kwargs)
