@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,7 @@ import rejeu
 from rejeu import cli, interrupt
 from rejeu.interrupt import Interrupt
 from tests.cli.test_cli import TINY
+from tests.sharing import shared_learners
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="signals are POSIX's")
 SOURCE = Path(interrupt.__file__)
@@ -39,15 +41,10 @@ def raise_signal(number=signal.SIGTERM):
     os.kill(os.getpid(), number)
 
 
-def test_an_interrupt_within_another_tells_it():
+def test_an_interrupt_within_another_tells_it_and_the_second_signal_acts_at_once():
     with Interrupt() as outer, Interrupt() as inner:
         raise_signal()
         assert (inner.signal, outer.signal) == (signal.SIGTERM, signal.SIGTERM)
-
-
-def test_the_second_signal_acts_at_once():
-    with Interrupt() as outer, Interrupt() as inner:
-        raise_signal()
         with pytest.raises(KeyboardInterrupt):
             raise_signal(signal.SIGINT)
     assert (inner.signal, outer.signal) == (signal.SIGTERM, signal.SIGTERM)
@@ -74,12 +71,6 @@ def test_a_signal_within_a_callback_of_the_garbage_collector_is_not_swallowed(nu
     """
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert (done.returncode, done.stdout, done.stderr) == (status, "", "rejeu: stopped\n")
-
-
-def test_a_closed_terminal_stops_training_as_sigterm_does():
-    with Interrupt() as stop:
-        raise_signal(signal.SIGHUP)
-    assert stop.signal == signal.SIGHUP
 
 
 def test_output_to_a_closed_terminal_is_no_error():
@@ -157,20 +148,24 @@ def test_the_command_is_known_by_the_program_that_runs(program, is_command, monk
     assert interrupt.is_command() == is_command
 
 
-def test_a_signal_after_training_ends_the_command_with_its_status_and_keeps_the_models(tmp_path):
-    script = """if True:
-        import os, signal, sys
-        import rejeu.reporting.video
-        rejeu.reporting.video.record_video = lambda *arguments: os.kill(os.getpid(), signal.SIGTERM)
-        from rejeu.cli import main
-        sys.exit(main(sys.argv[1:]))
-    """
+def test_a_signal_after_training_ends_the_command_and_keeps_the_models(tmp_path, monkeypatch):
+    ends, out = [], tmp_path / "run"
+
+    @contextmanager
+    def leaving(text):  # which ends the process at once
+        ends.append(text)
+        yield
+
+    def record_video(*arguments):
+        raise SystemExit(143)
+
+    monkeypatch.setattr("rejeu.cli.session.leaving", leaving)
+    monkeypatch.setattr("rejeu.reporting.video.record_video", record_video)
     argv = ["train", "rejeu/Ball-v0", "--algo", "SAC", "--steps", "60", "--evaluate-episodes", "1", "--no-report"]
-    argv += ["--out", str(tmp_path / "run"), "--set", *TINY]
-    done = subprocess.run([sys.executable, "-c", script, *argv], capture_output=True, text=True)
-    assert done.returncode == 143
-    assert done.stderr == f"rejeu: interrupted after training; the models are saved in {tmp_path / 'run'}\n"
-    files = {path.name for path in (tmp_path / "run").iterdir()}
+    with shared_learners(), pytest.raises(SystemExit):
+        cli.main([*argv, "--out", str(out), "--set", *TINY])
+    assert ends == [f"interrupted after training; the models are saved in {out}"]
+    files = {path.name for path in out.iterdir()}
     assert {"agent.safetensors", "best.safetensors", "checkpoints", "curve.png", "episodes.csv"} <= files
 
 

@@ -18,7 +18,7 @@ import rejeu
 from rejeu.agents import AGENTS
 from rejeu.algorithms.dqn import FOR_NEW
 from rejeu.callbacks import Evaluate
-from rejeu.cli import main, one_line
+from rejeu.cli import main
 from rejeu.cli.session import Session
 from rejeu.cli.train import untuned
 from rejeu.reporting.logging import CsvFile
@@ -152,29 +152,21 @@ def test_train_says_what_it_does_and_what_came_of_it(tmp_path, capsys):
     assert re.search(r"[\d.]+ s in all, [\d.]+ s of them compiling", text)
 
 
-@exhaustive
+@pytest.fixture
+def untrained(monkeypatch):
+    """Ends commands before they train."""
+    monkeypatch.setattr(Session, "run", lambda self, stop, stopwatch: (0, {}))
+
+
+@pytest.mark.usefixtures("untrained")
 def test_a_preset_for_envpool_trains_on_gymnasium_without_it_and_says_so(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "envpool", None)
-    assert train(tmp_path / "run", "--seed", "1", *FEWER_FILES, steps=60) == 0
+    assert train(tmp_path / "run", "--seed", "1") == 0
     said = (
         'backend       gymnasium; EnvPool would be faster (about 770 MB with its assets): pip install "rejeu[envpool]"'
     )
     assert said in capsys.readouterr().out
     assert json.loads((tmp_path / "run" / "config.json").read_text())["backend"] == "gymnasium"
-
-
-@exhaustive
-def test_train_stops_after_the_minutes_given(tmp_path):
-    out = tmp_path / "run"
-    argv = ["train", "Pendulum-v1", "--minutes", "0.01", "--evaluate-episodes", "1", "--out", str(out), "--set", *TINY]
-    assert main(argv) == 0
-    assert {path.name for path in out.iterdir()} == FILES
-
-
-@pytest.fixture
-def untrained(monkeypatch):
-    """Ends commands before they train."""
-    monkeypatch.setattr(Session, "run", lambda self, stop, stopwatch: (0, {}))
 
 
 @pytest.mark.usefixtures("untrained")
@@ -227,33 +219,19 @@ def test_a_missing_extra_is_named_before_anything_runs(missing, argv, extra, run
     assert not [*tmp_path.iterdir()]
 
 
-def test_evaluate_prints_the_result_and_writes_nothing(run, capsys):
+def test_evaluate_prints_the_result_repeats_itself_with_a_seed_and_writes_nothing(run, capsys):
     before = {path: path.stat().st_mtime_ns for path in run.iterdir()}
-    assert main(["evaluate", str(run), "--episodes", "2", "--backend", "gymnasium", "--seed", "0"]) == 0
-    text = capsys.readouterr().out
-    assert "on gymnasium" in text
-    assert "2 episodes" in text
-    assert {path: path.stat().st_mtime_ns for path in run.iterdir()} == before
-
-
-def test_evaluate_for_minutes_plays_at_least_an_episode_in_each_environment(run, capsys):
-    assert main(["evaluate", str(run), "--minutes", "1e-6", "--backend", "gymnasium"]) == 0
-    assert "16 episodes" in capsys.readouterr().out
-    assert main(["evaluate", str(run), "--minutes", "0"]) == 2
-    assert "--minutes=0.0 must be a finite number, above 0" in capsys.readouterr().err
-
-
-def test_evaluate_with_a_seed_repeats_itself(run, capsys):
     for _ in range(2):
-        assert main(["evaluate", str(run), "--episodes", "2", "--seed", "5"]) == 0
+        assert main(["evaluate", str(run), "--episodes", "2", "--seed", "5", "--backend", "gymnasium"]) == 0
     first, second = capsys.readouterr().out.split("Pendulum-v1 on gymnasium")[1:]
     assert first.strip() == second.strip()
-
-
-def test_evaluate_takes_the_last_model_or_a_file_as_well(run, capsys):
-    assert main(["evaluate", str(run), "--which", "last", "--episodes", "1"]) == 0
+    assert "2 episodes" in first
+    assert main(["evaluate", str(run), "--minutes", "1e-6", "--backend", "gymnasium", "--which", "last"]) == 0
     assert main(["evaluate", str(run / "agent.safetensors"), "--episodes", "1"]) == 0
-    assert capsys.readouterr().out.count("agent.safetensors") == 2
+    text = capsys.readouterr().out
+    assert "16 episodes" in text  # an episode in each environment
+    assert text.count("agent.safetensors") == 2
+    assert {path: path.stat().st_mtime_ns for path in run.iterdir()} == before
 
 
 @pytest.mark.usefixtures("untrained")
@@ -264,17 +242,12 @@ def test_a_preset_says_what_a_success_is_where_the_environments_threshold_ranks_
     assert json.loads((out / "config.json").read_text("utf-8"))["success_threshold"] == 0.0
 
 
-def test_list_shows_algorithms_and_presets(capsys):
-    assert main(["list"]) == 0
-    text = capsys.readouterr().out
-    assert re.search(r"SAC +Soft actor-critic", text)
-    assert re.search(r"parking-v0 +SAC +56,000 steps  success", text)
-
-
 def test_list_groups_presets_by_environment_in_columns(capsys):
-    main(["list"])
-    lines = capsys.readouterr().out.partition("environments with")[2].splitlines()[1:]
-    rows = [line for line in lines if " steps  " in line]
+    assert main(["list"]) == 0
+    algorithms, _, presets = capsys.readouterr().out.partition("environments with")
+    assert re.search(r"SAC +Soft actor-critic", algorithms)
+    assert re.search(r"parking-v0 +SAC +56,000 steps  success", presets)
+    rows = [line for line in presets.splitlines()[1:] if " steps  " in line]
     assert len(rows) == len(rejeu.presets.every())
     assert len({row.index(" steps  ") for row in rows}) == 1
     named = [row.split()[0] for row in rows if not row.startswith("   ")]
@@ -290,20 +263,14 @@ def test_a_reader_that_closes_the_output_is_no_error(monkeypatch, capsys):
     assert capsys.readouterr().err == ""
 
 
-def test_version_is_printed(capsys):
+def test_help_names_the_commands_and_python_m_rejeu_is_the_same_command(capsys):
     assert main(["--version"]) == 0
     assert capsys.readouterr().out == f"rejeu {rejeu.__version__}\n"
-
-
-def test_help_names_the_commands(capsys):
     with pytest.raises(SystemExit) as stop:
         main(["--help"])
     assert stop.value.code == 0
     text = capsys.readouterr().out
     assert all(command in text for command in ("train", "evaluate", "record", "list", "--version"))
-
-
-def test_python_m_rejeu_is_the_same_command():
     done = subprocess.run([sys.executable, "-m", "rejeu", "--version"], capture_output=True, text=True, check=True)
     assert done.stdout == f"rejeu {rejeu.__version__}\n"
 
@@ -319,11 +286,8 @@ def test_set_takes_dotted_names_numbers_lists_and_words():
     }
 
 
-def test_set_understands_pythons_false_as_false():
+def test_set_understands_pythons_false_and_leaves_the_preset_as_it_was():
     assert config.apply(["policy_kwargs.layer_norm=False"], {}) == {"policy_kwargs": {"layer_norm": False}}
-
-
-def test_set_leaves_the_preset_as_it_was():
     preset = rejeu.presets.find("parking-v0")
     config.apply(["policy_kwargs.net_arch=[1]"], preset.hyperparameters)
     assert preset.hyperparameters["policy_kwargs"]["net_arch"] != [1]
@@ -347,9 +311,9 @@ def test_without_a_preset_dqn_has_values_of_its_own_but_on_images(tmp_path):
         assert found["policy_kwargs"]["net_arch"] == [128, 128]
 
 
-@exhaustive
+@pytest.mark.usefixtures("untrained")
 def test_set_may_be_given_more_than_once(tmp_path):
-    assert train(tmp_path / "run", *FEWER_FILES, "--set", "gamma=0.5", steps=60) == 0
+    assert train(tmp_path / "run", "--backend", "gymnasium", "--set", "gamma=0.5") == 0
     hyperparameters = json.loads((tmp_path / "run" / "config.json").read_text())["hyperparameters"]
     assert (hyperparameters["gamma"], hyperparameters["batch_size"]) == (0.5, 8)
 
@@ -365,22 +329,15 @@ def test_set_may_be_given_more_than_once(tmp_path):
         (["train", "Pendulum-v1", "--algo", "SCA"], "did you mean SAC?"),
         (["train", "Pendulum-v1", "--backend", "envpol"], "must be one of auto, envpool"),
         (["train", "Pendulum-v1", "--steps", "5", "--minutes", "1"], "exclude each other"),
-        (["train", "Pendulum-v1", "--steps", "0"], "--steps=0 must be"),
-        (["train", "Pendulum-v1", "--seed", "-1"], "seed=-1 must be"),
         (
             ["train", "LunarLander-v2"],
             "LunarLander-v2 is an old version that Gymnasium no longer has; use LunarLander-v3",
         ),
         (["train", "ALE/Pong-v5"], "pip install ale-py; EnvPool has Pong-v5: backend='envpool' (--backend envpool)"),
-        (
-            ["train", "PongNoFrameskip-v4"],
-            "of the package ale-py, where it is called ALE/Pong-v5, which is not installed",
-        ),
         (["train", "Pendulum-v1", "--env-cpus", "2"], "--env-cpus are for --backend ray"),
         (["check", ":Walk-v0"], "':Walk-v0' must be MODULE:ID, such as my_env:Walk-v0"),
         (["check", "Pong-v5"], "Gymnasium has no Pong-v5, so it cannot be drawn or stepped by Gymnasium; EnvPool has"),
         (["trian", "Pendulum-v1"], "no command is called 'trian'; did you mean train?"),
-        (["trian", "--help"], "no command is called 'trian'; did you mean train?"),
         ([], "expected a command, such as rejeu train parking-v0"),
         (["train"], "rejeu train needs ENV"),
         (["train", "Pendulum-v1", "CartPole-v1"], "does not expect 'CartPole-v1'"),
@@ -393,19 +350,15 @@ def test_set_may_be_given_more_than_once(tmp_path):
         (["tune", "Pendulum-v1", "--lr", "1e-3"], "hyperparameters are given as --set learning_rate=1e-3"),
         (["evaluate", "run", "-n", "5"], "no option -n; "),
         (["train", "Pendulum-v1", "--tensorboard"], "no option --tensorboard; logs are named by --log tensorboard"),
-        (["train", "Pendulum-v1", "--gamma=0.9"], "hyperparameters are given as --set gamma=VALUE"),
         (["resume", "run", "--net-arch", "64"], "given as --set policy_kwargs.net_arch=[64,64]"),
-        (["train", "-s", "0"], "rejeu train has no option -s; did you mean --set?"),
         (["train", "Pendulum v1"], "no environment is called 'Pendulum v1'; did you mean Pendulum-v1"),
         (["train", "Pendulum-v1", "--seed", "x"], "--seed 'x' must be a whole number"),
-        (["train", "Pendulum-v1", "--seed", "1.5"], "--seed 1.5 must be a whole number"),
         (["train", "Pendulum-v1", "--minutes", "ten"], "--minutes 'ten' must be a number"),
         (["evaluate", "run", "--which", "bets"], "--which 'bets' must be one of best, last"),
         (["train", "rejeu-test/Words-v0"], "which no algorithm here takes"),
         (["train", "rejeu-test/Switches-v0", "--algo", "SAC"], "MultiBinary(3)"),
         (["runs"], "there is no folder runs; rejeu train ENV makes runs in the folder runs"),
         (["evaluate", "no-such-run"], "no run folder or model file no-such-run"),
-        (["record", "no-such-run"], "no run folder or model file no-such-run"),
     ],
 )
 def test_what_is_wrong_is_one_line_that_names_the_fix(capsys, monkeypatch, tmp_path, argv, message):
@@ -607,10 +560,6 @@ def test_a_warning_is_one_line_on_the_command_line(capsys):
             warnings.simplefilter("always")
             assert main(argv) == 2
     assert re.fullmatch(r"warning: one two\nrejeu: error: over \(.*\)\n", capsys.readouterr().err)
-
-
-def test_an_error_of_many_lines_becomes_one():
-    assert one_line(ValueError("first,\n   then second")) == "first, then second"
 
 
 def test_report_replays_the_episodes_that_record_and_watch_show(run, tmp_path):

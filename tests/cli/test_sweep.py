@@ -1,12 +1,9 @@
 """``rejeu sweep`` and ``rejeu resume SWEEP`` with real processes."""
 
-import contextlib
 import json
 import os
-import signal
 import subprocess
 import sys
-import time
 
 import numpy as np
 import pytest
@@ -14,7 +11,6 @@ from safetensors.numpy import load_file
 
 import rejeu
 from rejeu import cli, interrupt
-from rejeu.experiments.folder import read_folder
 
 PLAN = """\
 environments = ["CartPole-v1"]
@@ -46,19 +42,6 @@ def write_plan(tmp_path, steps):
     path = tmp_path / "plan.toml"
     path.write_text(PLAN.format(steps=steps), encoding="utf-8")
     return path
-
-
-def start(*words):
-    return subprocess.Popen(
-        [sys.executable, "-m", "rejeu", *map(str, words)], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-    )
-
-
-def wait_until(condition, seconds=120.0):
-    until = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < until
-        time.sleep(0.05)
 
 
 def models(folder):
@@ -123,41 +106,3 @@ def test_a_sweep_is_trained_compared_and_not_repeated(tmp_path, capsys):
     result = rejeu.sweep(path, out, workers=2)
     assert result.is_complete
     assert times == {one: one.stat().st_mtime_ns for one in out.glob("*/agent.safetensors")}
-
-
-@pytest.mark.exhaustive  # trains twice in four processes
-@pytest.mark.skipif(sys.platform == "win32", reason="it sends signals")
-def test_kills_of_runs_and_of_the_sweep_change_nothing(tmp_path):
-    path, out, undisturbed = write_plan(tmp_path, 6000), tmp_path / "out", tmp_path / "undisturbed"
-    first = start("sweep", path, "--out", undisturbed, "--workers", "2")
-    printed, _ = first.communicate(timeout=400)
-    assert first.returncode == 0, printed
-    sweep = start("sweep", path, "--out", out, "--workers", "2")
-    wait_until(lambda: any(out.glob("*/checkpoints/run_*")))
-    folder = read_folder(out)
-    sweep.kill()
-    sweep.communicate()
-    wait_until(lambda: not any(work.is_training() for work in folder.works()), 60)
-    assert {work.state() for work in folder.works()} >= {"stopped"}
-
-    sweep = start("resume", out, "--workers", "2")
-    wait_until(lambda: any(work.is_training() for work in folder.works()))
-    time.sleep(3)
-    for pid in children(sweep.pid):
-        with contextlib.suppress(ProcessLookupError):
-            os.kill(pid, signal.SIGKILL)
-    time.sleep(5)
-    sweep.send_signal(signal.SIGINT)
-    printed, _ = sweep.communicate(timeout=120)
-    assert sweep.returncode == 130, printed
-    assert "rejeu resume" in printed
-    assert not any(work.is_training() for work in folder.works())
-
-    printed, _ = (sweep := start("resume", out, "--workers", "1")).communicate(timeout=400)
-    assert sweep.returncode == 0, printed
-    assert_equal(models(undisturbed), models(out))
-
-
-def children(pid):
-    found = subprocess.run(["ps", "-o", "pid=", "--ppid", str(pid)], capture_output=True, text=True, check=False)
-    return [int(one) for one in found.stdout.split()]

@@ -1,12 +1,9 @@
 """``rejeu tune`` and ``rejeu resume`` of a study: output, exit status, and mistakes in one line."""
 
 import json
-import os
 import re
-import signal
 import subprocess
 import sys
-import time
 
 import pytest
 
@@ -168,22 +165,3 @@ def test_the_preset_of_a_real_study_trains(tmp_path):
     assert [row["runs"] for row in result["comparison"]] == [5, 5]
     words = ["train", "CartPole-v1", "--preset", out / "preset.json", "--out", tmp_path / "run", "--no-video"]
     subprocess.run(command(*words), capture_output=True, check=True)
-
-
-@pytest.mark.exhaustive
-@pytest.mark.skipif(os.name != "posix", reason="sends SIGINT and SIGKILL")
-def test_a_real_study_that_is_interrupted_and_killed_finds_the_same(tmp_path):
-    words = [*REAL, "--trials", 3, "--steps", 20_000, "--final-seeds", 0]
-    subprocess.run(command(*words, "--out", tmp_path / "one"), capture_output=True, check=True)
-    other = tmp_path / "other"
-    for number, seconds in ((signal.SIGINT, 9), (signal.SIGKILL, 12)):
-        again = ["resume", other, "--workers", 1] if other.exists() else [*words, "--out", other]
-        process = subprocess.Popen(command(*again), stdout=subprocess.DEVNULL, process_group=0)
-        time.sleep(seconds)
-        process.send_signal(number)
-        assert process.wait() == (130 if number == signal.SIGINT else -signal.SIGKILL)
-    subprocess.run(command("resume", other, "--workers", 1), capture_output=True, check=True)
-    one, two = ((folder / "preset.json").read_bytes() for folder in (tmp_path / "one", other))
-    assert one == two
-    for name in sorted(path.relative_to(other) for path in other.glob("trials/*/seed_*/agent.safetensors")):
-        assert (other / name).read_bytes()[-4096:] == (tmp_path / "one" / name).read_bytes()[-4096:]

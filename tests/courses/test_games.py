@@ -10,20 +10,14 @@ from rejeu.errors import MissingExtra
 
 
 @pytest.mark.parametrize("error", [OSError("no display"), MissingExtra("playing", "pygame-ce", "play")])
-def test_a_notebook_goes_on_without_a_window(error, monkeypatch, capsys):
+def test_a_notebook_goes_on_without_a_window_and_says_so_in_its_language(error, monkeypatch, capsys):
     def play(*_, **__):
         raise error
 
     monkeypatch.setattr("rejeu.play.play", play)
     assert courses.by_hand("Mountain", episodes=3) == []
     assert capsys.readouterr().out == f"{error}\n"
-
-
-def test_a_french_notebook_says_so_in_french(monkeypatch, capsys):
-    def play(*_, **__):
-        raise OSError("cannot open a window")
-
-    monkeypatch.setattr("rejeu.play.play", play)
+    error = OSError("cannot open a window")
     monkeypatch.setenv("REJEU_LANGUAGE", "en")  # restored at the end
     checks.speak("fr")
     assert courses.by_hand("Mountain", episodes=3) == []

@@ -35,21 +35,34 @@ def folder(tmp_path_factory):
 
 
 def run(folder, out, *options):
-    return main(["class", str(folder), "--episodes", "3", "--out", str(out), *options])
+    """Returns the leaderboard that a command writes: the content of a JSON file, else the text."""
+    assert main(["class", str(folder), "--episodes", "3", "--out", str(out), *options]) == 0
+    text = out.read_text(encoding="utf-8")
+    return json.loads(text) if out.suffix == ".json" else text
 
 
 def test_models_are_ranked_and_other_files_get_one_line_each(folder, tmp_path, capsys):
-    assert run(folder, tmp_path / "board.json") == 0
+    board = run(folder, tmp_path / "board.json")
     out = capsys.readouterr().out
     assert len(out.splitlines()) == 8  # the environment, six files, the page
-    board = json.loads((tmp_path / "board.json").read_text(encoding="utf-8"))
     assert board["env_id"] == "CartPole-v1"
-    assert [model["name"] for model in board["models"]] == ["anna", f"second/{HOSTILE}"]
-    assert [model["places"] for model in board["models"]] == [[1, 2], [1, 2]]
+    first, second = board["models"]
+    assert [first["name"], second["name"]] == ["anna", f"second/{HOSTILE}"]
+    assert first["places"] == second["places"] == [1, 2]
     reasons = {one["name"]: one["reason"] for one in board["not_evaluated"]}
     assert reasons.keys() == {"cut", "empty", "flipped", "other"}
     assert reasons["other"] == "it was trained on MountainCar-v0, not on CartPole-v1"
     assert "checksum" in reasons["flipped"]
+    assert first["returns"] == second["returns"]  # of the same episodes
+    assert len(set(first["returns"])) > 1
+    board = run(folder, tmp_path / "board.json", "--minutes", "0.00001", "--json")
+    assert not board["models"]
+    assert "it needs more than" in board["not_evaluated"][0]["reason"]
+    printed = capsys.readouterr()
+    assert json.loads(printed.out) == {**board, "file": str(tmp_path / "board.json")}
+    assert "cut: " in printed.err
+    board = run(folder, tmp_path / "board.json", "--env", "MountainCar-v0")
+    assert [model["name"] for model in board["models"]] == ["other"]
 
 
 def test_the_places_of_a_model_are_those_that_the_intervals_allow():
@@ -82,67 +95,46 @@ def entrants(tmp_path):
     return tmp_path
 
 
-def test_zip_files_are_models_and_a_run_folder_is_one_entrant(entrants, capsys):
-    run(entrants, entrants / "board.json")
-    board = json.loads((entrants / "board.json").read_text(encoding="utf-8"))
+def test_zip_files_are_models_and_a_run_folder_is_one_entrant(entrants):
+    board = run(entrants, entrants / "board.json")
     names = ["anna.safetensors", "anna.zip", "ben", "odd/agent"]
     assert [model["name"] for model in board["models"]] == names
     assert board["equal_files"] == [names]
     (other,) = board["not_evaluated"]
     assert other["name"] == "theirs"
     assert "rejeu import" in other["reason"]
-    run(entrants, entrants / "board.md", "--language", "fr")
-    assert f"- Le même fichier : {', '.join(names)}" in (entrants / "board.md").read_text(encoding="utf-8")
-
-
-def test_a_run_folder_alone_has_its_own_name(entrants):
-    run(entrants / "ben", entrants / "board.json")
-    (model,) = json.loads((entrants / "board.json").read_text(encoding="utf-8"))["models"]
+    assert f"- Le même fichier : {', '.join(names)}" in run(entrants, entrants / "board.md", "--language", "fr")
+    (model,) = run(entrants / "ben", entrants / "board.json")["models"]
     assert model["name"] == "ben"
 
 
-def test_the_language_is_that_of_the_setting(folder, tmp_path, monkeypatch, capsys):
+def test_a_leaderboard_in_french_which_the_setting_asks_for(folder, tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("REJEU_LANGUAGE", "fr")
-    run(folder, tmp_path / "board.md")
+    text = run(folder, tmp_path / "board.md")
     out = capsys.readouterr().out
     assert out.startswith("CartPole-v1, 3 épisodes pour chacun des 6 modèles\nanna : retour moyen ")
     assert "\ncut : le fichier est endommagé" in out
-    assert "- cut : le fichier" in (tmp_path / "board.md").read_text(encoding="utf-8")
+    assert "| place | modèle | algorithme | pas | graine | retour moyen |" in text
+    assert "| 1 à 2 | anna | DQN | 0 | 0 |" in text
+    assert "il a été entraîné sur MountainCar-v0, et non sur CartPole-v1" in text
+    broken = "le fichier est endommagé, ou ce n'est pas un modèle que rejeu peut évaluer"
+    assert [line.split(": ")[1] for line in text.splitlines() if line.startswith(("- cut", "- empty", "- flip"))] == (
+        [broken] * 3
+    )
     monkeypatch.setenv("REJEU_LANGUAGE", "de")
-    assert run(folder, tmp_path / "board.md") == 2
+    assert main(["class", str(folder)]) == 2
     assert "language 'de' must be one of en, fr" in capsys.readouterr().err
-
-
-def test_all_models_play_the_same_episodes(folder, tmp_path):
-    run(folder, tmp_path / "board.json")
-    first, second = json.loads((tmp_path / "board.json").read_text(encoding="utf-8"))["models"]
-    assert first["returns"] == second["returns"]
-    assert len(set(first["returns"])) > 1
 
 
 def test_names_are_escaped_in_the_page_and_in_markdown(folder, tmp_path):
     pytest.importorskip("jinja2")
-    run(folder, tmp_path / "board.html")
-    html = (tmp_path / "board.html").read_text(encoding="utf-8")
+    html = run(folder, tmp_path / "board.html", "--language", "fr")
+    assert '<html lang="fr">' in html
     assert "<script" not in html
     assert "second/&lt;script&gt;" in html
     assert "http" not in html.replace('http-equiv="Content-Security-Policy"', "")
-    run(folder, tmp_path / "board.md")
-    row = next(line for line in (tmp_path / "board.md").read_text(encoding="utf-8").splitlines() if "second" in line)
+    row = next(line for line in run(folder, tmp_path / "board.md").splitlines() if "second" in line)
     assert r"second/&lt;script&gt;alert(1)&lt;\_script&gt; \| \*x\*" in row
-
-
-def test_another_environment_can_be_chosen(folder, tmp_path):
-    run(folder, tmp_path / "board.json", "--env", "MountainCar-v0")
-    board = json.loads((tmp_path / "board.json").read_text(encoding="utf-8"))
-    assert [model["name"] for model in board["models"]] == ["other"]
-
-
-def test_a_model_that_takes_too_long_is_not_ranked(folder, tmp_path):
-    run(folder, tmp_path / "board.json", "--minutes", "0.00001")
-    board = json.loads((tmp_path / "board.json").read_text(encoding="utf-8"))
-    assert not board["models"]
-    assert "it needs more than" in board["not_evaluated"][0]["reason"]
 
 
 def test_a_model_whose_returns_are_not_finite_is_not_ranked(tmp_path):
@@ -150,8 +142,7 @@ def test_a_model_whose_returns_are_not_finite_is_not_ranked(tmp_path):
     agent.save(tmp_path / "good")
     agent.run.state = [leaf * 0 + 3e38 if leaf.dtype == "float32" else leaf for leaf in agent.run.state]
     agent.save(tmp_path / "huge")
-    run(tmp_path, tmp_path / "board.json")
-    board = json.loads((tmp_path / "board.json").read_text(encoding="utf-8"))
+    board = run(tmp_path, tmp_path / "board.json")
     assert [model["name"] for model in board["models"]] == ["good"]
     assert [one["name"] for one in board["not_evaluated"]] == ["huge"]
 
@@ -160,24 +151,8 @@ def test_success_is_not_what_the_author_of_a_file_calls_so(tmp_path):
     agent = rejeu.DQN("MlpPolicy", "CartPole-v1", policy_kwargs={"net_arch": [8]}, seed=0, success_threshold=-1e9)
     agent.save(tmp_path / "proud")
     for options, rate in (((), 0.0), (("--success-threshold", "1"), 1.0)):
-        run(tmp_path, tmp_path / "board.json", *options)
-        (model,) = json.loads((tmp_path / "board.json").read_text(encoding="utf-8"))["models"]
+        (model,) = run(tmp_path, tmp_path / "board.json", *options)["models"]
         assert (model["success_rate"], model["seed"], model["steps"]) == (rate, 0, 0)
-
-
-def test_a_leaderboard_in_french(folder, tmp_path):
-    run(folder, tmp_path / "board.md", "--language", "fr")
-    text = (tmp_path / "board.md").read_text(encoding="utf-8")
-    assert "| place | modèle | algorithme | pas | graine | retour moyen |" in text
-    assert "| 1 à 2 | anna | DQN | 0 | 0 |" in text
-    assert "il a été entraîné sur MountainCar-v0, et non sur CartPole-v1" in text
-    broken = "le fichier est endommagé, ou ce n'est pas un modèle que rejeu peut évaluer"
-    assert [line.split(": ")[1] for line in text.splitlines() if line.startswith(("- cut", "- empty", "- flip"))] == (
-        [broken] * 3
-    )
-    pytest.importorskip("jinja2")
-    run(folder, tmp_path / "board.html", "--language", "fr")
-    assert '<html lang="fr">' in (tmp_path / "board.html").read_text(encoding="utf-8")
 
 
 def test_a_page_without_models_says_so(folder):
@@ -218,13 +193,12 @@ def test_large_files_and_symbolic_links_are_not_opened(tmp_path, monkeypatch, ca
     except OSError:
         pytest.skip("no symbolic links here")
     monkeypatch.setattr(leaderboard, "MAX_BYTES", small.stat().st_size)
-    assert run(tmp_path, tmp_path / "board.json") == 0
-    board = json.loads((tmp_path / "board.json").read_text(encoding="utf-8"))
+    board = run(tmp_path, tmp_path / "board.json")
     assert [model["name"] for model in board["models"]] == ["small"]
     assert [one["name"] for one in board["not_evaluated"]] == ["large"]
     assert "MiB at most" in board["not_evaluated"][0]["reason"]
-    run(tmp_path, tmp_path / "board.md", "--language", "fr")
-    assert "- large : le fichier a 0 Mio, au lieu de 0 Mio au plus" in (tmp_path / "board.md").read_text("utf-8")
+    french = run(tmp_path, tmp_path / "board.md", "--language", "fr")
+    assert "- large : le fichier a 0 Mio, au lieu de 0 Mio au plus" in french
 
 
 def test_a_model_whose_spaces_are_not_those_of_its_environment_is_not_ranked(tmp_path):
@@ -232,14 +206,5 @@ def test_a_model_whose_spaces_are_not_those_of_its_environment_is_not_ranked(tmp
     agent.run.env.env_id = "CartPole-v1"
     agent.save(tmp_path / "other")
     for language, reason in (("en", "(6,)"), ("fr", "ses observations ou ses actions ne sont pas celles de CartPole")):
-        run(tmp_path, tmp_path / "board.json", "--language", language)
-        (problem,) = json.loads((tmp_path / "board.json").read_text(encoding="utf-8"))["not_evaluated"]
+        (problem,) = run(tmp_path, tmp_path / "board.json", "--language", language)["not_evaluated"]
         assert reason in problem["reason"]
-
-
-def test_json_is_all_of_standard_output(folder, tmp_path, capsys):
-    assert run(folder, tmp_path / "board.md", "--json") == 0
-    printed = capsys.readouterr()
-    board = json.loads(printed.out)
-    assert board.keys() == {"env_id", "episodes", "models", "not_evaluated", "equal_files", "file"}
-    assert "cut: " in printed.err

@@ -194,36 +194,25 @@ def test_jobs_that_another_process_holds_are_left_to_it(tmp_path):
     assert held.state() == "waiting"
 
 
-def test_a_run_that_cannot_be_started_is_one_line(tmp_path):
+@pytest.mark.parametrize("where", ["start", "claimed"])
+def test_a_run_that_cannot_be_started_is_one_line_and_stops_no_other(tmp_path, monkeypatch, where):
     folder, launcher = make_folder(tmp_path, 2), Launcher()
-    start = launcher.start
 
-    def fail_once(task, log, lock):
-        launcher.start = start
-        raise OSError(28, "No space left on device")
+    def full(*given):
+        if "job-0" in str(getattr(given[0], "name", given[0])):
+            raise OSError(28, "No space left on device")
+        return real(*given)
 
-    launcher.start = fail_once
-    states, lines = work(folder, launcher)
+    owner = launcher if where == "start" else scheduler
+    real = getattr(owner, where)
+    with monkeypatch.context() as patch:
+        patch.setattr(owner, where, full)
+        states, lines = work(folder, launcher)
     assert states == {"job-0": "waiting", "job-1": "done"}  # left to a later process
     assert lines[0] == "job-0 could not be started: [Errno 28] No space left on device"
     assert folder.works()[0].exit_status() is None
     states, _ = work(folder, launcher)
     assert states == {"job-0": "done", "job-1": "done"}
-
-
-def test_a_job_that_cannot_be_claimed_is_one_line_and_stops_no_other(tmp_path, monkeypatch):
-    folder = make_folder(tmp_path, 2)
-    claimed = scheduler.claimed
-
-    def fail(task):
-        if task.name == "job-0":
-            raise OSError(28, "No space left on device")
-        return claimed(task)
-
-    monkeypatch.setattr(scheduler, "claimed", fail)
-    states, lines = work(folder, Launcher())
-    assert states == {"job-0": "waiting", "job-1": "done"}
-    assert "No space left" in lines[0]
 
 
 def test_a_full_disk_at_the_end_of_a_run_is_one_line(tmp_path, monkeypatch):
@@ -234,13 +223,15 @@ def test_a_full_disk_at_the_end_of_a_run_is_one_line(tmp_path, monkeypatch):
 
     monkeypatch.setattr(JobWork, "write_exit", full)
     states, lines = work(folder, Launcher())
-    assert "No space left" in lines[-1]
+    assert "job-0 ended with exit status 0, but [Errno 28] No space left" in lines[-1]
     assert states == {"job-0": "stopped"}  # the next process finds its last checkpoint
 
 
 def test_a_folder_is_joined_only_with_the_same_plan(tmp_path):
     folder = make_folder(tmp_path)
     assert make_folder(tmp_path).sweep == folder.sweep
+    joined = open_folder(folder.path, Sweep(jobs=folder.jobs, threads=7), None, NOTHING)
+    assert joined.sweep.threads == 1  # fixed when it began
     other = Sweep(jobs=make_jobs(4, hyperparameters={"gamma": 0.9}), threads=1)
     with pytest.raises(ValueError, match="is the sweep of another plan: job-0 differs"):
         open_folder(folder.path, other, None, NOTHING)
@@ -248,12 +239,6 @@ def test_a_folder_is_joined_only_with_the_same_plan(tmp_path):
     (tmp_path / "other" / "file").touch()
     with pytest.raises(FileExistsError, match="something else"):
         open_folder(tmp_path / "other", folder.sweep, None, NOTHING)
-
-
-def test_the_threads_of_a_sweep_are_fixed_when_it_begins(tmp_path):
-    folder = make_folder(tmp_path)
-    joined = open_folder(folder.path, Sweep(jobs=folder.jobs, threads=7), None, NOTHING)
-    assert joined.sweep.threads == 1
 
 
 @pytest.mark.parametrize(

@@ -3,10 +3,12 @@
 import dataclasses
 import json
 import math
+import shutil
 import time
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from rejeu import presets
@@ -23,11 +25,13 @@ optuna = pytest.importorskip("optuna")
 RATE = {"learning_rate": LogUniform(1e-5, 4e-3)}
 
 
-@pytest.fixture(autouse=True)
-def pretend(monkeypatch):
+@pytest.fixture(autouse=True, scope="module")
+def pretend():
     """Lets trainings pretend, in this process."""
-    monkeypatch.setattr(process.LocalLauncher, "start", lambda self, task, log, lock: Pretended(task, log, lock))
-    monkeypatch.setattr("rejeu.experiments.scheduler.POLL", 0)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(process.LocalLauncher, "start", lambda self, task, log, lock: Pretended(task, log, lock))
+        patch.setattr("rejeu.experiments.scheduler.POLL", 0)
+        yield
 
 
 def make_plan(**changes):
@@ -51,6 +55,19 @@ def facts(result):
     return [(one.index, one.state, one.value, one.values, one.evaluations) for one in result.trials]
 
 
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """The result of a study of four trials."""
+    return run(tuning.open_study(make_plan(final_seeds=0), tmp_path_factory.mktemp("whole") / "study"))
+
+
+@pytest.fixture
+def journal(whole, tmp_path):
+    """The journal in a copy of its folder."""
+    shutil.copytree(whole.folder, tmp_path / "study")
+    return tmp_path / "study" / "journal.log"
+
+
 def commands(folder):
     return [line.split() for path in folder.rglob("commands.txt") for line in path.read_text().splitlines()]
 
@@ -69,35 +86,32 @@ def test_a_study_finds_the_best_trial_and_writes_it_as_a_preset(tmp_path):
     assert result.final.verdict == "the default itself"
 
 
-def test_a_study_with_one_worker_is_reproducible_and_another_seed_differs(tmp_path):
-    one, two, other = (
-        run(tuning.open_study(make_plan(seed=seed, final_seeds=0), tmp_path / name))
-        for name, seed in (("one", 0), ("two", 0), ("other", 1))
+def test_a_study_with_one_worker_is_reproducible_and_another_seed_differs(whole, tmp_path):
+    one, other = (
+        run(tuning.open_study(make_plan(seed=seed, trials=trials, final_seeds=0), tmp_path / f"seed {seed}"))
+        for seed, trials in ((0, 4), (1, 2))
     )
-    assert facts(one) == facts(two)
+    assert facts(one) == facts(whole)
     assert facts(one)[1] != facts(other)[1]
 
 
-def test_an_interrupted_study_continues_as_if_it_had_not_been_interrupted(tmp_path):
-    plan = make_plan(trials=3, steps=200, final_seeds=0)
-    undisturbed = run(tuning.open_study(plan, tmp_path / "undisturbed"))
+def test_an_interrupted_study_continues_as_if_it_had_not_been_interrupted(whole, tmp_path):
     stop = Interrupt()
 
     def interrupt(outcomes):
         if outcomes[-1].index == 2 and outcomes[-1].evaluations:
             stop.signal = 2
 
-    first = run(tuning.open_study(plan, tmp_path / "study"), stop=stop, watch=interrupt)
+    first = run(tuning.open_study(make_plan(final_seeds=0), tmp_path / "study"), stop=stop, watch=interrupt)
     assert (first.complete, first.signal) == (False, 2)
     assert [one.state for one in first.trials] == ["complete", "complete", "running"]
     second = run(studies.join(StudyFolder(tmp_path / "study")))
-    assert facts(second) == facts(undisturbed)
+    assert facts(second) == facts(whole)
     begun = commands(tmp_path / "study")
-    assert sorted(word for word, _ in begun) == ["resume", "train", "train", "train"]
+    assert sorted(word for word, _ in begun) == ["resume", "train", "train", "train", "train"]
 
 
-def test_a_trial_whose_process_was_killed_is_entered_again_with_its_parameters(tmp_path):
-    undisturbed = run(tuning.open_study(make_plan(final_seeds=0), tmp_path / "undisturbed"))
+def test_a_trial_whose_process_was_killed_is_entered_again_with_its_parameters(whole, tmp_path):
     killed = tuning.open_study(make_plan(final_seeds=0), tmp_path / "study")
     killed.take()
     killed.take()
@@ -109,21 +123,23 @@ def test_a_trial_whose_process_was_killed_is_entered_again_with_its_parameters(t
     assert third.take()[1] == 1  # the first one is held
     other.release(0)
     third.release(1)
-    result = run(studies.join(StudyFolder(tmp_path / "study")))
-    assert facts(result) == facts(undisturbed)
+    assert facts(run(studies.join(StudyFolder(tmp_path / "study")))) == facts(whole)
 
 
-def optuna_study(folder):
-    """The study as Optuna's dashboard opens it."""
-    storage = optuna.storages.JournalStorage(optuna.storages.journal.JournalFileBackend(str(folder / "journal.log")))
-    return optuna.load_study(study_name=None, storage=storage)
-
-
-def test_optuna_opens_the_journal(tmp_path):
+def test_a_killed_training_continues_and_the_study_is_the_same(whole, tmp_path, monkeypatch):
+    monkeypatch.setenv("KILLED_AT", "20")  # each training, once
     result = run(tuning.open_study(make_plan(final_seeds=0), tmp_path / "study"))
-    study = optuna_study(tmp_path / "study")
-    assert study.best_trial.params == result.best.values
-    assert [trial.value for trial in study.trials] == [one.value for one in result.trials]
+    assert facts(result) == facts(whole)
+    assert [word for word, _ in commands(tmp_path / "study")].count("resume") == 4
+
+
+def test_optuna_opens_the_journal(whole):
+    """As its dashboard does."""
+    path = str(whole.folder / "journal.log")
+    storage = optuna.storages.JournalStorage(optuna.storages.journal.JournalFileBackend(path))
+    study = optuna.load_study(study_name=None, storage=storage)
+    assert study.best_trial.params == whole.best.values
+    assert [trial.value for trial in study.trials] == [one.value for one in whole.trials]
     assert set(study.trials[0].intermediate_values) == {10, 20, 30, 40}
 
 
@@ -183,8 +199,9 @@ def test_other_pruners(tmp_path, pruner):
 def test_the_winner_is_compared_with_the_default_on_fresh_seeds(tmp_path, monkeypatch):
     default = presets.Preset(**{**vars(presets.find("Pendulum-v1")), "hyperparameters": {"learning_rate": 1e-5}})
     study = tuning.open_study(make_plan(preset=default, final_seeds=5, seed=3), tmp_path / "study")
-    result = run(study)
-    assert result.final.verdict == "better"
+    monkeypatch.setenv("KILLED_AT", "20")  # which changes nothing
+    result = run(study, workers=3)
+    assert (result.final.verdict, result.final.failed) == ("better", ())
     assert result.final.difference[1] > 0
     assert "on fresh seeds the winner is better than the default by" in str(result.final)
     assert [group.label for group in result.final.comparison.groups] == [
@@ -199,8 +216,6 @@ def test_the_winner_is_compared_with_the_default_on_fresh_seeds(tmp_path, monkey
 
 
 def test_difference_says_whether_zero_is_in_the_interval():
-    import numpy as np
-
     rng = np.random.default_rng(0)
     good, bad = rng.normal(10, 1, 20), rng.normal(0, 1, 20)
     value, low, high = search.difference([good], [bad], 0)
@@ -280,13 +295,16 @@ def test_runs_at_once_share_the_cores(monkeypatch):
         assert [environ[name] for name in (*process.THREADS, process.hardware.CORES)] == [expected] * 4
 
 
-def test_more_trials_continue_a_study_and_another_plan_is_refused(tmp_path):
-    run(tuning.open_study(make_plan(trials=2, final_seeds=0), tmp_path / "study"))
-    result = run(tuning.open_study(make_plan(trials=3, final_seeds=0), tmp_path / "study"))
-    assert len(result.trials) == 3
-    with pytest.raises(
-        ValueError, match=r"is another study: steps is 40 there, not 80; name another folder with --out"
-    ):
+def test_more_trials_continue_a_study_and_another_plan_is_refused(journal, tmp_path):
+    before = journal.read_bytes()
+    journal.write_bytes(before + b'{"op_code":6,"wor')  # half a line of a killed process, which is cut
+    (tmp_path / "study" / "journal.log.lock").touch()  # as Optuna's own lock leaves it, for which nobody waits
+    began = time.monotonic()
+    result = run(tuning.open_study(make_plan(trials=5, final_seeds=0), tmp_path / "study"))
+    assert time.monotonic() - began < 10
+    assert len(result.trials) == 5
+    assert journal.read_bytes().startswith(before)
+    with pytest.raises(ValueError, match=r"another study: steps is 40 there, not 80; .* --out"):
         tuning.open_study(make_plan(steps=80), tmp_path / "study")
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "notes.txt").write_text("mine")
@@ -294,52 +312,26 @@ def test_more_trials_continue_a_study_and_another_plan_is_refused(tmp_path):
         tuning.open_study(make_plan(), tmp_path / "mine")
 
 
-def test_half_a_line_at_the_end_of_the_journal_is_cut(tmp_path):
-    run(tuning.open_study(make_plan(trials=2, final_seeds=0), tmp_path / "study"))
-    journal = tmp_path / "study" / "journal.log"
-    before = journal.read_bytes()
-    journal.write_bytes(before + b'{"op_code":6,"wor')
-    result = run(tuning.open_study(make_plan(trials=3, final_seeds=0), tmp_path / "study"))
-    assert len(result.trials) == 3
-    assert journal.read_bytes().startswith(before)
-
-
-def test_the_lock_of_a_killed_process_delays_nothing(tmp_path):
-    run(tuning.open_study(make_plan(trials=1, final_seeds=0), tmp_path / "study"))
-    (tmp_path / "study" / "journal.log.lock").touch()  # as Optuna's own lock leaves it
-    began = time.monotonic()
-    studies.join(StudyFolder(tmp_path / "study")).outcomes()
-    assert time.monotonic() - began < 10
-
-
 @pytest.mark.parametrize("place", [0.3, 0.6])
-def test_a_damaged_journal_is_one_line_and_is_not_changed(tmp_path, place):
-    run(tuning.open_study(make_plan(trials=2, final_seeds=0), tmp_path / "study"))
-    journal = tmp_path / "study" / "journal.log"
+def test_a_damaged_journal_is_one_line_and_is_not_changed(journal, place):
     content = bytearray(journal.read_bytes())
     at = int(len(content) * place)
     content[at : at + 40] = b"\xff" * 40
     journal.write_bytes(content)
     with pytest.raises(CheckpointError, match=r"journal\.log is damaged: .*; restore it from a copy"):
-        run(studies.join(StudyFolder(tmp_path / "study")))
+        run(studies.join(StudyFolder(journal.parent)))
     assert journal.read_bytes() == content
 
 
-def test_a_journal_nested_too_deeply_is_one_line(tmp_path):
-    tuning.open_study(make_plan(), tmp_path / "study")
-    with (tmp_path / "study" / "journal.log").open("ab") as file:
+def test_a_journal_that_is_nested_too_deeply_or_a_link_is_refused(journal, tmp_path):
+    with journal.open("ab") as file:
         file.write(b"[" * 100_000 + b"]" * 100_000 + b"\n")
     with pytest.raises(CheckpointError, match=r"journal\.log is damaged"):
-        studies.join(StudyFolder(tmp_path / "study"))
-
-
-def test_a_journal_that_is_a_link_is_refused(tmp_path):
-    tuning.open_study(make_plan(), tmp_path / "study")
-    journal = tmp_path / "study" / "journal.log"
+        studies.join(StudyFolder(journal.parent))
     journal.unlink()
     journal.symlink_to(tmp_path / "mine")
     with pytest.raises(CheckpointError, match="is a link and no file"):
-        studies.join(StudyFolder(tmp_path / "study"))
+        studies.join(StudyFolder(journal.parent))
     assert not (tmp_path / "mine").exists()
 
 
@@ -364,23 +356,6 @@ def test_processes_are_ended_if_the_search_ends_by_an_error(tmp_path):
         search.run(fail)
     assert begun
     assert [one.poll() for one in begun] == [143]
-
-
-def test_a_killed_training_continues_and_the_study_is_the_same(tmp_path, monkeypatch):
-    plan = make_plan(trials=2, steps=200, final_seeds=0)
-    undisturbed = run(tuning.open_study(plan, tmp_path / "undisturbed"))
-    monkeypatch.setenv("KILLED_AT", "60")  # each training, once
-    result = run(tuning.open_study(plan, tmp_path / "study"))
-    assert facts(result) == facts(undisturbed)
-    assert [word for word, _ in commands(tmp_path / "study")].count("resume") == 2
-
-
-def test_a_killed_training_of_the_final_comparison_continues(tmp_path, monkeypatch):
-    default = presets.Preset(**{**vars(presets.find("Pendulum-v1")), "hyperparameters": {"learning_rate": 1e-5}})
-    monkeypatch.setenv("KILLED_AT", "20")
-    result = run(tuning.open_study(make_plan(preset=default, seed=3), tmp_path / "study"), workers=3)
-    assert result.final.failed == ()
-    assert result.final.verdict == "better"
 
 
 def test_a_study_with_fewer_final_seeds_than_are_compared_today_gets_more(tmp_path):

@@ -48,7 +48,7 @@ def rewrite(source, target, change):
 # Round trips.
 
 
-def test_a_loaded_agent_predicts_the_same_bits_with_the_settings_and_counters_of_the_saved_one(trained):
+def test_a_loaded_agent_predicts_the_same_bits_with_the_settings_and_counters_of_the_saved_one(trained, tmp_path):
     agent, path = trained
     loaded = rejeu.load(path)
     assert isinstance(loaded, rejeu.SAC)
@@ -60,19 +60,20 @@ def test_a_loaded_agent_predicts_the_same_bits_with_the_settings_and_counters_of
     of = lambda a: (a.n_updates, a.seed, a.policy, a.num_timesteps)  # noqa: E731
     assert of(loaded) == of(agent) == (12, 0, "MlpPolicy", 20)
     assert loaded.env is None
+    again = rejeu.SAC.load(path, env=Counter((5,))).save(tmp_path / "again")
+    assert again.read_bytes() == path.read_bytes()
 
 
-def test_saving_a_loaded_agent_gives_the_same_file(trained, tmp_path):
-    again = rejeu.SAC.load(trained[1], env=Counter((5,))).save(tmp_path / "again")
-    assert again.read_bytes() == trained[1].read_bytes()
-
-
-def test_a_suffix_is_added_only_where_there_is_none(trained, tmp_path):
+def test_a_suffix_is_added_where_there_is_none_and_that_of_stable_baselines3_stands_for_ours(trained, tmp_path):
     agent, _ = trained
-    assert agent.save(tmp_path / "model") == tmp_path / "model.safetensors"
-    assert agent.save(tmp_path / "model.zip") == tmp_path / "model.zip"
+    assert agent.save(tmp_path / "other.zip") == tmp_path / "other.zip"
     assert agent.save(tmp_path / "new" / "folder" / "model").is_file()
-    assert rejeu.SAC.load(tmp_path / "model").n_updates == rejeu.SAC.load(str(tmp_path / "model.zip")).n_updates == 12
+    path = agent.save(tmp_path / "model")
+    assert path == tmp_path / "model.safetensors"
+    for name in ("model", "model.zip", "other.zip"):
+        assert_same_parameters(rejeu.SAC.load(str(tmp_path / name)), agent)
+    with pytest.raises(FileNotFoundError, match=r"third\.zip"):
+        rejeu.SAC.load(tmp_path / "third.zip")
 
 
 def test_settings_may_be_changed_when_loading(trained):
@@ -81,17 +82,12 @@ def test_settings_may_be_changed_when_loading(trained):
     assert loaded.config.tau == trained[0].config.tau
 
 
-@pytest.mark.parametrize(
-    ("space", "name"),
-    [
-        (gym.spaces.Dict({"b": gym.spaces.Discrete(3, start=-1), "a": gym.spaces.Box(-np.inf, np.inf, (2,))}), "Dict"),
-        (gym.spaces.Tuple([gym.spaces.MultiBinary(3), gym.spaces.MultiDiscrete([2, 3])]), "Tuple"),
-    ],
-)
-def test_agents_of_nested_observations_survive(space, name, tmp_path):
-    env = Sampled(space)
+def test_agents_of_nested_observations_survive(tmp_path):
+    inner = gym.spaces.Tuple([gym.spaces.MultiBinary(3), gym.spaces.MultiDiscrete([2, 3])])
+    box = gym.spaces.Box(-np.inf, np.inf, (2,))
+    env = Sampled(gym.spaces.Dict({"c": inner, "b": gym.spaces.Discrete(3, start=-1), "a": box}))
     agent = small_sac(env)
-    loaded = rejeu.SAC.load(agent.save(tmp_path / name))
+    loaded = rejeu.SAC.load(agent.save(tmp_path / "nested"))
     obs = env.reset(seed=3)[0]
     np.testing.assert_array_equal(loaded.predict(obs, deterministic=True)[0], agent.predict(obs, deterministic=True)[0])
 
@@ -116,9 +112,8 @@ def test_a_hindsight_buffer_survives_with_its_episodes(tmp_path):
     np.testing.assert_array_equal(one.reward, two.reward)
 
 
+@pytest.mark.skipif(os.name != "posix", reason="permissions of this kind are POSIX's")
 def test_a_file_may_be_read_by_whoever_may_read_new_files(trained):
-    if os.name != "posix":
-        pytest.skip("permissions of this kind are POSIX's")
     plain = trained[1].with_name("plain")
     plain.touch()
     assert stat.S_IMODE(trained[1].stat().st_mode) == stat.S_IMODE(plain.stat().st_mode)
@@ -172,13 +167,10 @@ def test_arrays_in_another_order_of_bytes_and_memory_come_back_as_numbers(tmp_pa
     ("change", "words"),
     [
         (lambda h, a: h.update(schema=99), "has schema 99 and this rejeu reads schema 2; upgrade rejeu"),
-        (lambda h, a: h.update(schema=0), "has schema 0"),
         (lambda h, a: h.update(schema="1"), "header is damaged"),
         (lambda h, a: h.update(kind="replay"), "holds 'replay', expected 'agent'"),
         (lambda h, a: h.update(algorithm="TD3"), "holds a TD3 agent, not SAC; use rejeu.load"),
-        (lambda h, a: h.update(algorithm=None), "holds a None agent, not SAC"),
         (lambda h, a: h.pop("config"), "header is damaged or of another version"),
-        (lambda h, a: h.update(config=[1]), "header is damaged or of another version"),
         (lambda h, a: h["config"].update(gamma=7), "gamma=7 must be"),
         (lambda h, a: h["config"].update(speed=7), "no setting 'speed'"),
         (lambda h, a: h.update(observation_space={"os.system": "true"}), "not the description of a space"),
@@ -186,7 +178,6 @@ def test_arrays_in_another_order_of_bytes_and_memory_come_back_as_numbers(tmp_pa
         (lambda h, a: h.update(counters={}), "header is damaged"),
         (lambda h, a: h["counters"].update(step=-1), "step=-1"),
         (lambda h, a: h.update(rng={"state": "x", "inc": 1}), "header is damaged"),
-        (lambda h, a: h.update(seed=-1), "seed=-1"),
         (lambda h, a: h.update(policy="__import__"), "policy='__import__' must be one of"),
         (lambda h, a: h["config"]["policy_kwargs"].update(net_arch=[9]), "it was saved with other networks"),
         (lambda h, a: a["actor.head.bias"].fill(np.nan), "actor.head.bias holds numbers that are not finite"),
@@ -194,7 +185,6 @@ def test_arrays_in_another_order_of_bytes_and_memory_come_back_as_numbers(tmp_pa
         (lambda h, a: a.update(extra=np.zeros(2)), "has extra, which this agent does not have"),
         (lambda h, a: a.update(log_alpha=np.zeros(2, np.float32)), r"log_alpha is float32\[2\], expected float32\[\]"),
         (lambda h, a: a.update(log_alpha=np.zeros((), np.float64)), r"log_alpha is float64\[\], expected float32\[\]"),
-        (lambda h, a: a.update(log_alpha=np.zeros((), np.float16)), r"log_alpha is float16\[\], expected float32\[\]"),
     ],
 )
 def test_a_file_that_does_not_fit_says_what_differs(trained, tmp_path, change, words):
@@ -210,7 +200,6 @@ def test_a_file_that_does_not_fit_says_what_differs(trained, tmp_path, change, w
     [
         (lambda h, a: h["counters"].update(step=10**30), "step"),
         (lambda h, a: h["rng"].update(state=2**128), "other.safetensors"),
-        (lambda h, a: h["rng"].update(inc=-1), "other.safetensors"),
         (lambda h, a: h["config"].update(buffer_size=10**18), "buffer_size"),
         (lambda h, a: h["config"]["policy_kwargs"].update(net_arch=[10**9, 10**9]), "other networks|memory"),
     ],
@@ -250,14 +239,10 @@ def test_a_replay_buffer_of_another_environment_is_refused_and_nothing_changes(b
     ("metadata", "words"),
     [
         (None, "not one that rejeu wrote: its header is missing"),
-        ({"format": "pt"}, "not one that rejeu wrote"),
-        ({"rejeu": "{"}, "header is damaged"),
         ({"rejeu": "[]"}, "header is damaged"),
-        ({"rejeu": "{}"}, "header is damaged"),
         ({"rejeu": '{"schema": NaN}'}, "header is damaged"),
         ({"rejeu": "[" * 100_000}, "header is damaged"),
         ({"rejeu": '{"schema": 1}'}, "has schema 1 and this rejeu reads schema 2; it is from an unreleased version"),
-        ({"rejeu": '{"schema": 2}'}, "header is damaged"),
         ({"rejeu": '{"schema": 2}', "crc32": "00000000"}, "header is damaged"),
     ],
 )
@@ -283,9 +268,7 @@ def fails_with(number):
     [
         (errno.ENOSPC, OSError, "model.safetensors could not be written: No space left on device; free some space"),
         (errno.EACCES, PermissionError, "Permission denied; give a path that you may write to"),
-        (errno.EROFS, OSError, "Read-only file system; give a path on a disk that can be written"),
         (errno.ENOENT, FileNotFoundError, "its folder was removed while the file was written"),
-        (errno.EIO, OSError, "give a path on another disk"),
         (errno.EFBIG, OSError, "File too large; raise the limit on the size of files"),
         (None, KeyboardInterrupt, "^$"),
     ],
@@ -362,7 +345,6 @@ def test_a_path_that_is_a_folder_or_no_file_is_refused(trained, tmp_path):
         ({}, {"checksums": {}}, ValueError, "may not have a 'checksums' of its own"),
         ({}, {"x": "x" * 5 * 2**20}, ValueError, "use arrays for many numbers"),
         ({"a": np.zeros(2, np.complex64)}, {}, TypeError, "a has the dtype complex64; expected one of float32"),
-        ({"a": np.array(["text"])}, {}, TypeError, "a has the dtype"),
         ({"a": np.array([object()])}, {}, TypeError, "a has the dtype object"),
         ({"__metadata__": np.zeros(2)}, {}, ValueError, "no array may be called __metadata__"),
         ({"\ud800": np.zeros(2)}, {}, ValueError, "surrogates|utf-8"),
@@ -375,13 +357,3 @@ def test_what_could_not_be_read_again_is_not_written(tmp_path, arrays, header, e
         checkpoint.write(path, "rows", arrays, header)
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["a.safetensors"]
-
-
-def test_a_file_of_stable_baselines3_s_suffix_is_looked_for_under_ours(trained, tmp_path):
-    agent, _ = trained
-    path = agent.save(tmp_path / "model")
-    assert_same_parameters(rejeu.SAC.load(tmp_path / "model.zip"), agent)
-    path.rename(tmp_path / "model.zip")
-    assert_same_parameters(rejeu.SAC.load(tmp_path / "model.zip"), agent)
-    with pytest.raises(FileNotFoundError, match=r"other\.zip"):
-        rejeu.SAC.load(tmp_path / "other.zip")

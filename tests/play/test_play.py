@@ -103,100 +103,52 @@ def test_the_brake_slows_the_car_down():
     assert speeds[0] < 0.8 * speeds[1]
 
 
-def test_a_game_begins_with_the_first_key_that_means_something():
+LOST = "lose the keyboard"
+STEPS = "rejeu-play-test/Steps-v0"
+HELD = {
+    "a game begins with the first key that means something": (LEVER, ["tap x", 2, [], "down d", 1, [2]]),
+    "keys act from the moment they go down until they go up, and a cancels d": (
+        LEVER,
+        ["down d", 2, "down a", 1, "up d", 1, "up a", 1, [2, 2, 1, 0, 1]],
+    ),
+    "a tap shorter than a step counts for one": (LEVER, ["tap d", 3, [2, 1, 1]]),
+    "keys are let go when another window takes the keyboard": (LEVER, ["down d", 1, LOST, 1, [2, 1]]),
+    "actions that have none for nothing wait for a key": (STEPS, ["tap w", 3, [3], "tap 1", 2, [3, 1]]),
+    "p pauses the game and lets it go on": (LEVER, ["down d", 2, "tap p", 3, [2, 2], "tap p", 2, [2] * 4]),
+    "space pauses too": (LEVER, ["down d", 2, "tap space", 3, [2, 2], "tap space", 2, [2] * 4]),
+}
+"""What is pressed, for how many turns, and the actions until then."""
+
+
+@pytest.mark.parametrize("case", HELD)
+def test_keys_are_held_tapped_and_let_go(case):
+    env_id, script_of_case = HELD[case]
+
     def script(window, game):
-        tap("x")
-        yield
-        yield
-        assert (game.phase, lever(game).actions) == ("ready", [])
-        down("d")
-        yield
-        assert (game.phase, lever(game).actions) == ("running", [2])
+        for one in script_of_case:
+            if isinstance(one, int):
+                for _ in range(one):
+                    yield
+            elif isinstance(one, list):
+                assert lever(game).actions == one
+            elif one == LOST:
+                pygame.event.post(pygame.event.Event(pygame.WINDOWFOCUSLOST))
+            else:
+                {"down": down, "up": up, "tap": tap}[one.partition(" ")[0]](one.partition(" ")[2])
 
-    perform(script, play, LEVER)
+    perform(script, play, env_id)
 
 
-def test_keys_act_from_the_moment_they_go_down_until_they_go_up():
+def test_own_keys_are_given_on_the_command_line_and_a_space_bar_that_is_bound_does_not_pause():
     def script(window, game):
-        down("d")
-        yield
-        yield
-        down("a")  # cancels d
-        yield
-        up("d")
-        yield
-        up("a")
-        yield
-        assert lever(game).actions == [2, 2, 1, 0, 1]
-
-    perform(script, play, LEVER)
-
-
-def test_a_tap_shorter_than_a_step_counts_for_one():
-    def script(window, game):
-        tap("d")
-        yield
-        yield
-        yield
-        assert lever(game).actions == [2, 1, 1]
-
-    perform(script, play, LEVER)
-
-
-def test_keys_are_let_go_when_another_window_takes_the_keyboard():
-    def script(window, game):
-        down("d")
-        yield
-        pygame.event.post(pygame.event.Event(pygame.WINDOWFOCUSLOST))
-        yield
-        assert lever(game).actions == [2, 1]
-
-    perform(script, play, LEVER)
-
-
-def test_actions_that_have_none_for_nothing_wait_for_a_key():
-    def script(window, game):
-        tap("w")
-        yield
-        yield
-        yield
-        assert lever(game).actions == [3]
-        tap("1")
-        yield
-        yield
-        assert lever(game).actions == [3, 1]
-
-    perform(script, play, "rejeu-play-test/Steps-v0")
-
-
-@pytest.mark.parametrize("key", ["p", "space"])
-def test_pause_stops_the_game_and_lets_it_go_on(key):
-    def script(window, game):
-        down("d")
-        yield
-        yield
-        tap(key)
-        yield
-        yield
-        yield
-        assert game.paused
-        assert len(lever(game).actions) == 2
-        tap(key)
-        yield
-        yield
-        assert len(lever(game).actions) == 4
-
-    perform(script, play, LEVER)
-
-
-def test_a_space_bar_that_is_bound_does_not_pause():
-    def script(window, game):
+        tap("j")
         down("space")
         yield
+        yield
         assert not game.paused
-        assert lever(game).actions == [2]
+        assert lever(game).actions == [2, 0]
 
-    perform(script, play, LEVER, keys={"space": 2})
+    assert perform(script, main, ["play", LEVER, "--keys", "j=2", "space=0", "none=1"]) == 0
 
 
 def test_restart_begins_the_same_start_anew_and_the_episode_does_not_count():
@@ -268,15 +220,6 @@ def test_episodes_close_the_game_and_the_scores_are_printed(capsys):
     assert capsys.readouterr().out.endswith("you: 2 episodes, mean 10.00, best 10.00\n")
 
 
-def test_own_keys_are_given_on_the_command_line():
-    def script(window, game):
-        tap("j")
-        yield
-        assert lever(game).actions == [2]
-
-    assert perform(script, main, ["play", LEVER, "--keys", "j=2", "none=1"]) == 0
-
-
 def test_the_rate_is_the_environments_own_or_what_is_asked_for(monkeypatch):
     rates = []
 
@@ -345,28 +288,16 @@ def test_messages_are_written_beside_the_picture():
     perform(script, play, LEVER)
 
 
-def test_a_lost_episode_is_called_failed():
-    def script(window, game):
-        down("a")
-        for _ in range(6):
-            yield
-        assert message(game, game.players[0]) == "failed: 0"
-
-    perform(script, play, LEVER)
-
-
-def test_scores_are_summed_up_once_there_is_one():
-    player = Player("you", None, None)
+def test_a_lost_episode_is_called_failed_and_scores_are_summed_up_once_there_is_one(monkeypatch):
+    player = Player("you", None, None, steps=5, over=True, success=0.0)
+    assert message(Game([player], 0), player) == "failed: 0"
     assert score_summary(player, by_hand=False) == score_summary(player, by_hand=True) == ""
     player.scores.append(-3.0)
     assert score_summary(player, by_hand=False) == "mean -3 of 1 episode   best -3"
     assert score_summary(player, by_hand=True) == "best -3"
-
-
-def test_a_french_window(monkeypatch):
     monkeypatch.setenv("REJEU_LANGUAGE", "fr")
-    player = Player("you", None, None, steps=5, over=True, success=1.0, score=2.5, scores=[2.5])
-    assert score_summary(player, by_hand=False) == "moyenne 2.5 sur 1 épisode   meilleur 2.5"
+    assert score_summary(player, by_hand=False) == "moyenne -3 sur 1 épisode   meilleur -3"
+    player.score, player.success = 2.5, 1.0
     assert message(Game([player], 0), player) == "réussi : 2.5"
     entries = legend(keys_for("LunarLander-v3", gym.spaces.Discrete(4), None))
     assert [entry.label for entry in entries][:3] == ["gauche", "droite", "moteur principal"]
@@ -432,7 +363,9 @@ def test_a_round_is_over_when_both_are():
         def predict(self, obs, state=None, episode_start=None, deterministic=False):
             return np.int64(obs[2] + obs[3] > 0), None
 
-    perform(script, play, "CartPole-v1", seed=0, against=Balance())
+    perform(
+        script, play, lambda **given: gym.make("CartPole-v1", max_episode_steps=60, **given), seed=0, against=Balance()
+    )
 
 
 @pytest.fixture(scope="module")
