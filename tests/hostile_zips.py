@@ -203,10 +203,7 @@ def special(valid: bytes, members: dict[str, bytes], ran: Path) -> Iterator[tupl
         yield f"action space {i}", changed(valid, {"action_space": serialized(space)})
     yield "space of no numbers", changed(valid, {"observation_space": serialized(EMPTY_BOX)})
     bomb = b"\x80\x02}X\x04\x00\x00\x00full" + BOMB[2:-1] + b"s."
-    yield (
-        "shared policy_kwargs",
-        changed(valid, {"policy_kwargs": serialized(bomb)}),
-    )
+    yield ("shared policy_kwargs", changed(valid, {"policy_kwargs": serialized(bomb)}))
     yield "shared use_expln", changed(valid, {"policy_kwargs": serialized(KWARGS_BOMB)})
     yield "shared space", changed(valid, {"observation_space": serialized(BOMB)})
     yield "many critics", with_many_critics(valid)

@@ -113,17 +113,7 @@ def test_a_run_without_an_environment_is_a_run(tmp_path, capsys):
     assert (found["algorithm"], found["steps"], found["episodes"]) == ("IQL", 1200, 0)
     assert read_table(out / "evaluations.csv", ("step",)).column("step").tolist() == [600, 1200]
     assert "train/value_loss" in (out / "metrics.csv").read_text()
-    online = printed(
-        capsys,
-        "resume",
-        out,
-        "--no-report",
-        "--no-video",
-        "--steps",
-        210,
-        "--set",
-        "offline=false",
-        "learning_starts=0",
-    )
+    more = ["--no-report", "--no-video", "--steps", 210, "--set", "offline=false", "learning_starts=0"]
+    online = printed(capsys, "resume", out, *more)
     assert online["steps"] == 1410
     assert online["episodes"] == 1

@@ -106,17 +106,16 @@ def test_commands_to_type_name_what_was_imported():
     )
 
 
-def test_a_file_in_a_folder_with_py_in_its_name(here):
+def test_a_file_in_a_folder_with_py_in_its_name_and_one_that_registers_a_class(here):
     folder = here / "my.pyproject"
     folder.mkdir()
     (here / "drift_env.py").rename(folder / "drift_env.py")
-    assert main(["check", "my.pyproject/drift_env.py"]) == 0
-    assert main(["check", "my.pyproject/drift_env.py:Drift-v0"]) == 0
-
-
-def test_a_file_that_was_imported_for_its_wrapper_and_registers_a_class(here):
+    for named in ("my.pyproject/drift_env.py", "my.pyproject/drift_env.py:Drift-v0"):
+        assert main(["check", named]) == 0
+    forget()
     (here / "drift_env.py").write_text(SOURCE.replace('"drift_env:Drift"', "Drift"))
-    assert main(["check", "drift_env.py", "--wrapper", "drift_env:Double"]) == 0
+    sys.path.remove(str(folder))
+    assert main(["check", "drift_env.py", "--wrapper", "drift_env:Double"]) == 0  # imported for its wrapper first
 
 
 @pytest.mark.parametrize(
@@ -153,9 +152,8 @@ def test_an_error_of_ones_own_code_says_where(problem, here, capsys):
     source = here / "drift_env.py"
     source.write_text(SOURCE.replace("self.x += float(action[0])", problem))
     line = source.read_text().splitlines().index(f"        {problem}") + 1
-    assert f"(drift_env.py, line {line}, in step)" in error_of(
-        capsys, "train", "drift_env.py", "--algo", "SAC", "--steps", "9", "--out", "run", "--set", *TINY
-    )
+    argv = ["train", "drift_env.py", "--algo", "SAC", "--steps", "9", "--out", "run", "--set", *TINY]
+    assert f"(drift_env.py, line {line}, in step)" in error_of(capsys, *argv)
 
 
 def test_keyword_arguments_and_wrappers_are_used_while_training_and_named_in_the_hint(here, capsys):
@@ -299,14 +297,7 @@ def test_check_finds_all_errors_and_train_refuses_with_the_same_lines(arguments,
     (here / f"{name}.py").write_text(wrong.replace("wrong_env", name))
     assert main(["check", f"{name}.py"]) == 1
     lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("error: ")]
-    parts = [
-        fault,
-        "reset returned the observation only",
-        "dtype float64",
-        "shape (1,)",
-        "terminated=0",
-        "info",
-    ]
+    parts = [fault, "reset returned the observation only", "dtype float64", "shape (1,)", "terminated=0", "info"]
     assert len(lines) == len(parts)
     assert all(any(part in line for line in lines) for part in parts)
     assert main(["train", f"{name}.py", "--steps", "10", "--out", "run"]) == 2

@@ -92,6 +92,8 @@ def test_a_mistake_is_found_before_anything_starts(tmp_path, capsys):
     assert not out.exists()
     assert cli.main(["train", "CartPole-v1", "--seeds", "2", "--pause", "10"]) == 2
     assert "--pause is for a single run" in capsys.readouterr().err
+    assert cli.main(["train", "CartPole-v1", "--jobs", "2"]) == 2
+    assert "--jobs is for several seeds" in capsys.readouterr().err
     mistakes = {
         "--backend": "--backend='typo' must be 'auto' or 'envpool'",
         "--device": "--device='typo' must be",
@@ -117,11 +119,6 @@ def test_a_seed_that_cannot_be_started_is_left_and_said(tmp_path, monkeypatch, o
     monkeypatch.setattr(scheduler, "POLL", 0.03)
     assert cli.main(["train", "CartPole-v1", "--seeds", "2", "--seed", "1", "--out", str(out)]) == 1
     assert "seed 1 could not be started: [Errno 28] No space left on device" in capsys.readouterr().out
-
-
-def test_jobs_without_seeds(capsys):
-    assert cli.main(["train", "CartPole-v1", "--jobs", "2"]) == 2
-    assert "--jobs is for several seeds" in capsys.readouterr().err
 
 
 @pytest.mark.exhaustive  # starts three processes that train, half a minute

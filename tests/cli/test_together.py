@@ -15,33 +15,16 @@ TINY = ["--set", "policy_kwargs.net_arch=[8]", "batch_size=8", "learning_starts=
 def test_seeds_in_one_program_write_a_run_folder_each_and_a_comparison(tmp_path, capsys):
     out = tmp_path / "out"
     words = ["train", "jax/CartPole-v1", "--algo", "DQN", "--seeds", "2", "--seed", "3", "--steps", "120", "--no-video"]
-    words += [
-        "--evaluate-every",
-        "60",
-        "--evaluate-episodes",
-        "2",
-        "--out",
-        str(out),
-        "--json",
-        "--device",
-        "cpu",
-        *TINY,
-    ]
-    assert cli.main(words) == 0
+    words += ["--evaluate-every", "60", "--evaluate-episodes", "2", "--out", str(out), "--json", "--device", "cpu"]
+    assert cli.main([*words, *TINY]) == 0
     printed = capsys.readouterr()
     result = json.loads(printed.out)
     assert [(run["seed"], run["exit_status"]) for run in result["runs"]] == [(3, 0), (4, 0)]
     assert "2 seeds in one program" in printed.err
     for seed in (3, 4):
         folder = out / f"seed_{seed}"
-        assert {
-            "agent.safetensors",
-            "best.safetensors",
-            "config.json",
-            "curve.png",
-            "episodes.csv",
-            "evaluations.csv",
-        } <= {path.name for path in folder.iterdir()}
+        files = {"agent.safetensors", "best.safetensors", "config.json", "curve.png", "episodes.csv", "evaluations.csv"}
+        assert files <= {path.name for path in folder.iterdir()}
         config = json.loads((folder / "config.json").read_text())
         assert (config["seed"], config["device"]) == (seed, "cpu")
         assert len((folder / "evaluations.csv").read_text().splitlines()) == 3

@@ -356,11 +356,7 @@ WRONG = [
     ("log_prob", lambda m, s, a: log_prob(m, s, a) + s.sum(), "the term of the standard deviation"),
     ("log_prob", lambda m, s, a: log_prob(m, s, a) + LOG_2PI, "constant with 2 pi"),
     ("log_prob", lambda m, s, a: log_prob(m, s, a) - (z_of(m, s, a) ** 2).sum(1) / 2, "factor 1/2"),
-    (
-        "log_prob",
-        lambda m, s, a: (-0.5 * ((a - m) / s) ** 2 - s - 0.5 * LOG_2PI).sum(1),
-        "you divide by log_std",
-    ),
+    ("log_prob", lambda m, s, a: (-0.5 * ((a - m) / s) ** 2 - s - 0.5 * LOG_2PI).sum(1), "you divide by log_std"),
     ("returns_to_go", lambda r, g: returns_to_go(r, 1.0), "gamma has no effect"),
     ("returns_to_go", forwards, "you add the past"),
     ("returns_to_go", lambda r, g: np.cumsum((r * g ** np.arange(4))[::-1])[::-1], "from the beginning"),

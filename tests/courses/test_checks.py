@@ -84,11 +84,7 @@ def test_messages_are_in_both_languages_with_the_same_values(course):
 
 @pytest.mark.parametrize(
     ("check", "answers"),
-    [
-        (goals.future, [lambda *_: [[1], [1, 2]]]),
-        (goals.steps_needed, [10**400]),
-        (goals.saving, [None, None, 3]),
-    ],
+    [(goals.future, [lambda *_: [[1], [1, 2]]]), (goals.steps_needed, [10**400]), (goals.saving, [None, None, 3])],
 )
 def test_an_answer_of_another_kind_gives_one_line(check, answers, capsys):
     assert not check(*answers)

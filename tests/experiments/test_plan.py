@@ -97,7 +97,6 @@ MISTAKES = [
     ),
     ("1e-3", "-1", "settings.fast", "learning_rate=-1 must not fall below 0"),
     ("steps = 1e3", "steps = 1.5", "", "steps=1.5: expected `int"),
-    ("steps =", "stepz =", "", "did you mean steps?"),
     ('"DQN", "PPO"', '"DQN", "PPP"', "algorithms", "did you mean PPO?"),
     ('"DQN", "PPO"', '"DQN", "TQC"', "environments.CartPole-v1", "TQC needs a Box action space"),
     ("Acrobot-v1", "Acrobat-v1", "environments.Acrobat-v1", "did you mean Acrobot-v1"),
@@ -110,7 +109,6 @@ MISTAKES = [
     ("seeds = 2", "seeds = [1, 1]", "", "different seeds"),
     ("seeds = 2", "seeds = 'x'", "", "seeds='x': expected"),
     ("seeds = 2", "seeds = nan", "", "not JSON compliant"),
-    ("seeds = 2", "seeds = 2021-01-01", "", "date is not JSON serializable"),
     ("seeds = 2", "seeds = [", "", "line 5, column 1); expected TOML"),
     ("[settings.fast]", "[settings.default]", "", "line 10"),
     ("evaluate_every = 500", "minutes = 3", "", "exclude each other"),
@@ -119,8 +117,6 @@ MISTAKES = [
     ("evaluate_every = 500", "ray = 'HOST:6379'", "", "ray='HOST:6379' must be 'auto'"),
     ("evaluate_every = 500", "preset = true", "", "preset=True must be the path of a file"),
     ("evaluate_every = 500", "env_kwargs = {render_mode = 'human'}", "environments.CartPole-v1", "render_mode=human"),
-    ("evaluate_every = 500", "env_kwargs = {foo = 1}", "environments.CartPole-v1", "unexpected keyword argument"),
-    ("evaluate_every = 500", "threads = 0", "", "threads=0: expected `int` >= 1"),
     ("train_freq = 8", "buffer_size = 1_000_000_000_000_000", "settings.fast", "at most 1000000000000"),
 ]
 
@@ -140,13 +136,8 @@ def test_a_mistake_is_one_line_with_its_place(tmp_path, old, new, place, problem
 def test_a_mistake_at_the_end_of_a_plan_is_found_before_any_agent_is_built(monkeypatch):
     monkeypatch.setattr(rejeu.agents.Agent, "build", lambda *_: pytest.fail("an agent was built"))
     settings = {f"s{i}": {"learning_rate": 1e-4 * (i + 1)} for i in range(300)} | {"last": {"gama": 0.9}}
-    with pytest.raises(PlanError, match=r"settings\.last: DQN has no setting 'gama'"):
+    with pytest.raises(PlanError, match=r"^plan, settings\.last: DQN has no setting 'gama'"):
         read_plan({"environments": ["CartPole-v1"], "algorithms": ["DQN"], "settings": settings})
-
-
-def test_a_mistake_in_a_dict_is_named_by_its_path():
-    with pytest.raises(PlanError, match=r"plan, settings\.a: PPO has no setting 'gama'; did you mean gamma"):
-        read_plan({"environments": ["CartPole-v1"], "algorithms": ["PPO"], "settings": {"a": {"gama": 1}}})
 
 
 @pytest.mark.parametrize(

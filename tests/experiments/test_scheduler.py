@@ -135,16 +135,13 @@ def test_a_failed_run_does_not_stop_the_others_and_only_resume_repeats_it(tmp_pa
 
 
 @pytest.mark.parametrize("status", [-9, 143, 75])
-def test_a_lost_run_continues_from_its_checkpoint(tmp_path, status):
+def test_a_lost_run_continues_from_its_checkpoint_or_starts_anew_and_its_files_are_kept(tmp_path, status):
     folder, launcher = make_folder(tmp_path, 1), Launcher(ends={"job-0": [status, status, 0]})
     states, lines = work(folder, launcher)
     assert launcher.started == [("train", "job-0"), ("resume", "job-0"), ("resume", "job-0")]
     assert states == {"job-0": "done"}
     assert "continues from step" in lines[0]
-
-
-def test_a_run_lost_before_its_first_checkpoint_starts_anew_and_its_files_are_kept(tmp_path):
-    folder, launcher = make_folder(tmp_path, 1), Launcher(ends={"job-0": [-9, 0]}, checkpoints=False)
+    folder, launcher = make_folder(tmp_path / "b", 1), Launcher(ends={"job-0": [status, 0]}, checkpoints=False)
     states, _ = work(folder, launcher)
     assert launcher.started == [("train", "job-0"), ("train", "job-0")]
     assert states == {"job-0": "done"}
@@ -254,10 +251,7 @@ def test_a_folder_is_joined_only_with_the_same_plan(tmp_path):
         ("env_kwargs", {"path": "/etc/passwd"}, "imported or made with more than numbers"),
         ("env_kwargs", {"render_mode": "rgb_array", "--import": "evil.py"}, "env_kwargs"),
         ("imports", ["evil.py"], "names what is imported"),
-        ("env_argument", "evil.py", "names what is imported"),
-        ("seed", -1, "seed"),
         ("seed", None, "has no seed"),
-        ("steps", 0, "steps"),
     ],
 )
 def test_the_file_of_a_sweep_is_untrusted(tmp_path, key, value, problem):

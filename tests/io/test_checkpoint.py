@@ -210,14 +210,11 @@ def test_numbers_beyond_reason_are_refused_as_such(trained, tmp_path, change, wo
         rejeu.SAC.load(path, env=Counter())
 
 
-def test_another_environment_is_refused_when_loading(trained):
+def test_another_environment_or_another_kind_of_file_is_refused_when_loading(trained, buffer_file):
     with pytest.raises(ValueError, match=r"given environment has the observation space .* this agent was made for"):
         rejeu.SAC.load(trained[1], env=Reach())
     with pytest.raises(ValueError, match="given environment has the action space"):
         rejeu.SAC.load(trained[1], env=Counter(low=[-2.0], high=[2.0]))
-
-
-def test_a_model_is_no_replay_buffer_and_the_reverse(trained, buffer_file):
     agent, path = buffer_file
     with pytest.raises(CheckpointError, match="holds 'replay', expected 'agent'"):
         rejeu.SAC.load(path)

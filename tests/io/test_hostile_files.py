@@ -24,11 +24,7 @@ SECONDS = 2.0
 """Longest that any file may take."""
 MEGABYTES = 64
 """Most memory that any file may take, beyond what was in use."""
-FILES = {
-    "agent": RECORDED / "sac",
-    "replay": RECORDED / "replay",
-    "vec_normalize": RECORDED / "vec_normalize",
-}
+FILES = {"agent": RECORDED / "sac", "replay": RECORDED / "replay", "vec_normalize": RECORDED / "vec_normalize"}
 """A valid file of each kind, which is the first word."""
 CONTENTS = {kind: path.with_suffix(".safetensors").read_bytes() for kind, path in FILES.items()}
 SPECIAL = {

@@ -438,10 +438,7 @@ def test_watch_can_be_paused_begun_anew_and_closed():
     [
         (["play", "Lunr"], "did you mean Lunar?"),
         (["play", "MountanCar-v0"], "did you mean MountainCar-v0"),
-        (
-            ["play", "rejeu-play-test/Dark-v0"],
-            "cannot be rendered to arrays: its render modes are ['ansi']",
-        ),
+        (["play", "rejeu-play-test/Dark-v0"], "cannot be rendered to arrays: its render modes are ['ansi']"),
         (["play", "rejeu-play-test/Switches-v0"], "MultiBinary(3) cannot be played by hand"),
         (["play", LEVER, "--keys", "a"], "--keys 'a' must be keys=action"),
         (["play", LEVER, "--keys", "a=5"], "a=5 must be an integer from 0 to 2"),

@@ -59,12 +59,16 @@ def test_a_recording_is_read_back_by_minari(tmp_path, monkeypatch, capsys):
     assert not (tmp_path / "home").exists()
 
 
-def test_an_environment_that_cannot_be_described_is_recorded_all_the_same(tmp_path, monkeypatch):
+def test_an_environment_that_cannot_be_described_or_has_no_id_is_recorded_all_the_same(tmp_path, monkeypatch):
     play_and_record(tmp_path / "played", "rejeu-play-test/Class-v0")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "played"))
     dataset = minari.load_dataset("rejeu-play-test/Class-v0/human-v0")
     assert (dataset.total_episodes, dataset.env_spec) == (2, None)
     assert dataset.observation_space == Lever.observation_space
+    perform(hold(["d"], 4, lambda e: None, []), play, Lever, record=tmp_path / "other")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "other"))
+    dataset = minari.load_dataset("Lever/human-v0")
+    assert (dataset[0].actions.tolist()[:3], dataset.env_spec) == ([2, 2, 2], None)
 
 
 def test_a_recording_is_also_a_video(tmp_path):
@@ -96,17 +100,12 @@ def test_the_dataset_has_the_spaces_and_arguments_of_the_environment_that_was_pl
     assert (dataset.observation_space.shape, dataset.recover_environment().observation_space.shape) == ((3,), (3,))
 
 
-def test_an_environment_without_an_id_is_recorded(tmp_path, monkeypatch):
-    perform(hold(["d"], 4, lambda e: None, []), play, Lever, record=tmp_path / "played")
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "played"))
-    dataset = minari.load_dataset("Lever/human-v0")
-    assert (dataset[0].actions.tolist()[:3], dataset.env_spec) == ([2, 2, 2], None)
-
-
-def test_nothing_played_leaves_nothing_behind(tmp_path, capsys):
+def test_nothing_played_leaves_nothing_behind_and_nothing_is_overwritten(tmp_path, capsys):
     assert perform(lambda window, game: iter(()), main, ["play", LEVER, "--record", str(tmp_path / "played")]) == 0
     assert "nothing was played" in capsys.readouterr().out
     assert not [*tmp_path.iterdir()]
+    (tmp_path / "kept").write_text("")
+    assert "is not an empty folder" in error_of(capsys, "play", LEVER, "--record", str(tmp_path))
 
 
 def test_what_was_played_is_kept_when_something_goes_wrong(tmp_path, monkeypatch):
@@ -122,11 +121,6 @@ def test_what_was_played_is_kept_when_something_goes_wrong(tmp_path, monkeypatch
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "played"))
     assert minari.load_dataset("rejeu-play-test/Lever-v0/human-v0")[0].truncations.tolist() == [False, True]
     assert (tmp_path / "played" / "video.mp4").exists()
-
-
-def test_a_recording_overwrites_nothing(capsys, tmp_path):
-    (tmp_path / "kept").write_text("")
-    assert "is not an empty folder" in error_of(capsys, "play", LEVER, "--record", str(tmp_path))
 
 
 @pytest.mark.parametrize("package", ["minari", "h5py"])

@@ -21,12 +21,9 @@ def test_no_environment_has_two_presets_of_one_algorithm():
     assert len(names) == len(set(names))
 
 
-def test_find_returns_the_preset_of_an_environment_and_algorithm():
+def test_find_returns_the_preset_of_an_environment_and_algorithm_or_none():
     assert presets.find("parking-v0").env_id == "parking-v0"
     assert presets.find("parking-v0", "SAC").algorithm == "SAC"
-
-
-def test_find_returns_none_where_there_is_no_preset():
     assert presets.find("parking-v0", "DQN") is None
     assert presets.find("Blackjack-v1") is None
 
@@ -98,19 +95,14 @@ def test_a_preset_of_a_goal_task_learns_with_the_backend_it_names(env_id):
         assert any((after[name] != before[name]).any() for name in before if name.startswith("actor."))
 
 
-def test_result_shows_mean_interval_and_seeds():
+def test_a_result_is_of_the_preset_as_it_is_or_of_the_named_one_and_shows_its_interval():
     result = presets.find_result("Pendulum-v1", "TD3")
     assert str(result) == f"mean return {result.mean:.1f} ({result.low:.1f} to {result.high:.1f}), {result.seeds} seeds"
-
-
-def test_first_result_is_of_the_preset_as_it_is():
     assert presets.find_result("CartPole-v1", "PPO").setting == ""
     assert presets.find_result("Blackjack-v1", "DQN") is None
-
-
-def test_a_result_is_that_of_the_named_preset_it_was_measured_with():
-    assert presets.find_result("HalfCheetah-v5", "FlashSAC", "small").seeds == 1
-    assert "1 seed" in str(presets.find_result("HalfCheetah-v5", "FlashSAC", "small")).split(", ")
+    small = presets.find_result("HalfCheetah-v5", "FlashSAC", "small")
+    assert small.seeds == 1
+    assert "1 seed" in str(small).split(", ")
     assert presets.find_result("HalfCheetah-v5", "FlashSAC", "full") is None
 
 
