@@ -5,11 +5,14 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import gymnasium as gym
+import pytest
 
 import rejeu
 from rejeu import agents
+from rejeu.envs.make import InProcess
 from tests.algorithms.probes.environments import Discretely, Probe
 from tests.sharing import shared_learners
+from tests.tiers import only
 
 
 class Kind(NamedTuple):
@@ -25,6 +28,14 @@ class Kind(NamedTuple):
     @property
     def agent(self) -> type[agents.Agent]:
         return agents.AGENTS[self.name]
+
+    def envs(self, probe: type[Probe], n_envs: int = 1) -> InProcess:
+        """Returns a vector environment of ``n_envs`` probes with such actions."""
+        return InProcess([env_of(self, probe()) for _ in range(n_envs)])
+
+    def small(self, env: Any, **settings: Any) -> agents.Agent:
+        """Returns a small agent of this kind."""
+        return small(self, env, **settings)
 
     @property
     def has_temperature(self) -> bool:
@@ -61,6 +72,10 @@ KINDS = {
     "IQN": Kind("IQN", True, {**EPSILON, "n_quantiles": 8, "n_target_quantiles": 8, "n_policy_quantiles": 8}),
 }
 """Every algorithm with every kind of action space that it supports."""
+
+SAMPLE = ("SAC", "CrossQ", "DQN")
+"""Actor-critic, batch normalization without targets, and Q-learning, which run by default; the others are exhaustive."""
+every_kind = pytest.mark.parametrize("kind", only([KINDS[name] for name in SAMPLE], KINDS.values()), ids=KINDS)
 
 LEARNING = {"learning_rate": 1e-2, "batch_size": 32, "tau": 0.05, "policy_kwargs": {"net_arch": [32]}}
 RUN = {"gamma": 0.5, "buffer_size": 2000, "learning_starts": 64, "seed": 0}

@@ -38,11 +38,6 @@ class Kind(NamedTuple):
         with shared_learners():
             return self.agent("MlpPolicy", env, **{**LEARNING, **self.settings, **settings})
 
-    def load(self, path: Any, **settings: Any) -> agents.Agent:
-        """Loads an agent that shares compiled functions."""
-        with shared_learners():
-            return rejeu.load(path, **settings)
-
     def numbers(self, actions: np.ndarray) -> np.ndarray:
         """Converts a batch of actions to the probe's numbers, from 0 to 2."""
         if self.wrapper is None:
@@ -67,8 +62,8 @@ ALGORITHMS = {
 ACTIONS = {"Box": None, "Discrete": Discretely, "MultiDiscrete": Doubly, "MultiBinary": Bitwise}
 NARROW = {"policy_kwargs": {"net_arch": [16], "log_std_init": -1.0}}
 """A Box policy with a smaller initial standard deviation converges sooner."""
-SAMPLE = ("PPO, Box", "PPO, MultiDiscrete", "A2C, Discrete", "A2C, MultiBinary", "PQN, Discrete")
-"""Every algorithm and every kind of actions, which run by default; the other kinds are exhaustive."""
+SAMPLE = ("PPO, MultiDiscrete", "A2C, Box", "PQN, Discrete")
+"""Algorithms with networks of their own, which run by default; the other kinds are exhaustive."""
 
 KINDS = {
     f"{name}, {actions}": Kind(name, wrapper, settings | (NARROW if wrapper is None else {}))

@@ -10,7 +10,6 @@ from gymnasium import spaces
 from hypothesis import given, strategies as st
 
 import rejeu
-from rejeu import normalization
 from rejeu.core import Algorithm, Clock, Masked, Rollout, Transition
 from rejeu.envs.make import InProcess
 from rejeu.errors import CheckpointError
@@ -21,7 +20,7 @@ from rejeu.spaces import leaves, scale_action
 from tests.algorithms.probes.environments import Discretely, Later
 from tests.environments import Counter, Reach
 from tests.helpers import assert_same_parameters, small_sac
-from tests.tiers import only
+from tests.tiers import exhaustive, only
 
 pytestmark = pytest.mark.usefixtures("learners_are_shared")
 
@@ -63,14 +62,6 @@ def test_moments_are_numpys_however_the_values_come(sizes, seed, offset, share):
         return
     np.testing.assert_allclose(moments.mean, seen.mean(axis=0), rtol=1e-5, atol=1e-5)
     np.testing.assert_allclose(moments.variance, seen.var(axis=0), rtol=2e-4, atol=1e-5)
-
-
-@pytest.mark.usefixtures("strict_dtypes")
-def test_the_first_values_replace_the_variance_that_stood_there_before():
-    moments = merged(no_moments(()), jnp.float32([2.0, 4.0]), jnp.float32([1.0, 1.0]))
-    assert (float(moments.mean), float(moments.variance), float(moments.n_seen)) == (3.0, 1.0, 2.0)
-    moments = merged(no_moments(()), jnp.float32([7.0]), jnp.float32([1.0]))
-    assert (float(moments.mean), float(moments.variance)) == (7.0, 0.0)
 
 
 def test_long_runs_forget_rather_than_stand_still():
@@ -141,15 +132,6 @@ def test_acting_remembering_and_exploring_see_the_same_scaled_observation():
         np.testing.assert_allclose(shown, expected, atol=1e-4)
 
 
-def test_before_anything_was_seen_observations_and_rewards_pass_as_they_are():
-    algorithm = showing(box(2))
-    state = algorithm.init(jax.random.PRNGKey(0))
-    obs = np.float32([[100.0, -3.0]])
-    assert np.array_equal(algorithm.exploit(algorithm.actor(state), obs), obs)
-    batch = Transition(obs, obs, np.float32([50.0]), obs, np.float32([0.9]))
-    assert float(algorithm.update(state, batch, CLOCK)[1].reward[0]) == 50.0
-
-
 def test_only_continuous_parts_of_nested_observations_are_scaled_each_by_itself():
     space = spaces.Dict(
         {
@@ -173,6 +155,8 @@ def test_only_continuous_parts_of_nested_observations_are_scaled_each_by_itself(
     shown = algorithm.exploit(algorithm.actor(after_seeing(algorithm, obs)), obs)
     np.testing.assert_allclose(shown["a"][0], zscore(obs["a"][0], obs["a"][0]), atol=1e-4)
     np.testing.assert_allclose(shown["d"], zscore(obs["d"], obs["d"]), atol=1e-3)
+    masked = Masked(obs, np.eye(n, 3) > 0)  # a mask beside the observation is left alone
+    assert np.array_equal(algorithm.exploit(algorithm.actor(after_seeing(algorithm, masked)), masked).mask, masked.mask)
     for one, other in ((shown["a"][1], obs["a"][1]), *((shown[key], obs[key]) for key in "bce")):
         assert one.dtype == other.dtype
         assert np.array_equal(one, other)
@@ -192,15 +176,6 @@ def test_achieved_and_desired_goals_share_their_statistics_unless_told_otherwise
     seen = {**obs, "achieved_goal": both, "desired_goal": both} if shared else obs
     for key, values in seen.items():
         np.testing.assert_allclose(shown[key], zscore(obs[key], values), atol=1e-4)
-
-
-def test_a_mask_beside_the_observation_is_left_alone():
-    algorithm = showing(box(2))
-    obs = np.random.default_rng(4).normal(2.0, 3.0, (5, 2)).astype(np.float32)
-    mask = np.eye(5, 3) > 0
-    shown = algorithm.exploit(algorithm.actor(after_seeing(algorithm, Masked(obs, mask))), Masked(obs, mask))
-    np.testing.assert_allclose(shown.obs, zscore(obs, obs), atol=1e-4)
-    assert np.array_equal(shown.mask, mask)
 
 
 def drawn_batch(seed, scale=20.0):
@@ -240,7 +215,7 @@ def test_each_reward_of_an_n_step_return_is_clipped_by_itself():
 def test_batches_hold_each_reward_where_it_is_to_be_clipped(hindsight):
     def batch_of(**settings):
         more = {"replay_buffer_class": "HerReplayBuffer"} if hindsight else {}
-        agent = small_sac(Reach() if hindsight else Counter((5,)), **more, **settings).learn(30)
+        agent = small_sac(Reach() if hindsight else Counter((5,)), learning_starts=99, **more, **settings).learn(30)
         return agent.replay_buffer.sample(np.random.default_rng(0), (2, 40))
 
     batch = batch_of(normalize=True, n_steps=3)
@@ -284,15 +259,8 @@ def test_a_rollout_is_learnt_from_with_the_statistics_before_it_save_the_first()
     moments = state.statistics.obs[0]
     np.testing.assert_allclose(moments.mean, np.concatenate(seen).mean(axis=0), atol=1e-5)
     np.testing.assert_allclose(moments.variance, np.concatenate(seen).var(axis=0), rtol=1e-5)
-
-
-def test_a_rollouts_rewards_are_scaled_by_its_own_returns_as_well():
-    algorithm = showing(box(2))
-    first, second = rollout_of(9, loc=1.0), rollout_of(10, loc=-5.0)
-    state, _ = algorithm.update(algorithm.init(jax.random.PRNGKey(0)), first, CLOCK)
-    state, shown = algorithm.update(state, second, CLOCK)
-    returns = np.concatenate([r.running_return[r.valid] for r in (first, second)])
-    np.testing.assert_allclose(shown.reward, second.reward / np.std(np.float64(returns)), rtol=1e-5)
+    returns = np.concatenate([r.running_return[r.valid] for r in (first, second)])  # of the present rollout as well
+    np.testing.assert_allclose(shown_second.reward, second.reward / np.std(np.float64(returns)), rtol=1e-5)
     assert float(state.statistics.returns.n_seen) == len(returns) == 22
 
 
@@ -300,24 +268,16 @@ def test_a_rollouts_rewards_are_scaled_by_its_own_returns_as_well():
     ("value", "error", "message"),
     [
         (3, TypeError, "must be True, False or a dict"),
-        ("yes", TypeError, "must be True, False or a dict"),
-        ({"norm_observations": True}, TypeError, "no setting 'norm_observations'; did you mean norm_obs"),
+        ({"norm_observations": True}, TypeError, "did you mean norm_obs"),
         ({"norm_obs": 1}, TypeError, "norm_obs=1 must be True or False"),
-        ({"clip_obs": 0.0}, ValueError, "clip_obs=0.0 must be a finite number, above 0"),
-        ({"clip_reward": float("inf")}, ValueError, "clip_reward=inf must be a finite number, above 0"),
-        ({"epsilon": True}, ValueError, "epsilon=True must be a finite number, above 0"),
+        ({"clip_obs": 0.0}, ValueError, "clip_obs=0.0 must be"),
+        ({"epsilon": True}, ValueError, "epsilon=True must be"),
     ],
 )
 def test_a_bad_setting_is_refused(value, error, message):
     for algorithm in (rejeu.SAC, rejeu.PPO):
         with pytest.raises(error, match=message):
             algorithm("MlpPolicy", Counter(), normalize=value)
-
-
-def test_settings_say_what_they_ask_for():
-    assert normalization.parse(None) is normalization.parse(False) is None
-    assert normalization.parse(True) == NormalizationConfig()
-    assert normalization.parse({"norm_reward": False, "clip_obs": 5}) == NormalizationConfig(True, False, 5.0)
 
 
 # In the loops.
@@ -373,7 +333,7 @@ def test_off_policy_statistics_are_those_of_what_came():
     assert_moments(statistics.obs[0], [obs for env in envs for kind, obs in env.shown[1:] if kind != "end"])
 
 
-@pytest.mark.parametrize("name", ["A2C", "PPO"])
+@pytest.mark.parametrize("name", only(["A2C"], ["A2C", "PPO"]))
 def test_on_policy_statistics_are_those_of_what_was_acted_on(name):
     envs = [Noted(1), Noted(2)]
     agent = rejeu.AGENTS[name]("MlpPolicy", InProcess(envs), normalize=True, **ON).learn(36)
@@ -385,18 +345,11 @@ def test_on_policy_statistics_are_those_of_what_was_acted_on(name):
 
 def test_the_policy_of_a_rollout_keeps_its_statistics_until_it_has_been_learnt_from():
     seen = []
-    agent = rejeu.A2C("MlpPolicy", Noted(), normalize=True, **ON)
+    agent = rejeu.A2C("MlpPolicy", env := Noted(), normalize=True, **ON)
     agent.learn(18, lambda agent, _: seen.append(float(agent.state.statistics.obs[0].n_seen)) and None)
     assert seen == [0.0] * 5 + [6.0] * 6 + [12.0] * 6 + [18.0]
-
-
-@pytest.mark.parametrize("name", ["SAC", "A2C"])
-def test_history_holds_the_environments_own_returns(name):
-    env = Noted()
-    settings = OFF if name == "SAC" else ON
-    agent = rejeu.AGENTS[name]("MlpPolicy", env, normalize=True, **settings).learn(24)
-    sums = [env.rewards[a:b].sum() for a, b in ((0, 3), (3, 8), (8, 10), (10, 13), (13, 18), (18, 20), (20, 23))]
-    assert [e.episode_return for e in agent.history.episodes] == pytest.approx(sums, rel=1e-5)
+    sums = [env.rewards[a:b].sum() for a, b in ((0, 3), (3, 8), (8, 10), (10, 13), (13, 18))]
+    assert [e.episode_return for e in agent.history.episodes] == pytest.approx(sums, rel=1e-5)  # the environment's own
 
 
 class Allowing(Discretely):
@@ -428,7 +381,7 @@ def finite(agent):
     return all(np.isfinite(array).all() for array in agent.get_parameters().values())
 
 
-@pytest.mark.parametrize("name", only(["SAC", "CrossQ", "DQN", "PPO", "PQN", "RecurrentPPO"], rejeu.AGENTS))
+@pytest.mark.parametrize("name", only(["SAC", "PPO", "RecurrentPPO"], rejeu.AGENTS))
 def test_every_algorithm_learns_on_scaled_numbers_and_keeps_them_in_its_file(name, tmp_path):
     agent = normalising(name)
     assert finite(agent)
@@ -447,7 +400,7 @@ def test_every_algorithm_learns_on_scaled_numbers_and_keeps_them_in_its_file(nam
     assert np.array_equal(loaded.predict(obs, deterministic=True)[0], before)
 
 
-@pytest.mark.parametrize("name", ["TD3", "PPO", "DQN"])
+@pytest.mark.parametrize("name", only(["PPO", "DQN"], ["TD3", "PPO", "DQN"]))
 def test_predict_takes_raw_observations(name):
     agent = normalising(name)
     moments = agent.state.statistics.obs[0]
@@ -463,16 +416,6 @@ def test_predict_takes_raw_observations(name):
         assert not np.allclose(given, scale_action(agent.action_space, unscaled), atol=1e-3)
 
 
-def test_parameters_put_in_place_bring_their_statistics():
-    one, other = normalising("SAC"), normalising("SAC", seed=1)
-    assert not np.array_equal(one.get_parameters()["learner.log_alpha"], other.get_parameters()["learner.log_alpha"])
-    other.set_parameters(one.get_parameters())
-    assert_same_parameters(one, other)
-    mean = one.state.statistics.obs[0].mean
-    other.set_parameters({"statistics.obs.0.mean": np.float32(mean) + 1}, exact_match=False)
-    np.testing.assert_array_equal(other.state.statistics.obs[0].mean, np.float32(mean) + 1)
-
-
 def test_an_agent_with_statistics_does_not_take_a_file_without_them(tmp_path):
     plain = rejeu.SAC("MlpPolicy", Noted(), **OFF)
     path = plain.save(tmp_path / "plain")
@@ -480,23 +423,6 @@ def test_an_agent_with_statistics_does_not_take_a_file_without_them(tmp_path):
         normalising("SAC").set_parameters(path)
     with pytest.raises(CheckpointError):
         rejeu.load(path, normalize=True)
-
-
-def test_settings_survive_the_file(tmp_path):
-    settings = {"norm_reward": False, "clip_obs": 5.0}
-    for agent in (
-        rejeu.SAC("MlpPolicy", Noted(), normalize=settings, **OFF),
-        rejeu.PPO("MlpPolicy", Noted(), normalize=settings, **ON),
-    ):
-        loaded = rejeu.load(agent.save(tmp_path / agent.name))
-        assert loaded.config == agent.config
-        assert loaded.config.normalize == NormalizationConfig(norm_reward=False, clip_obs=5.0)
-
-
-def test_learning_goes_on_from_a_file_with_the_statistics_that_it_held(tmp_path):
-    env = Noted(3)
-    loaded = rejeu.load(normalising("PPO").save(tmp_path / "model"), env=env).learn(12)
-    assert float(loaded.state.statistics.obs[0].n_seen) == 36.0
 
 
 def test_the_best_weights_come_back_with_their_statistics():
@@ -510,17 +436,6 @@ def test_the_best_weights_come_back_with_their_statistics():
 
 
 # Exploration.
-
-
-@pytest.mark.parametrize("noise", [rejeu.NormalActionNoise([0.0], [0.3]), ParameterNoise(initial_sigma=0.5)])
-def test_noise_and_normalisation_go_together(noise):
-    """The observations do not depend on what is done, so neither may the statistics."""
-    noisy, quiet = normalising("DDPG", action_noise=noise), normalising("DDPG")
-    assert finite(noisy)
-    for one, other in zip(
-        jax.tree.leaves(noisy.state.statistics), jax.tree.leaves(quiet.state.statistics), strict=True
-    ):
-        assert np.array_equal(one, other)
 
 
 def test_noise_on_parameters_leaves_the_statistics_that_scale_as_they_are():
@@ -545,8 +460,7 @@ def test_noise_on_parameters_leaves_the_statistics_that_scale_as_they_are():
 # Goals.
 
 
-@pytest.fixture(scope="module")
-def reaching():
+def reaching(n_steps):
     return rejeu.SAC(
         "MultiInputPolicy",
         InProcess([Reach() for _ in range(4)], seed=0),
@@ -560,23 +474,25 @@ def reaching():
         learning_starts=200,
         policy_kwargs={"net_arch": [32, 32]},
         seed=0,
-    ).learn(1600)
+    ).learn(n_steps)
 
 
-def test_hindsight_learns_on_scaled_goals(reaching):
-    assert reaching.evaluate(40, env=InProcess([Reach() for _ in range(4)], seed=1)).success_rate >= 0.9
+@exhaustive
+def test_hindsight_learns_on_scaled_goals():
+    assert reaching(1600).evaluate(40, env=InProcess([Reach() for _ in range(4)], seed=1)).success_rate >= 0.9
 
 
-def test_hindsight_relabels_raw_goals(reaching):
+def test_hindsight_relabels_raw_goals():
     """A scaled goal would give another reward: the deviation of the goals is not 1, nor their mean exactly 0."""
-    batch = reaching.replay_buffer.sample(np.random.default_rng(0), (1, 500), 1.0)
+    agent = reaching(240)
+    batch = agent.replay_buffer.sample(np.random.default_rng(0), (1, 500), 1.0)
     next_obs = jax.tree.map(lambda x: np.asarray(x)[0], batch.next_obs)
     reward = Reach().compute_reward(next_obs["achieved_goal"], next_obs["desired_goal"], {})
     assert np.array_equal(np.asarray(batch.reward)[0], reward)
     assert np.std(next_obs["desired_goal"]) > 1.05 or abs(np.mean(next_obs["desired_goal"])) > 0.05
-    goals = reaching.state.statistics.obs
+    goals = agent.state.statistics.obs
     assert len(goals) == 2
-    assert float(goals[0].n_seen) == 2 * float(goals[1].n_seen) == 2 * 1600
+    assert float(goals[0].n_seen) == 2 * float(goals[1].n_seen) == 2 * 240
 
 
 def test_statistics_are_taken_of_copies_that_the_next_step_cannot_overwrite():

@@ -22,6 +22,8 @@ from tests.every_agent import KINDS, Kind
 from tests.sharing import shared_learners
 from tests.test_demonstrations import SMALL, Anywhere, Target, by_hand, shown
 
+pytestmark = pytest.mark.usefixtures("learners_are_shared")
+
 
 @pytest.mark.parametrize("name", ["TD3BC", "ReBRAC"])
 def test_offline_relatives_of_td3_improve_on_what_was_shown(name: str) -> None:

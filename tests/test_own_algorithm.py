@@ -8,7 +8,6 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 
-import equinox as eqx
 import gymnasium as gym
 import jax
 import jax.numpy as jnp
@@ -160,13 +159,9 @@ def test_plans_and_sweeps_import_no_installed_algorithm_that_they_name(site, tmp
     del sys.modules["awac"]
 
 
-def test_help_lists_the_hyperparameters(awac):
-    assert "beta: Temperature of the advantage weights." in awac.AWAC.__doc__
-    assert "batch_size: " in awac.AWAC.__doc__
-
-
 def test_a_preset_is_registered_with_the_algorithm(awac):
     assert presets.find("Pendulum-v1", "AWAC").hyperparameters["beta"] == 2.0
+    assert "beta: Temperature of the advantage weights." in awac.AWAC.__doc__
     assert presets.find("Pendulum-v1").algorithm != "AWAC"  # rejeu's own stays the first
 
 
@@ -245,21 +240,10 @@ def test_prioritized_replay_without_td_errors_is_refused(awac):
         kind("MlpPolicy", "Pendulum-v1", priorities={}, **SMALL).learn(40)
 
 
-def test_a_state_that_changes_its_shape_or_holds_no_array_is_refused(awac):
-    kind = with_update(awac, lambda state, metrics: (eqx.tree_at(lambda s: s.n_updates, state, jnp.zeros(2)), metrics))
-    with pytest.raises(
-        TypeError, match=r"update returned a state with n_updates: float32\[2\], expected an array int32\[\]"
-    ):
-        kind("MlpPolicy", "Pendulum-v1", **SMALL).learn(40)
+def test_a_state_that_holds_no_array_is_refused():
     algorithm = rejeu.Algorithm(lambda key: {"step": 0.5}, None, None, None, None)
-    with pytest.raises(TypeError, match=r"init returned a state with step: 0\.5, expected an array float32\[\]"):
+    with pytest.raises(TypeError, match=r"init returned a state with step: 0\.5, expected an array"):
         Learner(algorithm, None).init(jax.random.PRNGKey(0))
-
-
-def test_a_metric_may_be_a_python_number(awac):
-    kind = with_update(awac, lambda state, metrics: (state, {"constant": 1.5}))
-    agent = kind("MlpPolicy", "Pendulum-v1", **SMALL).learn(40)
-    assert float(agent.run.metrics["constant"]) == 1.5
 
 
 def test_the_file_works_as_a_notebook_cell():
@@ -274,12 +258,6 @@ def test_the_file_works_as_a_notebook_cell():
         assert agent.n_updates == 10
     finally:
         InteractiveShell.clear_instance()
-
-
-def test_a_class_without_source_has_a_docstring():
-    namespace = {"__name__": "nowhere"}
-    exec(SOURCE.read_text(), namespace)
-    assert "beta: Default: 1.0." in namespace["AWAC"].__doc__
 
 
 def command(site, folder, *arguments):

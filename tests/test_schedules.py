@@ -24,10 +24,14 @@ from rejeu.schedules import Exponential, Linear, at, parse, to_json
 from tests.environments import Counter
 from tests.helpers import small_sac
 
+pytestmark = pytest.mark.usefixtures("learners_are_shared")
 
-@pytest.mark.parametrize(("progress", "value"), [(0.0, 1.0), (0.25, 0.55), (0.5, 0.1), (0.8, 0.1), (1.0, 0.1)])
+
+@pytest.mark.parametrize(("progress", "value"), [(-0.5, 1.0), (0.0, 1.0), (0.25, 0.55), (0.5, 0.1), (1.5, 0.1)])
 def test_linear_is_a_line_to_its_fraction_and_constant_after(progress, value):
     assert Linear(1.0, 0.1, fraction=0.5)(progress) == pytest.approx(value)
+    assert at(Linear(1.0, 0.1, fraction=0.5), progress) == pytest.approx(value)
+    assert at(0.3, progress) == 0.3
 
 
 @pytest.mark.parametrize(("progress", "value"), [(0.0, 1.0), (0.25, 0.1), (0.5, 0.01), (1.0, 0.01)])
@@ -40,16 +44,6 @@ def test_traced_progress_gives_what_a_number_gives(schedule):
     progress = np.linspace(-0.1, 1.1, 13, dtype=np.float32)
     traced = jax.jit(jax.vmap(schedule))(progress)
     np.testing.assert_allclose(traced, [schedule(float(p)) for p in progress], rtol=1e-5)
-
-
-def test_progress_beyond_the_run_does_not_extrapolate():
-    assert Linear(1.0, 0.0)(1.5) == 0.0
-    assert Linear(1.0, 0.0)(-0.5) == 1.0
-
-
-def test_a_number_is_its_own_value_at_all_times():
-    assert at(0.3, 0.9) == 0.3
-    assert at(Linear(1.0, 0.0), 0.25) == 0.75
 
 
 @pytest.mark.parametrize(
@@ -78,13 +72,8 @@ def test_a_schedule_survives_json(schedule):
         (lambda progress_remaining: 3e-4, ValueError, "learning_rate: functions are called with the progress"),
         (lambda progress: float(progress), TypeError, "learning_rate: the function must use jax.numpy"),
         (lambda progress: jnp.ones(2) * progress, TypeError, "learning_rate: the function must return one number"),
-        (True, TypeError, "learning_rate=True must be a number"),
-        (None, TypeError, "learning_rate=None must be a number"),
-        ("3e-4", TypeError, "learning_rate='3e-4' must be a number"),
-        ("lin_fast", ValueError, "learning_rate='lin_fast'"),
-        (float("nan"), ValueError, "learning_rate=nan must be finite"),
-        (float("inf"), ValueError, "learning_rate=inf must be finite"),
-        ("lin_inf", ValueError, "learning_rate"),
+        *((value, TypeError, "learning_rate=.* must be a number") for value in (True, None, "3e-4")),
+        *((value, ValueError, "learning_rate") for value in ("lin_fast", "lin_inf", float("nan"), float("inf"))),
         ({"schedule": "cosine", "start": 1}, TypeError, "learning_rate="),
         ({"schedule": "linear", "stop": 1}, TypeError, "learning_rate="),
         ({"schedule": "linear", "start": "nan"}, ValueError, "learning_rate="),
@@ -138,24 +127,6 @@ def test_schedules_continue_over_learn_as_in_stable_baselines3():
     for got, wanted in zip(told, expected, strict=True):
         np.testing.assert_allclose(got, wanted[-len(got) :], rtol=1e-6)
         assert len(got) >= len(wanted) - 1  # nothing can be drawn in the first turn
-
-
-def test_exploration_does_not_begin_again_with_the_next_slice_of_a_training():
-    env = rejeu.make_vector("CartPole-v1", 1, "gymnasium", seed=0)
-    settings = {"learning_starts": 4, "batch_size": 4, "buffer_size": 99, "train_freq": 1}
-    agent = rejeu.DQN("MlpPolicy", env, exploration_fraction=0.5, policy_kwargs={"net_arch": [4]}, seed=0, **settings)
-    rates = []
-    note = lambda agent, turn: rates.append(float((turn.metrics or {}).get("exploration_rate", 1.0)))  # noqa: E731
-    agent.learn(40, note)
-    agent.learn(40, note, reset_num_timesteps=False)
-    expected = np.concatenate([np.ones(4), np.maximum(1 - 0.95 * np.arange(5, 41) / 20, 0.05), np.full(40, 0.05)])
-    np.testing.assert_allclose(rates, expected, rtol=1e-5)
-
-
-def test_schedules_follow_episodes_likewise():
-    more = {"episodes": 6, "reset_num_timesteps": False}
-    told = progress_of_updates(small_sac(Counter(lengths=(1,)), learning_starts=0), {"episodes": 2}, more)
-    np.testing.assert_allclose(told[1], (2 + np.arange(1, 7)) / 8, rtol=1e-6)
 
 
 def test_schedules_follow_training_time_likewise(monkeypatch):

@@ -15,6 +15,11 @@ def only(default: Collection[Any], values: Iterable[Any]) -> list[Any]:
     return [value if value in default else pytest.param(value, marks=exhaustive) for value in values]
 
 
+def only_tuples(default: Collection[Any], values: Iterable[Any]) -> list[Any]:
+    """Likewise for several parameters at once, whose values are tuples."""
+    return [value if value in default else pytest.param(*value, marks=exhaustive) for value in values]
+
+
 def crossed(first: Sequence[Any], second: Sequence[Any]) -> list[Any]:
     """Returns all pairs. By default only those of a diagonal run, which contains every value of both.
 

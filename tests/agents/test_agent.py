@@ -15,7 +15,9 @@ from rejeu.envs.make import InProcess
 from rejeu.errors import CheckpointError
 from tests.environments import Counter, Reach, Sampled
 from tests.helpers import assert_same_parameters, count_updates, same_parameters, small_sac
-from tests.tiers import exhaustive
+from tests.tiers import exhaustive, only
+
+pytestmark = pytest.mark.usefixtures("learners_are_shared")
 
 NEVER = 10**6
 """``learning_starts`` of agents that only act at random."""
@@ -42,12 +44,6 @@ def test_learn_takes_exactly_the_steps_that_were_asked_for(n_envs, total):
     assert agent.replay_buffer.size() == 2 * total
 
 
-def test_num_timesteps_counts_from_the_last_learn_that_reset_it():
-    agent = small_sac(counters(1), learning_starts=NEVER).learn(7)
-    assert agent.learn(5, reset_num_timesteps=False).num_timesteps == 12
-    assert agent.learn(5).num_timesteps == 5
-
-
 @pytest.mark.parametrize("total", [0, -1, 2.5, "many", True, None])
 def test_an_impossible_number_of_steps_is_refused(agent, total):
     words = (
@@ -65,12 +61,11 @@ def test_minutes_end_a_run():
 # Updates.
 
 
-@pytest.mark.parametrize("n_envs", [1, 3, 8])
+@pytest.mark.parametrize("n_envs", only([3], [1, 3, 8]))
 @pytest.mark.parametrize(
     ("train_freq", "gradient_steps", "expected"),
     [
-        (1, 1, lambda steps: steps),
-        (4, 1, lambda steps: steps // 4),
+        pytest.param(1, 1, lambda steps: steps, marks=exhaustive),
         (4, 2, lambda steps: 2 * (steps // 4)),
         pytest.param(1, 3, lambda steps: 3 * steps, marks=exhaustive),
         (16, -1, lambda steps: None),
@@ -136,16 +131,6 @@ def test_training_actions_respect_asymmetrical_bounds_and_reach_both_ends():
     assert actions.dtype == np.float32
 
 
-def test_predicted_actions_are_in_the_range_of_the_environment():
-    env = Counter((5,), low=[2.0, -1.0], high=[6.0, -0.5])
-    agent = small_sac(env)
-    obs = np.random.default_rng(0).normal(size=(200, 3)).astype(np.float32)
-    for deterministic in (True, False):
-        action, _ = agent.predict(obs, deterministic=deterministic)
-        assert action.shape == (200, 2)
-        assert all(env.action_space.contains(a) for a in action)
-
-
 def test_what_is_stored_is_the_action_before_scaling():
     env = Counter((5,), low=[2.0], high=[6.0])
     agent = small_sac(env, learning_starts=NEVER).learn(5)
@@ -207,6 +192,13 @@ def test_the_window_of_statistics_keeps_the_last_episodes():
     assert agent.ep_info_buffer.maxlen == 3
     assert agent.statistics()["rollout/ep_rew_mean"] == pytest.approx(1601.0)
     assert agent.statistics()["rollout/ep_len_mean"] == 2.0
+    assert "rollout/success_rate" not in agent.statistics()
+    reaching = small_sac(Reach()).learn(40)
+    assert len(reaching.ep_success_buffer) == 4
+    row = reaching.statistics()
+    assert row["rollout/success_rate"] == np.mean(reaching.ep_success_buffer)
+    assert {"train/critic_loss", "train/actor_loss", "train/ent_coef", "train/n_updates"} <= set(row)
+    assert all(isinstance(value, int | float) for value in row.values())
 
 
 @pytest.mark.parametrize("window", [1, 200])
@@ -256,48 +248,19 @@ def test_the_best_return_stands_in_every_row_and_records_can_be_printed(capsys):
     assert agent.statistics()["rollout/ep_rew_best"] == 401.0
 
 
-def test_success_is_counted_where_the_environment_tells():
-    agent = small_sac(Reach(), learning_starts=NEVER).learn(40)
-    assert len(agent.ep_success_buffer) == 4
-    assert agent.statistics()["rollout/success_rate"] == np.mean(agent.ep_success_buffer)
-    assert "rollout/success_rate" not in small_sac(counters(1), learning_starts=NEVER).learn(10).statistics()
-
-
-def test_statistics_name_the_losses(agent):
-    row = agent.statistics()
-    assert {"train/critic_loss", "train/actor_loss", "train/ent_coef", "train/n_updates"} <= set(row)
-    assert all(isinstance(value, int | float) for value in row.values())
-
-
 # Callbacks.
 
 
-def test_a_callback_is_called_after_every_step_of_the_environments():
+@pytest.mark.parametrize("number", [int, np.float64])
+def test_only_false_stops_training_at_once_and_learning_can_go_on(number):
     seen = []
     agent = small_sac(counters(3), learning_starts=NEVER)
-    agent.learn(10, callback=lambda a, progress: seen.append((a is agent, progress.step)))
+    answers = iter([None, True, 0, []])
+    agent.learn(10, callback=lambda a, progress: seen.append((a is agent, progress.step)) or next(answers))
     assert seen == [(True, 3), (True, 6), (True, 9), (True, 10)]
-
-
-@pytest.mark.parametrize("answer", [None, True, 0, "", []])
-def test_only_false_stops_training(answer):
-    assert small_sac(counters(1), learning_starts=NEVER).learn(6, callback=lambda a, p: answer).num_timesteps == 6
-
-
-@pytest.mark.parametrize("number", [int, np.float64])
-def test_false_stops_training_at_once_and_learning_can_go_on(number):
     agent = small_sac(counters(1), learning_starts=NEVER)
     assert agent.learn(10, callback=lambda a, p: number(p.step) < 4).num_timesteps == 4
     assert agent.learn(10, reset_num_timesteps=False).num_timesteps == 14
-
-
-def test_several_callbacks_are_all_called_and_any_may_stop():
-    calls = []
-    first = lambda a, p: calls.append("first")  # noqa: E731
-    second = lambda a, p: (calls.append("second"), False)[1]  # noqa: E731
-    third = lambda a, p: calls.append("third")  # noqa: E731
-    small_sac(counters(1), learning_starts=NEVER).learn(5, callback=[first, second, third])
-    assert calls == ["first", "second", "third"]
 
 
 # Predictions.
@@ -313,7 +276,7 @@ SPACES["tuple"] = gym.spaces.Tuple([SPACES["discrete"], SPACES["box"]])
 SPACES["dict"] = gym.spaces.Dict({"z": SPACES["tuple"], "a": SPACES["bits"], "m": SPACES["many"]})
 
 
-@pytest.mark.parametrize("name", ["discrete", "image", "dict"])
+@pytest.mark.parametrize("name", only(["dict"], ["discrete", "image", "dict"]))
 def test_any_observation_can_be_predicted_on_and_learnt_from(name):
     space = SPACES[name]
     env = Sampled(space)
@@ -329,15 +292,6 @@ def test_any_observation_can_be_predicted_on_and_learnt_from(name):
     np.testing.assert_allclose(together[0], single, atol=1e-6)
 
 
-def test_actions_of_several_axes_come_back_in_their_shape():
-    env = Sampled(gym.spaces.Box(-1.0, 1.0, (3,)), gym.spaces.Box(-2.0, 2.0, (2, 2), np.float64))
-    agent = small_sac(env, learning_starts=4)
-    action, _ = agent.predict(np.zeros(3), deterministic=True)
-    assert (action.shape, action.dtype) == ((2, 2), np.float64)
-    assert agent.predict(np.zeros((5, 3)))[0].shape == (5, 2, 2)
-    assert agent.learn(6).n_updates == 2
-
-
 def test_deterministic_predictions_repeat_and_others_vary(agent):
     obs = np.ones((4, 3), np.float32)
     fixed = [agent.predict(obs, deterministic=True)[0] for _ in range(2)]
@@ -345,6 +299,9 @@ def test_deterministic_predictions_repeat_and_others_vary(agent):
     np.testing.assert_array_equal(*fixed)
     assert (drawn[0] != drawn[1]).all()
     assert len(np.unique(drawn[0])) == 4
+    for given in (obs[0].tolist(), obs.tolist()):  # lists of numbers
+        np.testing.assert_array_equal(agent.predict(given, deterministic=True)[0].ravel()[0], fixed[0][0, 0])
+    assert repr(agent) == "<rejeu.SAC on Counter, 20 steps, 12 updates>"
 
 
 @pytest.mark.parametrize(
@@ -371,46 +328,26 @@ def test_an_observation_without_a_key_is_refused():
         agent.predict({"observation": np.zeros(1), "achieved_goal": np.zeros(1), "desired_goal": np.zeros(2)})
 
 
-def test_an_observation_as_highway_env_gives_it_is_read_by_its_keys():
-    from collections import OrderedDict
-
-    agent = small_sac(Reach())
-    obs = {"observation": np.float32([1.0]), "achieved_goal": np.float32([2.0]), "desired_goal": np.float32([3.0])}
-    np.testing.assert_array_equal(
-        agent.predict(OrderedDict(obs), deterministic=True)[0], agent.predict(obs, deterministic=True)[0]
-    )
-
-
 # Parameters.
 
 
-def test_parameters_come_back_as_they_were_set():
+def test_parameters_come_back_as_they_were_set_as_a_whole_in_part_and_from_a_file(tmp_path):
     one, two = small_sac(counters(1), seed=0), small_sac(counters(1), seed=1)
     assert not same_parameters(one, two)
-    two.set_parameters(one.get_parameters())
+    two.get_parameters()["actor.head.bias"][:] = 99.0  # a copy
+    path = two.save(tmp_path / "model")
+    two.set_parameters(before := one.get_parameters())
     assert_same_parameters(one, two)
-    obs = np.ones((3, 3), np.float32)
-    np.testing.assert_array_equal(*(a.predict(obs, deterministic=True)[0] for a in (one, two)))
-
-
-def test_parameters_are_copies(agent):
-    agent.get_parameters()["actor.head.bias"][:] = 99.0
-    assert (np.abs(agent.get_parameters()["actor.head.bias"]) < 1).all()
-
-
-def test_parameters_are_taken_from_a_file(agent, tmp_path):
-    other = small_sac(counters(1), seed=1)
-    other.set_parameters(agent.save(tmp_path / "model"))
-    assert_same_parameters(agent, other)
-
-
-def test_a_part_of_the_parameters_may_be_set():
-    agent = small_sac(counters(1))
-    before = agent.get_parameters()
-    agent.set_parameters({"log_alpha": np.float32(-3.0)}, exact_match=False)
-    after = agent.get_parameters()
+    one.set_parameters({"log_alpha": np.float32(-3.0)}, exact_match=False)
+    after = one.get_parameters()
     assert after.pop("log_alpha") == -3.0
     assert all(np.array_equal(value, before[name]) for name, value in after.items())
+    one.set_parameters(path)
+    assert (np.abs(one.get_parameters()["actor.head.bias"]) < 1).all()
+    assert_same_parameters(one, rejeu.load(path))
+    one.set_parameters(two.get_parameters())
+    obs = np.ones((3, 3), np.float32)
+    np.testing.assert_array_equal(*(a.predict(obs, deterministic=True)[0] for a in (one, two)))
 
 
 @pytest.mark.parametrize(
@@ -532,36 +469,12 @@ def test_hindsight_rewards_come_from_the_new_environment():
     np.testing.assert_array_equal(batch.reward[:8], 7.0)
 
 
-def test_hindsight_works_with_several_environments_and_unfinished_episodes():
-    agent = small_sac(
-        InProcess([Reach() for _ in range(3)], seed=0),
-        replay_buffer_class=rejeu.HerReplayBuffer,
-        replay_buffer_kwargs={"n_sampled_goal": 3, "goal_selection_strategy": "future"},
-    ).learn(20)
-    assert agent.n_updates == 12
-    assert isinstance(agent.replay_buffer, rejeu.HerReplayBuffer)
-    batch = agent.replay_buffer.sample(np.random.default_rng(0), (40,))
-    expected = Reach().compute_reward(batch.next_obs["achieved_goal"], batch.obs["desired_goal"], {})
-    np.testing.assert_array_equal(batch.reward, expected)
-
-
 def test_action_noise_is_added_and_clipped():
     """Without it the policy's actions are tanh(0.5); with a mean of 3 they all become 1, the upper bound."""
     env = Counter((50,))
     agent = small_sac(env, learning_starts=0, learning_rate=0.0, action_noise=rejeu.NormalActionNoise([3.0], [0.1]))
     agent.learn(5)
     np.testing.assert_array_equal(np.stack(env.actions), 1.0)
-
-
-def test_the_representation_names_environment_and_progress(agent):
-    assert repr(agent) == "<rejeu.SAC on Counter, 20 steps, 12 updates>"
-
-
-def test_predict_takes_lists_of_numbers(agent):
-    one = [0.5, -0.5, 0.25]
-    expected, _ = agent.predict(np.array(one, np.float32), deterministic=True)
-    assert np.array_equal(agent.predict(one, deterministic=True)[0], expected)
-    assert np.array_equal(agent.predict([one, one], deterministic=True)[0], np.stack([expected] * 2))
 
 
 def test_a_loaded_agent_evaluates_where_it_was_trained(tmp_path):
@@ -595,8 +508,6 @@ def test_an_agent_of_an_environment_that_was_given_has_none_after_loading(tmp_pa
     path = small_sac(gym.make("Pendulum-v1")).save(tmp_path / "agent")
     with pytest.raises(ValueError, match="has no environment; give one"):
         rejeu.load(path).evaluate(1)
-
-
-def test_a_folder_without_a_model_is_named(tmp_path):
+    (empty := tmp_path / "empty").mkdir()
     with pytest.raises(FileNotFoundError, match="is a folder without a model"):
-        rejeu.load(tmp_path)
+        rejeu.load(empty)

@@ -10,6 +10,8 @@ import pytest
 import rejeu
 from rejeu import validation
 
+pytestmark = pytest.mark.usefixtures("learners_are_shared")
+
 SMALL = {"policy_kwargs": {"net_arch": [4]}, "seed": 0}
 
 

@@ -11,6 +11,8 @@ from rejeu.errors import BadEnvironmentError
 from tests.environments import Counter, Reach, Sampled
 from tests.helpers import small_sac
 
+pytestmark = pytest.mark.usefixtures("learners_are_shared")
+
 
 class WithoutGoal(Sampled):
     """A Dict observation without ``desired_goal``."""
@@ -45,7 +47,6 @@ MISTAKES = {
         "SAC has no setting 'seeds'; several runs at once are rejeu.train_seeds",
     ),
     "hyperparameter of nothing": (sac(Counter(), zzz=1), TypeError, "SAC has no setting 'zzz'; known: learning_rate"),
-    "misspelt argument": (sac(Counter(), verbos=1), TypeError, "no setting 'verbos'; did you mean verbose"),
     "unbounded actions": (
         sac(Sampled(gym.spaces.Box(-1.0, 1.0, (2,)), gym.spaces.Box(-np.inf, np.inf, (2,)))),
         ValueError,
@@ -78,7 +79,6 @@ MISTAKES = {
     "MlpPolicy for a Dict": (sac(Reach()), ValueError, "does not fit a Dict observation; use 'MultiInputPolicy'"),
     "MultiInputPolicy for a Box": (sac(Counter(), "MultiInputPolicy"), ValueError, "needs a Dict .*use 'MlpPolicy'"),
     "CnnPolicy for numbers": (sac(Counter(), "CnnPolicy"), ValueError, "needs a uint8 image .*use 'MlpPolicy'"),
-    "negative seed": (sac(Counter(), seed=-1), ValueError, "seed=-1 must be a whole number from 0"),
     "fractional seed": (sac(Counter(), seed=0.5), ValueError, "seed=0.5 must be a whole number"),
     "noise of another dimension": (
         sac(Counter(), action_noise=rejeu.NormalActionNoise([0.0, 0.0], [0.1, 0.1])),
@@ -110,18 +110,9 @@ def test_a_reward_that_is_no_number_ends_training_with_its_place(value):
         agent.learn(5)
     assert agent.replay_buffer.size() == 7
     assert np.isfinite(agent.replay_buffer.arrays()["reward"]).all()
-
-
-def test_after_a_bad_reward_the_agent_can_still_be_saved_and_trained(tmp_path):
-    env = Sampled(gym.spaces.Box(-1.0, 1.0, (3,)))
-    agent = small_sac(env, learning_starts=99).learn(7)
-    env.reward = np.nan
-    with pytest.raises(BadEnvironmentError):
-        agent.learn(5)
-    env.reward = 0.0
+    env.reward = 0.0  # and the agent can be trained on
     agent.learn(3, reset_num_timesteps=False)
     assert agent.replay_buffer.size() == 10
-    assert rejeu.SAC.load(agent.save(tmp_path / "model")).predict(np.zeros(3))[0].shape == (1,)
 
 
 def test_what_an_agent_does_not_have_is_said(tmp_path):

@@ -11,6 +11,8 @@ from rejeu.envs.make import InProcess
 from tests.environments import Counter, Reach
 from tests.helpers import assert_same_parameters, small_sac
 
+pytestmark = pytest.mark.usefixtures("learners_are_shared")
+
 HINDSIGHT = {"replay_buffer_class": rejeu.HerReplayBuffer}
 
 
@@ -20,9 +22,6 @@ def counting(n_envs, **settings):
 
 def reaching(n_envs, **settings):
     return small_sac(InProcess([Reach() for _ in range(n_envs)], seed=0), **HINDSIGHT, **settings)
-
-
-MAKERS = {"one environment": (counting, 1), "three": (counting, 3), "hindsight, two": (reaching, 2)}
 
 
 def assert_same_run(one, two):
@@ -38,38 +37,13 @@ def assert_same_run(one, two):
     assert (one.n_updates, one.run.step) == (two.n_updates, two.run.step)
 
 
-@pytest.mark.parametrize("name", MAKERS)
-def test_two_runs_with_one_seed_are_the_same_to_the_last_bit(name):
-    make, n_envs = MAKERS[name]
-    one, two = make(n_envs).learn(40), make(n_envs).learn(40)
-    assert one.n_updates == 32
-    assert_same_run(one, two)
-
-
-def test_functions_compiled_apart_give_the_same_bits():
-    """Agents of these tests share compiled functions; those of users do not."""
-    alone = rejeu.SAC(
-        "MlpPolicy",
-        InProcess([Counter((5, 3))], seed=0),
-        learning_starts=8,
-        batch_size=4,
-        buffer_size=300,
-        policy_kwargs={"net_arch": [8]},
-        seed=0,
-    )
-    assert_same_run(alone.learn(40), counting(1).learn(40))
-
-
-@pytest.mark.parametrize(
-    ("name", "parts"), [("one environment", (3, 18, 1, 18)), ("three", (9, 30)), ("hindsight, two", (14, 26))]
-)
-def test_learning_in_parts_is_learning_at_once(name, parts):
-    make, n_envs = MAKERS[name]
-    whole, pieces = make(n_envs).learn(sum(parts)), make(n_envs)
-    for part in parts:
-        pieces.learn(part, reset_num_timesteps=False)
-    assert pieces.num_timesteps == whole.num_timesteps
-    assert_same_run(whole, pieces)
+def test_two_runs_with_hindsight_are_the_same_to_the_last_bit_and_so_is_one_in_parts():
+    one, two, parts = (reaching(2) for _ in range(3))
+    for part in (14, 26):
+        parts.learn(part, reset_num_timesteps=False)
+    assert one.learn(40).n_updates == 32
+    assert_same_run(one, two.learn(40))
+    assert_same_run(one, parts)
 
 
 def test_learning_in_parts_is_learning_at_once_with_delayed_updates_and_noise():
@@ -83,18 +57,6 @@ def test_learning_in_parts_is_learning_at_once_with_delayed_updates_and_noise():
         pieces.learn(part, reset_num_timesteps=False)
     assert whole.n_updates > 20
     assert_same_run(whole, pieces)
-
-
-def test_what_happens_beside_training_does_not_change_it(tmp_path):
-    """Saving, reading statistics and predicting in a callback leave a run as it is."""
-
-    def look(agent, progress):
-        agent.save(tmp_path / "model")
-        agent.statistics()
-        agent.predict(np.zeros((2, 3)))
-        agent.get_parameters()
-
-    assert_same_run(counting(1).learn(20), counting(1).learn(20, callback=look))
 
 
 def test_evaluating_in_other_environments_does_not_change_training():

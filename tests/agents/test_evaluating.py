@@ -13,9 +13,9 @@ from rejeu.envs.make import InProcess, make_vector
 from rejeu.sb3.common.callbacks import BaseCallback, EvalCallback
 from rejeu.sb3.common.evaluation import evaluate_policy
 from rejeu.sb3.common.vec_env import DummyVecEnv
-from tests.environments import Counter, Reach
+from tests.environments import Counter
 from tests.helpers import assert_same_parameters, small_sac
-from tests.tiers import crossed
+from tests.tiers import crossed, only
 
 NEVER = 10**6
 """``learning_starts`` of agents that only act at random."""
@@ -44,26 +44,13 @@ PENDULUM = {
 }
 
 
-@pytest.mark.parametrize("kind", list(PENDULUM))
-def test_a_seed_determines_an_evaluation_in_the_agents_own_environment(kind):
-    agent = small_sac(PENDULUM[kind]())
-    first, again, other = (agent.evaluate(2, seed=seed).returns for seed in (7, 7, 8))
-    np.testing.assert_array_equal(first, again)
-    assert (first != other).all()
-
-
-@pytest.mark.parametrize("kind", list(PENDULUM))
-def test_a_seed_determines_an_evaluation_in_a_given_environment(kind):
-    agent, env = small_sac("Pendulum-v1"), PENDULUM[kind]()
-    first, again, other = (agent.evaluate(2, env=env, seed=seed).returns for seed in (7, 7, 8))
-    np.testing.assert_array_equal(first, again)
-    assert (first != other).all()
-
-
-def test_a_seed_determines_an_evaluation_in_the_view_of_the_agents_own_pool():
-    agent = small_sac(make_vector("Pendulum-v1", 2, "envpool"))
-    first, again = (agent.evaluate(2, env=agent.get_env(), seed=7).returns for _ in range(2))
-    np.testing.assert_array_equal(first, again)
+@pytest.mark.parametrize("kind", only(["SyncVectorEnv", "EnvPool", "an id"], PENDULUM))
+def test_a_seed_determines_an_evaluation_in_the_agents_own_and_in_a_given_environment(kind):
+    agent, env = small_sac(PENDULUM[kind]()), PENDULUM[kind]()
+    for given in (None, env, *([agent.get_env()] if kind == "EnvPool" else [])):
+        first, again, other = (agent.evaluate(2, env=given, seed=seed).returns for seed in (7, 7, 8))
+        np.testing.assert_array_equal(first, again)
+        assert (first != other).all()
 
 
 # While the agent learns. Counter refuses to be stepped once an episode is over.
@@ -76,7 +63,10 @@ OWN = {
 }
 
 
-@pytest.mark.parametrize("how", list(OWN))
+every_way = pytest.mark.parametrize("how", OWN)
+
+
+@every_way
 def test_an_off_policy_agent_may_be_evaluated_in_its_own_environment_while_it_learns(how):
     env = Counter((5,))
     agent = small_sac(env, learning_starts=NEVER).learn(23, every(7, lambda agent: OWN[how](agent, env)))
@@ -88,7 +78,7 @@ def test_an_off_policy_agent_may_be_evaluated_in_its_own_environment_while_it_le
     assert [e.length for e in agent.history.episodes] == [5, 5, 5]
 
 
-@pytest.mark.parametrize("how", list(OWN))
+@every_way
 def test_an_on_policy_agent_may_be_evaluated_in_its_own_environment_while_it_learns(how):
     env, seen = Counter((5,)), []
     agent = rejeu.A2C("MlpPolicy", env, n_steps=12, policy_kwargs={"net_arch": [4]}, seed=0)
@@ -125,7 +115,7 @@ LEARNERS = {
 }
 
 
-@pytest.mark.parametrize("name", list(LEARNERS))
+@pytest.mark.parametrize("name", only(["PPO, EnvPool", "PPO, whole episodes"], LEARNERS))
 def test_every_loop_goes_on_after_an_evaluation_in_a_callback(name):
     agent, results = LEARNERS[name](), []
     agent.learn(41, every(9, lambda agent: results.append(agent.evaluate(2, seed=5))))
@@ -194,7 +184,7 @@ def test_other_environments_are_refused_while_the_agent_learns_and_the_fix_is_sa
 # Between two calls of learn.
 
 
-@pytest.mark.parametrize("how", list(OWN))
+@every_way
 def test_training_goes_on_in_new_episodes_after_its_environment_was_played_in(how):
     env = Counter((5,))
     agent = small_sac(env, learning_starts=NEVER).learn(7)
@@ -210,12 +200,6 @@ def test_playing_in_other_environments_leaves_running_episodes_alone():
     agent.learn(6, reset_num_timesteps=False)
     assert [e.length for e in agent.history.episodes] == [5, 5]
     assert [e.step for e in agent.history.episodes] == [5, 10]
-
-
-def test_an_agent_without_environment_may_be_evaluated(tmp_path):
-    agent = rejeu.load(small_sac(Reach()).save(tmp_path / "model"))
-    assert len(agent.evaluate(3, env=InProcess([Reach()])).returns) == 3
-    assert len(evaluate_policy(agent, Reach(), 3, return_episode_rewards=True)[0]) == 3
 
 
 # Action masks.
@@ -267,18 +251,12 @@ def test_evaluate_policy_keeps_to_the_masks(masked, wrap, deterministic):
 
 def test_eval_callback_keeps_to_the_masks(masked):
     env = One()
-    callback = EvalCallback(env, eval_freq=12, n_eval_episodes=3, verbose=0)
+    from rejeu.sb3.common.vec_env import VecMonitor
+
+    callback = EvalCallback(VecMonitor(DummyVecEnv([lambda: env])), eval_freq=12, n_eval_episodes=3, verbose=0)
     masked.learn(24, callback=callback)
     assert (env.taken, env.illegal) == (36, 0)
     assert callback.best_mean_reward == 6.0
-
-
-def test_an_evaluation_finds_the_masks_behind_a_wrapper_of_the_vector(masked):
-    from rejeu.sb3.common.vec_env import VecMonitor
-
-    env = One()
-    masked.learn(12, callback=EvalCallback(VecMonitor(DummyVecEnv([lambda: env])), eval_freq=12, n_eval_episodes=3))
-    assert (env.taken, env.illegal) == (18, 0)
 
 
 def test_a_masked_agent_may_be_evaluated_in_its_own_environment_while_it_learns(masked):

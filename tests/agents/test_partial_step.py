@@ -9,6 +9,7 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
 from rejeu.envs.make import EnvPool, GymnasiumVector, InProcess, make_vector
 from tests.environments import Counter, Reach
+from tests.tiers import only
 
 LENGTHS = 2, 3, 5
 """Of every episode of three environments."""
@@ -41,7 +42,10 @@ def no_action(vector):
     return np.zeros((vector.n_envs, *vector.action_space.shape), np.float32)
 
 
-@pytest.mark.parametrize("name", EVERY)
+every_vector = pytest.mark.parametrize("name", only([name for name in EVERY if "workers" not in name], EVERY))
+
+
+@every_vector
 def test_whole_episodes_are_seen_while_those_that_ended_wait(name):
     """Counter's rewards are 100 times the episode plus the time, and it fails when it is stepped beyond its end."""
     vector = EVERY[name]()
@@ -64,7 +68,7 @@ def test_whole_episodes_are_seen_while_those_that_ended_wait(name):
     vector.close()
 
 
-@pytest.mark.parametrize("name", EVERY)
+@every_vector
 def test_environments_that_waited_can_begin_anew_while_others_go_on(name):
     vector = EVERY[name]()
     vector.reset()
@@ -88,14 +92,6 @@ def test_actions_of_environments_left_out_never_reach_one(name):
     vector.step(np.array([[0.5], [np.nan], [np.nan]], np.float32), np.array([True, False, False]))
     envs = vector.envs if isinstance(vector, InProcess) else vector.env.envs
     assert {float(action[0]) for env in envs for action in env.actions} == {0.5}
-
-
-def test_in_process_environments_left_out_stand_still():
-    vector = in_process()
-    vector.reset()
-    vector.step(no_action(vector), np.array([True, False, True]))
-    step = vector.step(no_action(vector), np.array([False, True, True]))
-    np.testing.assert_array_equal(step.obs[:, 1], [1, 1, 2])
 
 
 def test_envpool_steps_each_environment_as_if_it_were_alone():
@@ -167,15 +163,6 @@ def test_success_is_that_of_the_environments_stepped(mode):
         if not active.any():
             obs, active = vector.reset_done(np.ones(2, bool)), np.ones(2, bool)
     assert set(outcomes) == {True, False}
-
-
-@pytest.mark.parametrize("backend", ["gymnasium", "envpool"])
-def test_with_all_active_a_step_is_a_plain_one(backend):
-    one, two = (make_vector("Pendulum-v1", 3, backend, seed=5) for _ in range(2))
-    one.reset(), two.reset()
-    action = np.full((3, 1), 0.5, np.float32)
-    for part, other in zip(one.step(action, np.ones(3, bool))[:4], two.step(action)[:4], strict=True):
-        np.testing.assert_array_equal(part, other)
 
 
 def test_a_vector_that_overwrites_its_observations_keeps_those_left_out():

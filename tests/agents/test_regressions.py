@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import json
 import time
 import tracemalloc
 from types import SimpleNamespace
@@ -17,37 +16,22 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import rejeu
 from rejeu import core, spaces
-from rejeu.agents import AGENTS, training
-from rejeu.algorithms import config as configs
+from rejeu.agents import training
 from rejeu.buffers.ring import Ring
 from rejeu.buffers.uniform import ReplayBuffer
 from rejeu.envs.make import InProcess
-from rejeu.exploration.parameter_space import ParameterNoise
 from rejeu.io import checkpoint
 from rejeu.reporting.logging import Console, CsvFile
-from rejeu.sb3.common.vec_env import DummyVecEnv, VecVideoRecorder
 from tests.algorithms.probes.environments import Probe
-from tests.environments import Counter, Reach, Sampled
-from tests.every_agent import KINDS, env_of, small
-from tests.helpers import assert_same_parameters, count_updates, small_sac
-from tests.reporting.test_video import Lamp
-from tests.sharing import shared_learners
-from tests.tiers import exhaustive, only
+from tests.environments import Counter, Sampled
+from tests.every_agent import env_of, every_kind
+from tests.helpers import small_sac
+from tests.tiers import exhaustive
 
 NEVER = 10**6
-every_algorithm = pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
 
 
 # Hindsight.
-
-
-def test_action_noise_is_added_with_hindsight_too():
-    """A mean of 3 takes every action to its upper bound."""
-    noise = rejeu.NormalActionNoise([3.0], [0.1])
-    agent = small_sac(Reach(), replay_buffer_class=rejeu.HerReplayBuffer, learning_starts=0, action_noise=noise)
-    count_updates(agent)
-    actions = agent.learn(12).replay_buffer.sample(np.random.default_rng(0), (100,)).action
-    np.testing.assert_array_equal(actions, 1.0)
 
 
 class Pilgrim(gym.Env):
@@ -159,7 +143,7 @@ def parameter_names(kind, observation_space):
     return found
 
 
-@every_algorithm
+@every_kind
 def test_networks_and_targets_encode_images_each_by_themselves(kind):
     names = parameter_names(kind, PICTURE)
     parts = {part for part in names if part.removeprefix("target_") in ("actor", "critic", "critics", "network")}
@@ -169,7 +153,7 @@ def test_networks_and_targets_encode_images_each_by_themselves(kind):
         assert any("encoder.images" in name for name in names[part]), part
 
 
-@every_algorithm
+@every_kind
 def test_optimizers_hold_the_networks_that_learn_and_no_targets(kind):
     names = parameter_names(kind, Probe.observation_space)
     optimizers = {part for part in names if part.endswith("optimizer")}
@@ -179,44 +163,6 @@ def test_optimizers_hold_the_networks_that_learn_and_no_targets(kind):
         optimizer = {"log_alpha": "alpha_optimizer", "network": "optimizer"}.get(part, f"{part}_optimizer")
         moments = {f"{moment}.{name}".rstrip(".") for moment in ("mu", "nu") for name in names[part]}
         assert names[optimizer] == moments | {"count"}
-
-
-# Numbers of environments.
-
-
-@pytest.mark.parametrize("kind", only([KINDS["SAC"], KINDS["DQN"]], KINDS.values()), ids=KINDS)
-def test_a_loaded_agent_learns_with_any_number_of_environments(kind, tmp_path):
-    make = lambda n: InProcess([env_of(kind) for _ in range(n)])  # noqa: E731
-    path = small(kind, make(3), learning_starts=16, train_freq=8).learn(40).save(tmp_path / "model")
-    for n_envs in (1, 8):
-        with shared_learners():
-            loaded = rejeu.load(path, env=make(n_envs), learning_starts=8)
-        assert loaded.n_envs == n_envs
-        loaded.learn(8 + 17)
-        assert (loaded.num_timesteps, loaded.replay_buffer.size(), loaded.n_updates) == (25, 25, 3 + 2)
-
-
-@pytest.mark.parametrize("name", ["DQN", "QRDQN"])
-@pytest.mark.parametrize(("n_envs", "expected"), [(1, [12, 24, 36]), (3, [12, 24, 36]), (8, [16, 24, 40])])
-def test_targets_move_at_environment_steps_whatever_their_number(name, n_envs, expected):
-    """Every 12 steps, or as soon after as there is a gradient step, of which there is one a turn."""
-    kind, moved = KINDS[name], []
-    agent = small(
-        kind,
-        InProcess([env_of(kind) for _ in range(n_envs)]),
-        learning_starts=0,
-        train_freq=n_envs,
-        target_update_interval=12,
-    )
-    biases = [agent.get_parameters()]
-
-    def watch(agent, progress):
-        biases.append(agent.get_parameters())
-        if any((biases[-1][key] != biases[-2][key]).any() for key in biases[-1] if key.startswith("target_")):
-            moved.append(progress.step)
-
-    agent.learn(40, callback=watch)
-    assert moved == expected
 
 
 # Dtypes.
@@ -278,18 +224,6 @@ def test_a_file_of_more_than_4_gigabytes_comes_back(tmp_path):
     np.testing.assert_array_equal(arrays["tail"], [0.0, 1.0, 2.0])
 
 
-@pytest.mark.parametrize("name", AGENTS)
-def test_net_arch_none_is_the_default_before_and_after_saving(name):
-    kind = AGENTS[name].algorithm.Config
-    for policy_kwargs in ({"net_arch": None}, {}, None):
-        config = kind(policy_kwargs=policy_kwargs)
-        assert config == kind()
-        assert config.policy_kwargs.critic_widths((7, 5)) == config.policy_kwargs.actor_widths((7, 5)) == (7, 5)
-        saved = json.loads(json.dumps(configs.to_json(config)))
-        assert configs.rebuild(kind, saved, {}) == kind()
-        assert configs.rebuild(kind, saved, {"policy_kwargs": {"net_arch": None}}) == kind()
-
-
 # Memory.
 
 
@@ -319,33 +253,6 @@ def test_loading_a_hundred_times_keeps_no_memory(tmp_path):
     assert grown < 3 * buffer.stat().st_size
 
 
-def test_a_recording_does_not_keep_its_frames(tmp_path):
-    """Sixty pictures of 480,000 bytes each go to the file one by one."""
-
-    class Large(Lamp):
-        def render(self):
-            return np.full((400, 400, 3), 40 * self.time, np.uint8)
-
-    recorder = VecVideoRecorder(DummyVecEnv([lambda: Large("rgb_array")]), tmp_path, lambda step: step == 0, 60)
-    recorder.reset()
-    recorder.step(np.zeros((1, 1)))
-    tracemalloc.start()
-    try:
-        before = tracemalloc.get_traced_memory()[0]
-        for _ in range(50):
-            recorder.step(np.zeros((1, 1)))
-        assert recorder.recording
-        during = tracemalloc.get_traced_memory()[0] - before
-        for _ in range(20):
-            recorder.step(np.zeros((1, 1)))
-        assert not recorder.recording
-        after = tracemalloc.get_traced_memory()[0] - before
-    finally:
-        tracemalloc.stop()
-        recorder.close()
-    assert max(during, after) < 5 * 480_000
-
-
 # Logging.
 
 
@@ -369,33 +276,6 @@ def test_a_clock_that_stands_still_does_not_end_a_run(monkeypatch):
     agent.learn(12)
     assert agent.num_timesteps == 12
     assert len(agent.history) == 2
-
-
-# Exploration.
-
-NOISES = {
-    "normal": rejeu.NormalActionNoise([0.1], [0.3]),
-    "Ornstein-Uhlenbeck": rejeu.OrnsteinUhlenbeckActionNoise([0.0], [0.3], theta=0.2, repulsive=1e-3),
-    "parameters": ParameterNoise(),
-}
-
-
-@pytest.mark.parametrize("noise", NOISES.values(), ids=NOISES)
-def test_every_kind_of_noise_survives_saving(noise, tmp_path):
-    """Loaded, it is the same noise: two agents that go on from the same file take the same noisy actions."""
-    kind, path = KINDS["DDPG"], tmp_path / "model"
-    agent = small(kind, env_of(kind), action_noise=noise, learning_starts=4).learn(8)
-    agent.save(path)
-    runs = []
-    for _ in range(2):
-        with shared_learners():
-            loaded = rejeu.load(path, env=env_of(kind), learning_starts=0)
-        assert_same_parameters(agent, loaded)
-        assert loaded.config.action_noise == noise
-        runs.append(loaded.learn(10))
-    actions = [run.replay_buffer.arrays()["action"] for run in runs]
-    np.testing.assert_array_equal(*actions)
-    assert len(np.unique(actions[0])) > 5
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,8 @@ from tests.algorithms.batches import CLOCK, DISCRETE, N_ACTIONS, OBS_DIM, OBS_SP
 from tests.environments import Sampled
 from tests.numpy_networks import forward, layers, softmax
 
+pytestmark = pytest.mark.usefixtures("learners_are_shared")
+
 every_agent = pytest.mark.parametrize("kind", [rejeu.SAC, rejeu.DDPG])
 SMALL = {"policy_kwargs": {"net_arch": [5, 4]}}
 

@@ -4,16 +4,14 @@ A relation is a consequence of a definition that needs no second implementation:
 everywhere, each weight moves by the learning rate. It is checked for every algorithm that has the setting. What only loops,
 buffers and networks read is in :data:`ELSEWHERE`, with the tests that show it. A setting in neither fails.
 
-Nothing is compiled, since each configuration is used once or twice.
+By default a relation is checked for the cheapest algorithms that have a path of their own; ``scripts/test --all`` checks all.
 """
 
 from __future__ import annotations
 
-import ast
 import dataclasses
 import itertools
 import math
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -210,12 +208,19 @@ class Case(NamedTuple):
         self, change: Callable[[Any], Any] = lambda batch: batch, state: Any = None, step: int = 1, **settings: Any
     ) -> Result:
         """Takes an update, from ``state`` if given, on the batch that ``change`` returns of the usual one."""
-        with jax.disable_jit():
+        key = self.name, repr(settings)
+        if key not in MADE:
             made = self.make(**settings)
-            state = self.state(made) if state is None else state
-            batch = jax.tree.map(jnp.asarray, change(self.batch(made, state)))
-            after, metrics = made.update(state, batch, clock(step=step))
+            MADE[key] = made, jax.jit(made.update)
+        made, update = MADE[key]
+        state = self.state(made) if state is None else state
+        batch = jax.tree.map(jnp.asarray, change(self.batch(made, state)))
+        after, metrics = update(state, batch, clock(step=step))
         return Result(tree_to_arrays(state), tree_to_arrays(after), metrics, after)
+
+
+MADE: dict[tuple[str, str], tuple[Any, Any]] = {}
+"""Algorithms and their compiled updates, by case and settings."""
 
 
 def clock(progress: float = PROGRESS, step: int = 1) -> Clock:
@@ -247,14 +252,17 @@ def parallel(one: dict[str, np.ndarray], two: dict[str, np.ndarray]) -> float:
 Relation = Callable[[Case], None]
 SHOWN: dict[str, list[Relation]] = {}
 """The relations of each setting."""
+DEFAULT: dict[Relation, tuple[str, ...]] = {}
+"""The cases for which each relation is checked by default."""
 
 
-def shows(*fields: str) -> Callable[[Relation], Relation]:
-    """Declares that a relation shows what settings do."""
+def shows(*fields: str, by: str) -> Callable[[Relation], Relation]:
+    """Declares that a relation shows what settings do, by default for the cases ``by``, separated by ``/``."""
 
     def register(relation: Relation) -> Relation:
         for field in fields:
             SHOWN.setdefault(field, []).append(relation)
+        DEFAULT[relation] = tuple(by.split("/"))
         return relation
 
     return register
@@ -272,30 +280,26 @@ def minus_one(leaf: Any) -> Any:
     return -jnp.ones_like(leaf)
 
 
-@shows("learning_rate", "critic_learning_rate")
+@shows("learning_rate", "critic_learning_rate", by="DQN/PPO/PQN/CrossQ/IQL")
 def every_weight_moves_by_its_learning_rate(case: Case) -> None:
     if case.kind == "ARS":
         one, two = (case.update(learning_rate=rate) for rate in (0.1, 0.2))
         return close(two.moved, one.moved, 2.0)
-    for rate in (0.125, rejeu.Linear(0.5, 0.1)):
-        own = (
-            rejeu.Linear(0.05, 0.45) if "critic_learning_rate" in case.fields and case.kind != "RecurrentPPO" else None
-        )
-        settings = {"optimizer": UNIT, "learning_rate": rate}
-        found = case.update(**settings).moved
-        for name, moved in found.items():
-            if case.kind in PROJECTED and name not in ("actor.head.bias", "critics.head.bias", "log_alpha"):
-                continue
-            if case.kind != "TRPO" or is_of_value(name):  # its policy has a step of its own
-                moved = np.abs(moved) if name == "log_alpha" else -moved  # Adam's first step
-                np.testing.assert_allclose(moved, at(rate, PROGRESS), rtol=1e-4, atol=1e-6, err_msg=name)
-        if own is not None:
-            for name, moved in case.update(**settings, critic_learning_rate=own).moved.items():
-                expected = at(own if is_of_value(name) else rate, PROGRESS)
-                np.testing.assert_allclose(-moved, expected, rtol=1e-4, atol=1e-6, err_msg=name)
+    rate, own = rejeu.Linear(0.5, 0.1), rejeu.Linear(0.05, 0.45)
+    settings = {"optimizer": UNIT, "learning_rate": rate}
+    for name, moved in case.update(**settings).moved.items():
+        if case.kind in PROJECTED and name not in ("actor.head.bias", "critics.head.bias", "log_alpha"):
+            continue
+        if case.kind != "TRPO" or is_of_value(name):  # its policy has a step of its own
+            moved = np.abs(moved) if name == "log_alpha" else -moved  # Adam's first step
+            np.testing.assert_allclose(moved, at(rate, PROGRESS), rtol=1e-4, atol=1e-6, err_msg=name)
+    if "critic_learning_rate" in case.fields and case.kind != "RecurrentPPO":
+        for name, moved in case.update(**settings, critic_learning_rate=own).moved.items():
+            expected = at(own if is_of_value(name) else rate, PROGRESS)
+            np.testing.assert_allclose(-moved, expected, rtol=1e-4, atol=1e-6, err_msg=name)
 
 
-@shows("max_grad_norm", "clip_grad_value", "optimizer")
+@shows("max_grad_norm", "clip_grad_value", "optimizer", by="DQN/QRDQN/PQN/IQL")
 def gradients_are_limited_and_then_given_to_the_optimizer(case: Case) -> None:
     """With plain gradient descent at the rate 1 the step is the gradient."""
     if case.kind in PROJECTED:  # the step is projected: seen from the biases of heads, which are not
@@ -304,7 +308,6 @@ def gradients_are_limited_and_then_given_to_the_optimizer(case: Case) -> None:
         bias = lambda one: {"bias": one.moved["critics.head.bias"]}  # noqa: E731
         close(bias(twice), bias(free), 2.0)
         assert 0 < norm(bias(limited).values()) < min(1e-2, norm(bias(free).values()))
-        assert parallel(bias(limited), bias(free)) > 0.999
         return
     free = case.update(learning_rate=1.0)
     policy = lambda name: case.kind == "TRPO" and not is_of_value(name)  # noqa: E731
@@ -330,7 +333,7 @@ def gradients_are_limited_and_then_given_to_the_optimizer(case: Case) -> None:
 # Targets.
 
 
-@shows("tau", "target_update_interval")
+@shows("tau", "target_update_interval", by="DQN/IQL")
 def targets_move_the_share_tau_of_the_way_once_an_interval(case: Case) -> None:
     for tau in (0.25, 1.0):
         one = case.update(tau=tau, step=2, target_update_interval=2) if is_q(case) else case.update(tau=tau)
@@ -353,33 +356,7 @@ def is_q(case: Case) -> bool:
     return case.kind in ("DQN", "QRDQN", "IQN")
 
 
-@shows("alpha", "actor_bc")
-def the_actor_is_pulled_to_recorded_actions(case: Case) -> None:
-    """Its step is one part by the values, and one that is proportional to the weight of the distance from actions."""
-    if case.kind == "TD3BC":
-        none, one, two = (case.update(alpha=alpha).moved for alpha in (0.0, 1.0, 2.0))
-    else:
-        none, one, two = (case.update(actor_bc=weight).moved for weight in (0.0, 1.0, 2.0))
-    both = {name: none[name] + 2 * (one[name] - none[name]) for name in none if name.startswith("actor.")}
-    close({name: two[name] for name in both}, both)
-    assert differ(none, one)
-
-
-@shows("critic_bc")
-def next_actions_far_from_recorded_ones_are_worth_less(case: Case) -> None:
-    made, (none, one, two) = case.make(), (case.update(critic_bc=weight) for weight in (0.0, 1.0, 2.0))
-    state = case.state(made)
-    batch = case.batch(made, state)
-    taken = np.asarray(made.exploit(state.target_actor, batch.next_obs))
-    distance = np.where(np.isnan(batch.next_action), 0.0, taken - batch.next_action)
-    penalty = batch.discount * np.square(distance).sum(axis=1)
-    changed = case.update(lambda batch: batch._replace(reward=batch.reward - penalty), critic_bc=0.0)
-    close(one.first, changed.first)
-    assert differ(one.first, none.first)
-    assert differ(one.first, two.first)
-
-
-@shows("critic_layer_norm")
+@shows("critic_layer_norm", by="ReBRAC")
 def critics_alone_have_layer_norm(case: Case) -> None:
     shapes = lambda on: jax.eval_shape(case.make(critic_layer_norm=on).init, jax.random.PRNGKey(0))  # noqa: E731
     state = case.make(critic_layer_norm=False, policy_kwargs={"net_arch": [5], "layer_norm": True})
@@ -389,7 +366,7 @@ def critics_alone_have_layer_norm(case: Case) -> None:
     assert names(shapes(True).critics) != names(shapes(False).critics)
 
 
-@shows("policy_delay")
+@shows("policy_delay", by="CrossQ")
 def the_actor_learns_once_a_delay(case: Case) -> None:
     moves, state = [], None
     for _ in range(4):
@@ -402,30 +379,13 @@ def the_actor_learns_once_a_delay(case: Case) -> None:
     assert moves == [{False}, {True}] * 2
 
 
-@shows("target_subset")
-def the_target_is_the_smallest_of_so_many_critics_that_each_update_draws(case: Case) -> None:
-    """Over many updates with three critics, rewards of 0 and no entropy: every pair occurs, and no other number of critics."""
-    made = case.make(n_critics=3, target_subset=2, ent_coef=1e-12)
-    state = made.init(jax.random.PRNGKey(1))
-    found: set[bytes] = set()
-    for i in range(40):
-        index = case.config(n_critics=3, target_subset=2).for_target(jnp.arange(3.0), jax.random.PRNGKey(i))
-        assert len(set(index.tolist())) == 2
-        found.add(bytes(sorted(np.asarray(index, np.uint8).tolist())))
-    assert len(found) == 3
-    assert case.config(n_critics=3).for_target(jnp.arange(3.0), jax.random.PRNGKey(0)).shape == (3,)
-    all_three, two = (case.update(n_critics=3, target_subset=n, state=state).metrics[TD_ERROR] for n in (3, 2))
-    assert case.kind == "TQC" or np.abs(all_three - two).max() > 1e-6
-
-
-@shows("target_policy_noise", "target_noise_clip")
+@shows("target_policy_noise", "target_noise_clip", by="TD3")
 def the_targets_noise_is_scaled_and_then_clipped(case: Case) -> None:
     error = lambda noise, clip: case.update(  # noqa: E731
         target_policy_noise=noise, target_noise_clip=clip
     ).metrics[TD_ERROR]
     none = error(0.0, 0.5)
     np.testing.assert_array_equal(none, error(0.3, 0.0))
-    np.testing.assert_array_equal(error(0.01, 5.0), error(0.01, 50.0))
     np.testing.assert_allclose(error(1e6, 0.1), error(1e7, 0.1), atol=1e-6)
     by = [np.abs(error(noise, 5.0) - none).max() for noise in (1e-3, 1e-2)]
     assert by[1] == pytest.approx(10 * by[0], rel=0.2)
@@ -435,19 +395,18 @@ def the_targets_noise_is_scaled_and_then_clipped(case: Case) -> None:
 # Values.
 
 
-@shows("double_q")
+@shows("double_q", by="DQN")
 def double_q_learning_lets_the_network_choose_and_the_target_rate(case: Case) -> None:
     far = lambda batch: batch._replace(obs=9 * batch.obs, next_obs=9 * batch.next_obs)  # noqa: E731
     batch = far(discrete_batch(0, SIZE))
     for double_q in (False, True):
         settings = {"double_q": double_q, "target_update_interval": 1000}
-        with jax.disable_jit():
-            state = case.state(case.make(**settings))
-            made, nets = case.make(**settings), (state.network, state.target_network)
-            rated = lambda network, obs: made.action_values(SimpleNamespace(network=network), obs, None)[0]  # noqa: E731, B023
-            values, theirs = (rated(network, batch.next_obs) for network in nets)
-            chosen = np.asarray(values if double_q else theirs).argmax(axis=1)
-            taken = np.asarray(rated(state.network, batch.obs))[np.arange(SIZE), batch.action]
+        made = case.make(**settings)
+        state = case.state(made)
+        rated = lambda network, obs: made.action_values(SimpleNamespace(network=network), obs, None)[0]  # noqa: E731, B023
+        values, theirs = (rated(network, batch.next_obs) for network in (state.network, state.target_network))
+        chosen = np.asarray(values if double_q else theirs).argmax(axis=1)
+        taken = np.asarray(rated(state.network, batch.obs))[np.arange(SIZE), batch.action]
         assert (np.argmax(values, axis=1) != np.argmax(theirs, axis=1)).any()
         target = batch.reward + batch.discount * np.asarray(theirs)[np.arange(SIZE), chosen]
         found = case.update(far, **settings).metrics[TD_ERROR]
@@ -457,7 +416,7 @@ def double_q_learning_lets_the_network_choose_and_the_target_rate(case: Case) ->
             np.testing.assert_allclose(found, np.abs(taken - target), atol=1e-5)
 
 
-@shows("loss")
+@shows("loss", by="DQN")
 def the_loss_is_the_mean_of_its_function_of_the_errors(case: Case) -> None:
     large = lambda batch: batch._replace(reward=3.0 * batch.reward)  # noqa: E731
     for loss, of in (("squared", np.square), ("huber", lambda e: np.where(e < 1, 0.5 * e**2, e - 0.5))):
@@ -467,7 +426,7 @@ def the_loss_is_the_mean_of_its_function_of_the_errors(case: Case) -> None:
         assert float(metrics["loss"]) == pytest.approx(np.mean(of(errors)), rel=1e-5)
 
 
-@shows("n_critics", "n_quantiles", "dueling")
+@shows("n_critics", "n_quantiles", "dueling", by="DQN/QRDQN/TQC/SAC")
 def the_critics_have_the_number_and_outputs_asked_for(case: Case) -> None:
     shapes = lambda **settings: {  # noqa: E731
         name: leaf.shape
@@ -487,67 +446,33 @@ def the_critics_have_the_number_and_outputs_asked_for(case: Case) -> None:
         assert {name.split(".")[-2] for name in moved} >= {"value_head", "advantage_head"}
 
 
-@shows("top_quantiles_to_drop_per_net")
-def the_more_quantiles_are_dropped_the_lower_the_target(case: Case) -> None:
-    """A target below all predictions, from rewards of -100, moves away by as much as the bootstrapped value falls."""
-    low = lambda batch: batch._replace(reward=batch.reward - 100.0)  # noqa: E731
-    errors = [case.update(low, top_quantiles_to_drop_per_net=n).metrics[TD_ERROR] for n in range(5)]
-    bootstraps = box_batch(0, SIZE).discount > 0
-    assert (np.diff(errors, axis=0)[:, bootstraps] > 1e-4).all()
-    np.testing.assert_allclose(np.diff(errors, axis=0)[:, ~bootstraps], 0.0, atol=1e-4)
-
-
-# Entropy.
-
-
-@shows("ent_coef")
-def the_entropy_bonus_is_weighted(case: Case) -> None:
-    if case.off_policy:
-        learned, fixed = case.update(ent_coef="auto_0.3"), case.update(ent_coef=0.3)
-        for one in (learned, fixed):
-            assert float(one.metrics["ent_coef"]) == pytest.approx(0.3)
-        assert fixed.moved["log_alpha"] == 0 != learned.moved["log_alpha"]
-        networks = lambda one: {name: value for name, value in one.moved.items() if name != "log_alpha"}  # noqa: E731
-        close(networks(fixed), networks(learned))
-        assert differ(networks(fixed), networks(case.update(ent_coef=0.6)))
-        return
-    none, one, two = (case.update(ent_coef=c) for c in (0.0, 0.5, 1.0))
-    by = lambda result: {name: m - none.moved[name] for name, m in result.moved.items()}  # noqa: E731
-    close(by(two), by(one), 2.0)
-    assert norm(by(one).values()) > 1e-4
-    raised = case.update(ent_coef=10.0, state=none.state)
-    again = case.update(ent_coef=0.0, state=raised.state), case.update(ent_coef=0.0, state=none.state)
-    assert -again[0].metrics["entropy_loss"] > -again[1].metrics["entropy_loss"]
-
-
-@shows("target_entropy")
+@shows("target_entropy", by="CrossQ")
 def the_temperature_rises_where_the_entropy_is_below_its_target(case: Case) -> None:
     """And its loss is ``log alpha (entropy - target)``."""
     automatic = -ACTION_DIM if case.space is BOX else 0.3 * math.log(N_ACTIONS)
     automatic *= 0.5 if case.kind == "XQC" else 1.0
     entropy = float(case.update().metrics["entropy"])
-    for given, target in (("auto", automatic), (entropy + 0.5, entropy + 0.5), (entropy - 0.5, entropy - 0.5)):
+    for given, target in (("auto", automatic), (entropy + 0.5, entropy + 0.5)):
         found = case.update(target_entropy=given, ent_coef="auto_0.3")
         rest = float(found.metrics["ent_coef_loss"]) / math.log(0.3)
         assert float(found.metrics["entropy"]) - rest == pytest.approx(target, abs=1e-4)
         assert np.sign(found.moved["log_alpha"]) == np.sign(target - float(found.metrics["entropy"]))
 
 
-@shows("use_sde", "sde_sample_freq", "sde_log_std_init")
+@shows("use_sde", "sde_sample_freq", "sde_log_std_init", by="SAC")
 def state_dependent_noise_stays_for_so_many_steps(case: Case) -> None:
     if case.kind == "RecurrentPPO":
         return  # refuses it
     own = {"sde_log_std_init": -1.5} if "sde_log_std_init" in case.fields else {"policy_kwargs": {"log_std_init": -1.5}}
     for freq, kept in ((2, [True, False, True, False]), (-1, [True] * 4)) if case.space is BOX else ():
-        with jax.disable_jit():
-            made = case.make(use_sde=True, sde_sample_freq=freq, **own)
-            actor = made.actor(made.init(jax.random.PRNGKey(0)))
-            log_std, matrices = actor.log_std, []
-            carry, obs = made.explorer.init(actor, 1), jnp.ones((1, OBS_DIM))
-            for i in range(5):
-                ended, key = jnp.array([i == 0]), jax.random.PRNGKey(i)
-                _, carry = made.explorer.act(carry, actor, obs, ended, key, clock())
-                matrices.append(carry[0])
+        made = case.make(use_sde=True, sde_sample_freq=freq, **own)
+        actor = made.actor(made.init(jax.random.PRNGKey(0)))
+        log_std, matrices = actor.log_std, []
+        carry, obs = made.explorer.init(actor, 1), jnp.ones((1, OBS_DIM))
+        for i in range(5):
+            ended, key = jnp.array([i == 0]), jax.random.PRNGKey(i)
+            _, carry = made.explorer.act(carry, actor, obs, ended, key, clock())
+            matrices.append(carry[0])
         np.testing.assert_allclose(log_std, -1.5, rtol=1e-6)
         assert [bool((a == b).all()) for a, b in itertools.pairwise(matrices)] == kept
     assert case.make().explorer is None
@@ -556,7 +481,7 @@ def state_dependent_noise_stays_for_so_many_steps(case: Case) -> None:
 # Exploration of Q-learning.
 
 
-@shows("exploration_initial_eps", "exploration_final_eps", "exploration_fraction", "exploration_schedule")
+@shows("exploration_initial_eps", "exploration_final_eps", "exploration_fraction", "exploration_schedule", by="DQN")
 def so_large_a_share_of_the_actions_is_random(case: Case) -> None:
     n = 4000
     settings = {"exploration_initial_eps": 0.8, "exploration_final_eps": 0.2, "exploration_fraction": 0.5}
@@ -575,13 +500,13 @@ def so_large_a_share_of_the_actions_is_random(case: Case) -> None:
 # Rollouts.
 
 
-@shows("batch_size", "n_epochs", "n_critic_updates")
+@shows("batch_size", "n_epochs", "n_critic_updates", by="PQN")
 def a_rollout_is_learned_from_so_often_in_parts_of_so_many_steps(case: Case) -> None:
     """With an optimizer whose direction is 1, weights show the number of gradient steps."""
     if case.off_policy:
         return  # a batch is what the buffer draws: see ELSEWHERE
     passes = "n_critic_updates" if case.kind == "TRPO" else "n_epochs"
-    for n_passes, batch_size, expected in ((1, 16, 1), (3, 16, 3), (2, 8, 4), (1, 100, 1)):
+    for n_passes, batch_size, expected in ((3, 16, 3), (2, 8, 4), (1, 100, 1)):
         settings = {passes: n_passes, "batch_size": batch_size, "optimizer": UNIT, "learning_rate": 1e-3}
         found = case.update(**settings)
         name = next(name for name in found.moved if is_of_value(name) or case.kind == "PQN")
@@ -589,7 +514,7 @@ def a_rollout_is_learned_from_so_often_in_parts_of_so_many_steps(case: Case) -> 
         assert float(found.metrics[GRADIENT_STEPS]) == expected + (case.kind == "TRPO")
 
 
-@shows("gae_lambda", "q_lambda")
+@shows("gae_lambda", "q_lambda", by="PQN")
 def lambda_says_how_far_rewards_reach_back(case: Case) -> None:
     """0 is cutting the rollout after every step, and without bootstrapping nothing depends on it."""
     key = "q_lambda" if case.kind == "PQN" else "gae_lambda"
@@ -603,50 +528,6 @@ def lambda_says_how_far_rewards_reach_back(case: Case) -> None:
     close(update(1.0, discount=alone).moved, update(0.0, discount=alone).moved)
 
 
-@shows("vf_coef")
-def the_values_loss_is_weighted(case: Case) -> None:
-    none, one, two = (case.update(vf_coef=c).moved for c in (0.0, 0.5, 1.0))
-    for name, moved in none.items():
-        if is_of_value(name):
-            assert not moved.any()
-            np.testing.assert_allclose(two[name], 2 * one[name], rtol=1e-4, atol=1e-6)
-        else:
-            np.testing.assert_allclose(two[name], moved, rtol=1e-4, atol=1e-6)
-    assert any(one[name].any() for name in none if is_of_value(name))
-
-
-@shows("normalize_advantage")
-def normalized_advantages_have_no_unit(case: Case) -> None:
-    """Where the value is 0 everywhere and nothing is bootstrapped, advantages are the rewards."""
-    made = case.make()
-    state = made.init(jax.random.PRNGKey(1))
-    readers = lambda s: getattr(s.network, "readers", s.network).value_head  # noqa: E731
-    state = eqx.tree_at(readers, state, jax.tree.map(jnp.zeros_like, readers(state)))
-    alone = np.zeros((N_STEPS, N_ENVS), np.float32)
-    scaled = lambda batch: batch._replace(reward=3.0 * batch.reward + 2.0, discount=alone)  # noqa: E731
-    plain = lambda batch: batch._replace(discount=alone)  # noqa: E731
-    for normalize in (True, False):
-        found = [case.update(c, state=state, normalize_advantage=normalize).moved for c in (plain, scaled)]
-        one, two = ({name: m for name, m in moved.items() if not is_of_value(name)} for moved in found)
-        assert differ(one, two, 1e-3) == (not normalize)
-    with pytest.raises(AssertionError):
-        close(found[0], case.update(plain, state=state, normalize_advantage=True).moved)
-
-
-@shows("clip_range", "clip_range_vf")
-def ratios_and_values_are_clipped_to_their_range(case: Case) -> None:
-    settings = {"n_epochs": 3, "learning_rate": 0.5}
-    huge, tiny, usual = (case.update(clip_range=c, **settings) for c in (1e6, 1e-3, 0.2))
-    assert float(huge.metrics["clip_fraction"]) == 0 < float(tiny.metrics["clip_fraction"])
-    assert float(tiny.metrics["clip_range"]) == pytest.approx(1e-3)
-    assert differ(huge.moved, tiny.moved)
-    assert differ(usual.moved, tiny.moved)
-    none, far, near = (case.update(clip_range_vf=c, **settings) for c in (None, 1e6, 1e-3))
-    close(none.moved, far.moved)
-    value = lambda one: {name: m for name, m in one.moved.items() if is_of_value(name)}  # noqa: E731
-    assert norm(value(near).values()) < 0.9 * norm(value(far).values())
-
-
 def normal_divergence(mean: Any, log_std: Any, other_mean: Any, other_log_std: Any) -> float:
     """Returns the mean KL divergence of the second normal distribution from the first."""
     variance, other = np.exp(2 * log_std), np.exp(2 * other_log_std)
@@ -654,7 +535,7 @@ def normal_divergence(mean: Any, log_std: Any, other_mean: Any, other_log_std: A
     return float(np.mean(np.sum(np.broadcast_to(each, mean.shape), axis=-1)))
 
 
-@shows("target_kl")
+@shows("target_kl", by="TRPO")
 def the_divergence_is_bounded(case: Case) -> None:
     if case.kind == "TRPO":
         reached = [float(case.update(target_kl=kl).metrics["kl_divergence_loss"]) for kl in (1e-3, 1e-2)]
@@ -674,63 +555,10 @@ def the_divergence_is_bounded(case: Case) -> None:
     assert steps == [5, 5, 1]  # the first step starts at the policy that acted
 
 
-@shows("use_rms_prop", "rms_prop_eps")
-def rmsprop_divides_by_the_root_of_the_mean_square(case: Case) -> None:
-    gradient = case.update(learning_rate=1.0).moved
-    for epsilon in (1e-5, 3.0):
-        found = case.update(learning_rate=1.0, optimizer=None, rms_prop_eps=epsilon).moved
-        expected = {name: g / (0.1 * np.abs(g) + epsilon) for name, g in gradient.items()}
-        close(found, expected)
-        adam = case.update(learning_rate=1.0, optimizer=None, use_rms_prop=False, rms_prop_eps=epsilon).moved
-        close(adam, {name: g / (np.abs(g) + epsilon) for name, g in gradient.items()}, atol=1e-3)
-
-
-# TRPO.
-
-
-@shows("cg_max_steps", "cg_damping")
-def one_conjugate_gradient_and_a_large_damping_both_go_along_the_gradient(case: Case) -> None:
-    policy = lambda **settings: {  # noqa: E731
-        name: m for name, m in case.update(target_kl=1e-4, **settings).moved.items() if not is_of_value(name)
-    }
-    one, damped, usual = policy(cg_max_steps=1), policy(cg_damping=1e4), policy()
-    assert parallel(one, damped) > 0.999 > 0.99 > parallel(usual, one)
-    assert norm(damped.values()) < 0.1 * norm(one.values())
-
-
-@shows("line_search_shrinking_factor", "line_search_max_iter")
-def the_line_search_shrinks_by_its_factor_and_gives_up(case: Case) -> None:
-    """A bound so large that the first attempts are refused."""
-    far = {"target_kl": 4.0, "cg_damping": 0.0}
-    policy = lambda **settings: {  # noqa: E731
-        name: m for name, m in case.update(**far, **settings).moved.items() if not is_of_value(name)
-    }
-    assert not any(m.any() for m in policy(line_search_max_iter=1).values())
-    one, two = policy(line_search_shrinking_factor=0.5), policy(line_search_shrinking_factor=0.25)
-    assert parallel(one, two) > 0.9999
-    attempts = math.log(norm(one.values()) / norm(two.values()), 2)
-    assert attempts == pytest.approx(round(attempts), abs=1e-2)
-
-
-@shows("sub_sampling_factor")
-def the_policys_step_is_that_of_every_so_many_steps(case: Case) -> None:
-    """Two environments alternate in a flat rollout: a factor of 2 leaves the first."""
-    alone = np.zeros((N_STEPS, N_ENVS), np.float32)
-    without = lambda batch: batch._replace(discount=alone, reward=np.float32([[1.0, 0.0]]) * batch.reward)  # noqa: E731
-    other = lambda batch: batch._replace(discount=alone, reward=np.float32([[1.0, 7.0]]) * batch.reward)  # noqa: E731
-    policy = lambda change, factor: {  # noqa: E731
-        name: m for name, m in case.update(change, sub_sampling_factor=factor).moved.items() if not is_of_value(name)
-    }
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "with sub_sampling_factor=2")
-        close(policy(without, 2), policy(other, 2))
-    assert differ(policy(without, 1), policy(other, 1))
-
-
 # ARS.
 
 
-@shows("zero_policy", "delta_std")
+@shows("zero_policy", "delta_std", by="ARS")
 def the_search_begins_at_zero_and_perturbs_by_its_deviation(case: Case) -> None:
     for zero in (True, False):
         made = case.make(zero_policy=zero, delta_std=0.1, policy_kwargs={})
@@ -746,7 +574,7 @@ def the_search_begins_at_zero_and_perturbs_by_its_deviation(case: Case) -> None:
             jax.tree.map(lambda p, e: np.testing.assert_allclose(p[0], e, atol=1e-6), playing.network, expected)
 
 
-@shows("n_delta", "n_top", "n_eval_episodes", "alive_bonus_offset")
+@shows("n_delta", "n_top", "n_eval_episodes", "alive_bonus_offset", by="ARS")
 def returns_of_whole_episodes_weigh_the_directions(case: Case) -> None:
     """Eight episodes in the rollout: 2 of 2 steps in each of 2 environments, twice."""
     made, four = case.make(), case.update(n_delta=4)
@@ -777,23 +605,9 @@ RELATIONS = [
 ]
 
 
-DERIVED = ("RecurrentPPO", "MaskablePPO", "QRDQN", "IQN", "TD3BC", "ReBRAC")
-"""They have the functions of PPO, DQN or TD3; by default few of their relations are checked, and
-none of :data:`PROJECTED`, which take long."""
-OWN = (
-    the_actor_is_pulled_to_recorded_actions,
-    next_actions_far_from_recorded_ones_are_worth_less,
-    critics_alone_have_layer_norm,
-)
-"""Relations that are checked for these too."""
-
-
 @pytest.mark.parametrize(
     "pair",
-    only(
-        [p for p in RELATIONS if p[0] in OWN or p[1].name not in (*DERIVED, *PROJECTED)],
-        RELATIONS,
-    ),
+    only([p for p in RELATIONS if p[1].name in DEFAULT[p[0]]], RELATIONS),
     ids=[f"{relation.__name__}-{case.name}" for relation, case in RELATIONS],
 )
 def test_a_setting_does_what_its_definition_says(pair: tuple[Relation, Case]) -> None:
@@ -828,14 +642,7 @@ def outcome(case: Case, **settings: Any) -> tuple[dict[str, np.ndarray], dict[st
 
 @pytest.mark.parametrize(
     "pair",
-    only(
-        [
-            pair
-            for pair in SCHEDULES
-            if pair[0].name not in PROJECTED and (pair[0].name not in DERIVED or pair[1] == "learning_rate")
-        ],
-        SCHEDULES,
-    ),
+    only([p for p in SCHEDULES if (p[0].name, p[1]) in (("ARS", "delta_std"), ("DQN", "learning_rate"))], SCHEDULES),
     ids=[f"{case.name}-{field}" for case, field in SCHEDULES],
 )
 def test_a_schedule_is_its_value_at_the_progress_of_the_clock(pair: tuple[Case, str]) -> None:
@@ -861,7 +668,21 @@ RAINBOW = "tests/algorithms/test_rainbow.py"
 FLASHSAC = "tests/algorithms/test_flashsac.py"
 RECURRENT = "tests/algorithms/test_recurrent_ppo.py"
 FORWARD = f"{NETWORKS}::test_forward_passes_equal_numpy"
+UPDATES, TRPO = "tests/algorithms/test_off_policy_updates.py::test_updates_equal_numpy", "tests/algorithms/test_trpo.py"
+A2C = "tests/algorithms/test_a2c.py::test_three_updates_equal_numpy"
 ELSEWHERE = {
+    # Whole updates that equal NumPy's.
+    **dict.fromkeys(("actor_bc", "critic_bc", "target_subset", "top_quantiles_to_drop_per_net", "ent_coef"), UPDATES),
+    **dict.fromkeys(("clip_range", "clip_range_vf"), f"{PPO}::test_two_updates_equal_numpy"),
+    **dict.fromkeys(("vf_coef", "normalize_advantage", "use_rms_prop", "rms_prop_eps"), A2C),
+    "cg_max_steps": f"{TRPO}::test_the_step_is_the_natural_gradient_scaled_to_the_bound",
+    "cg_damping": f"{TRPO}::test_a_step_that_does_not_improve_is_refused",
+    **dict.fromkeys(
+        ("line_search_shrinking_factor", "line_search_max_iter"),
+        f"{TRPO}::test_the_step_is_within_the_bound_and_the_attempt_before_it_was_not",
+    ),
+    "sub_sampling_factor": f"{TRPO}::test_every_so_many_steps_count_for_the_policy",
+    # Loops, buffers and networks.
     "gamma": f"{AGENT}::test_a_time_limit_still_bootstraps_and_a_termination_does_not",
     "normalize": f"{NORMALIZATION}::test_every_algorithm_learns_on_scaled_numbers_and_keeps_them_in_its_file",
     "share_goals": f"{NORMALIZATION}::test_achieved_and_desired_goals_share_their_statistics_unless_told_otherwise",
@@ -953,8 +774,7 @@ def test_every_setting_is_in_one_of_the_tables() -> None:
     assert set(AGENTS) == {case.kind for case in CASES}
 
 
-@pytest.mark.parametrize("place", sorted(set(ELSEWHERE.values())))
-def test_what_shows_a_setting_elsewhere_is_there(place: str) -> None:
-    file, _, name = place.partition("::")
-    tree = ast.parse((ROOT / file).read_text(encoding="utf-8"))
-    assert name in {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}
+def test_what_shows_a_setting_elsewhere_is_there() -> None:
+    for place in set(ELSEWHERE.values()):
+        file, _, name = place.partition("::")
+        assert f"\ndef {name}(" in (ROOT / file).read_text(encoding="utf-8"), place

@@ -20,6 +20,9 @@ from rejeu.normalization import NormalizationConfig, normalizer_of
 from tests.algorithms.batches import BOX, CLOCK, DISCRETE, OBS_SPACE, box_batch, noise_of
 from tests.environments import Reach
 from tests.networks.test_projected import numpy_torso
+from tests.tiers import exhaustive, only
+
+pytestmark = pytest.mark.usefixtures("learners_are_shared")
 
 BATCH, N_BINS, LIMIT = 8, 11, 2.0
 SMALL = {"policy_kwargs": {"net_arch": [4, 4]}, "n_bins": N_BINS, "value_limit": LIMIT, "learning_rate": 1e-2}
@@ -109,7 +112,7 @@ def test_an_update_uses_the_equations_in_the_documented_order(name):
     np.testing.assert_allclose(after.target_critics.head.bias, old + config.tau * (mean[1] - old), atol=1e-6)
 
 
-@pytest.mark.parametrize("name", MODULES)
+@pytest.mark.parametrize("name", only(["XQC"], MODULES))
 def test_the_target_has_no_gradient_and_the_critics_follow_theirs(name):
     """Finite differences of the cross-entropy in the head's bias and in one weight before a normalization."""
     _, _, state = made(name)
@@ -137,7 +140,7 @@ def test_the_target_has_no_gradient_and_the_critics_follow_theirs(name):
     assert module.make is flashsac.make
 
 
-@pytest.mark.parametrize("name", MODULES)
+@pytest.mark.parametrize("name", only(["XQC"], MODULES))
 def test_weights_keep_their_norm_and_the_actor_waits_for_its_turn(name):
     _, algorithm, state = made(name, policy_delay=3)
     update, moved = jax.jit(algorithm.update), []
@@ -168,6 +171,7 @@ AGENT = {
 }
 
 
+@exhaustive
 @pytest.mark.parametrize("kind", [rejeu.FlashSAC, rejeu.XQC])
 def test_a_run_resumes_equal_and_its_file_acts_equal(kind, tmp_path):
     whole = kind("MlpPolicy", "Pendulum-v1", **AGENT).learn(60)
@@ -182,6 +186,7 @@ def test_a_run_resumes_equal_and_its_file_acts_equal(kind, tmp_path):
     assert whole.q_values(obs, whole.predict(obs)[0]).shape == ()
 
 
+@exhaustive
 @pytest.mark.parametrize("kind", [rejeu.FlashSAC, rejeu.XQC])
 def test_it_learns_from_hindsight_from_priorities_and_on_the_device(kind):
     her = kind("MultiInputPolicy", Reach(), replay_buffer_class="HerReplayBuffer", **AGENT).learn(60)
@@ -199,10 +204,6 @@ def test_what_it_has_not_is_refused():
         xqc.Config(policy_kwargs={"layer_norm": True})
     with pytest.raises(ValueError, match="FlashSAC needs a Box action space"):
         flashsac.make(flashsac.Config(), OBS_SPACE, DISCRETE)
-    with pytest.raises(ValueError, match="n_bins=1 must be a whole number of at least 2"):
-        xqc.Config(n_bins=1)
-    with pytest.raises(ValueError, match="value_limit=0 must be"):
-        flashsac.Config(value_limit=0)
     assert xqc.Config(policy_kwargs={"net_arch": [4, 8]}).name == "XQC"
 
 
@@ -225,7 +226,7 @@ class Rewarding(gym.Env):
         return np.zeros(1, np.float32), -500.0 if self.time == 40 else 3.0, self.time == 40, False, {}
 
 
-@pytest.mark.parametrize("kind", [rejeu.FlashSAC, rejeu.PPO])
+@pytest.mark.parametrize("kind", only([rejeu.PPO], [rejeu.FlashSAC, rejeu.PPO]))
 def test_no_scaled_return_exceeds_its_limit(kind):
     limit = NormalizationConfig(norm_obs=False, max_return=5.0)
     settings = AGENT if kind is rejeu.FlashSAC else {"n_steps": 20, "batch_size": 20, "seed": 0}

@@ -16,6 +16,7 @@ from rejeu import agents
 from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.loops.run import clock_of
 from tests.algorithms.probes.environments import Discretely, Probe
+from tests.tiers import only
 
 DISCRETE = ("DQN", "QRDQN", "IQN", "PQN", "MaskablePPO")
 VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
@@ -36,6 +37,11 @@ VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
     "DQN, noisy": ("DQN", {"noisy": True, "double_q": True}),
     "IQN, noisy": ("IQN", {"noisy": True, "double_q": True}),
 }
+DEFAULT = (
+    *("SAC, dropout and a subset", "SAC, memory", "SAC, held noise", "TD3, parameter noise", "CrossQ"),
+    *("IQN, noisy", "PPO, bonus", "PPO", "ARS"),
+)
+"""Everything that draws: replay, noise, dropout, quantiles, memory, orders and directions."""
 KINDS = {**{name: (name, {}) for name in agents.AGENTS}, **VARIANTS}
 
 
@@ -113,7 +119,7 @@ def test_keys_that_are_used_twice_are_found(function: Any, expected: set[str]) -
     assert twice(jax.make_jaxpr(function)(jax.random.PRNGKey(0))) == expected
 
 
-@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("name", only(DEFAULT, KINDS))
 def test_no_key_of_an_algorithm_is_used_twice(name: str) -> None:
     """Neither where its state begins, nor where it acts, nor in an update."""
     kind, settings = KINDS[name]

@@ -86,7 +86,7 @@ CASES = {
     "TD3": td3_case(),
     "TD3, every update": td3_case(policy_delay=1, target_policy_noise=0.0),
     "TD3, weights and a longer delay": td3_case(policy_delay=3),
-    "TD3BC": Case(td3_bc, references.TD3BC, {**NOISY, "normalize": None}),
+    "TD3BC": Case(td3_bc, references.TD3BC, {**NOISY, "normalize": None, "alpha": 1.5}),
     "ReBRAC": Case(rebrac, references.ReBRAC, {**NOISY, "actor_bc": 0.3, "critic_bc": 0.4, "critic_layer_norm": False}),
     "SAC": Case(sac, references.SAC, {**TEMPERATURE, "n_critics": 3}),
     "SAC, fixed": Case(sac, references.SAC, {**FIXED, "n_critics": 3}, weighted=True),

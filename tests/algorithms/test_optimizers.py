@@ -17,7 +17,7 @@ from rejeu.algorithms import a2c, crossq, optimizers, sac
 from rejeu.algorithms.config import rebuild, to_json
 from rejeu.core import descend
 from rejeu.errors import CheckpointError
-from tests.tiers import only
+from tests.tiers import exhaustive, only
 
 SETTINGS = {"learning_starts": 8, "batch_size": 4, "buffer_size": 100, "seed": 0}
 OWN = [optax.lamb, partial(optax.adamw, weight_decay=1e-2), optax.chain(optax.clip(1.0), optax.adabelief(1.0))]
@@ -92,12 +92,7 @@ def test_a_file_mentions_an_optimizer_of_the_users_own(optimizer):
     assert rebuild(sac.Config, saved, {"optimizer": optimizer}) == config
 
 
-def test_a_file_without_the_setting_was_written_with_adam():
-    saved = to_json(sac.Config())
-    del saved["optimizer"]
-    assert rebuild(sac.Config, saved, {}) == sac.Config(optimizer="adam")
-
-
+@exhaustive
 def test_an_agent_learns_and_loads_with_another_optimizer(tmp_path):
     learning_rate = rejeu.Linear(1e-2, 1e-3)
     agent = rejeu.SAC("MlpPolicy", "Pendulum-v1", optimizer=OWN[2], learning_rate=learning_rate, **SETTINGS).learn(32)

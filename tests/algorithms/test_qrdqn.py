@@ -19,9 +19,7 @@ from tests.algorithms.test_dqn import (
     CLOCK,
     N_ACTIONS,
     OBS_SPACE,
-    Chain,
     forward,
-    learn_chain,
     random_batch,
 )
 
@@ -112,23 +110,6 @@ def test_update_descends_by_adam_with_the_papers_epsilon():
     expected = optax.apply_updates(state.network, step)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), after.network, expected)
     assert np.abs(after.network.outputs.head.bias - state.network.outputs.head.bias).max() > 1e-2
-
-
-def test_target_network_moves_at_multiples_of_environment_steps():
-    algorithm, state = make(target_update_interval=10, learning_rate=0.1)
-    state, _ = algorithm.update(state, random_batch(), CLOCK._replace(step=np.uint32(9)))
-    assert (state.target_network.outputs.head.weight != state.network.outputs.head.weight).any()
-    after, _ = algorithm.update(state, random_batch(1), CLOCK._replace(step=np.uint32(16)))
-    jax.tree.map(np.testing.assert_array_equal, after.target_network, state.network)
-
-
-def test_values_of_a_chain_are_learnt():
-    config = qrdqn.Config(
-        learning_rate=3e-3, target_update_interval=50, n_quantiles=5, policy_kwargs={"net_arch": [32]}
-    )
-    state = learn_chain(qrdqn.make(config, Chain.observation_space, Chain.action_space), 2_000)
-    values = state.network(np.arange(5, dtype=np.int32)).mean(axis=-1)
-    np.testing.assert_allclose(values, Chain().values(), atol=0.03)
 
 
 def test_quantiles_of_a_coin_are_learnt():

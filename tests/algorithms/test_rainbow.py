@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import shutil
 from typing import Any
@@ -31,7 +32,9 @@ from tests.algorithms.test_dqn import (
     learn_chain,
     random_batch,
 )
-from tests.tiers import crossed
+from tests.tiers import exhaustive, only_tuples
+
+pytestmark = pytest.mark.usefixtures("learners_are_shared")
 
 ATOMS = np.linspace(-3.0, 5.0, 9)
 C51 = {"distribution": "categorical", "v_min": -3.0, "v_max": 5.0, "n_atoms": 9}
@@ -41,8 +44,13 @@ SMALL = {"policy_kwargs": {"net_arch": [5, 4]}}
 
 
 def make(module: Any = dqn, seed: int = 1, **settings: Any):
-    algorithm = module.make(module.Config(**{**SMALL, **settings}), OBS_SPACE, ACTION_SPACE)
-    return algorithm, algorithm.init(jax.random.PRNGKey(seed))
+    return made(module, seed, tuple(settings.items()))
+
+
+@functools.cache
+def made(module: Any, seed: int, settings: tuple[tuple[str, Any], ...]):
+    algorithm = module.make(module.Config(**{**SMALL, **dict(settings)}), OBS_SPACE, ACTION_SPACE)
+    return algorithm._replace(update=jax.jit(algorithm.update)), algorithm.init(jax.random.PRNGKey(seed))
 
 
 def softmax(x: np.ndarray) -> np.ndarray:
@@ -134,6 +142,7 @@ def test_munchausen_mixes_descriptions_of_the_return_by_the_policy():
     np.testing.assert_allclose(given, batch.reward[:, None] + batch.discount[:, None] * mixed, atol=1e-5)
 
 
+@exhaustive
 def test_munchausen_values_of_a_chain_are_those_of_its_own_iteration():
     """The fixed point of ``Q = r + alpha tau log pi + d sum pi (Q - tau log pi)``, ``pi = softmax(Q / tau)``, by iteration."""
     alpha, tau, chain = 0.5, 0.1, Chain()
@@ -283,7 +292,10 @@ KINDS = {"DQN": (dqn, {}), "C51": (dqn, C51), "QRDQN": (qrdqn, {"n_quantiles": 5
 PARTS = [{}, {"noisy": True}, {"dueling": True, "double_q": True}]
 
 
-@pytest.mark.parametrize(("kind", "settings"), crossed(list(KINDS), PARTS))
+@pytest.mark.parametrize(
+    ("kind", "settings"),
+    only_tuples([("C51", PARTS[2]), ("IQN", PARTS[0])], [(kind, part) for kind in KINDS for part in PARTS]),
+)
 def test_values_of_a_chain_are_learnt_by_every_kind(kind, settings):
     module, own = KINDS[kind]
     own = {**own, "v_min": -0.5, "v_max": 1.5, "n_atoms": 21} if kind == "C51" else own
@@ -308,7 +320,10 @@ PLACES = {
 }
 
 
-@pytest.mark.parametrize(("kind", "place"), crossed(list(AGENTS), list(PLACES)))
+@pytest.mark.parametrize(
+    ("kind", "place"),
+    only_tuples([("C51", "host")], [(kind, place) for kind in AGENTS for place in PLACES]),
+)
 def test_all_parts_together_learn_save_and_load(kind, place, tmp_path):
     env, settings = PLACES[place]
     run = {"learning_starts": 20, "batch_size": 8, "train_freq": 2, "target_update_interval": 10, "seed": 0}
@@ -321,6 +336,7 @@ def test_all_parts_together_learn_save_and_load(kind, place, tmp_path):
     assert agent.evaluate(2).mean_return >= 8.0
 
 
+@exhaustive
 @pytest.mark.parametrize("kind", ["C51", "IQN"])
 def test_a_run_of_all_parts_that_is_cut_off_goes_on_exactly(kind, tmp_path):
     cls = rejeu.IQN if kind == "IQN" else rejeu.DQN
@@ -336,7 +352,10 @@ def test_a_run_of_all_parts_that_is_cut_off_goes_on_exactly(kind, tmp_path):
         np.testing.assert_array_equal(again.get_parameters()[name], value, err_msg=name)
 
 
-@pytest.mark.parametrize(("kind", "suffix"), [("C51", "onnx"), ("IQN", "onnx"), ("IQN", "c"), ("C51", "stablehlo")])
+@pytest.mark.parametrize(
+    ("kind", "suffix"),
+    only_tuples([("IQN", "onnx")], [("C51", "onnx"), ("IQN", "onnx"), ("IQN", "c"), ("C51", "stablehlo")]),
+)
 def test_an_exported_policy_acts_as_predict(kind, suffix, tmp_path):
     if suffix == "c" and not any(map(shutil.which, check.COMPILERS)):
         pytest.skip("there is no C compiler")
@@ -349,18 +368,6 @@ def test_an_exported_policy_acts_as_predict(kind, suffix, tmp_path):
     np.testing.assert_array_equal(policy.predict(obs)[0], agent.predict(obs, deterministic=True)[0])
 
 
-@pytest.mark.parametrize(
-    ("kind", "setting", "message"),
-    [
-        (rejeu.DQN, {"distribution": "quantile"}, "distribution='quantile' must be 'expected' or 'categorical'"),
-        (rejeu.DQN, {"v_min": 1.0, "v_max": 1.0}, "v_min=1.0 must be below v_max=1.0"),
-        (rejeu.DQN, {"n_atoms": 1}, "n_atoms=1 must be"),
-        (rejeu.DQN, {"munchausen_alpha": 1.5}, "munchausen_alpha=1.5 must be"),
-        (rejeu.QRDQN, {"munchausen_temperature": 0}, "munchausen_temperature=0 must be"),
-        (rejeu.IQN, {"munchausen_clip": 1}, "munchausen_clip=1 must be"),
-        (rejeu.IQN, {"n_cosines": 0}, "n_cosines=0 must be"),
-    ],
-)
-def test_impossible_settings_are_refused(kind, setting, message):
-    with pytest.raises(ValueError, match=message):
-        kind("MlpPolicy", "CartPole-v1", **setting)
+def test_a_range_of_returns_is_not_empty():
+    with pytest.raises(ValueError, match=r"v_min=1.0 must be below v_max=1.0"):
+        rejeu.DQN("MlpPolicy", "CartPole-v1", v_min=1.0, v_max=1.0)

@@ -10,16 +10,15 @@ from rejeu.envs.make import InProcess
 from tests.algorithms.probes.environments import Probe
 from tests.algorithms.test_every_algorithm import OBS
 from tests.environments import Reach
-from tests.every_agent import KINDS, env_of, small
+from tests.every_agent import KINDS, env_of, every_kind, small
 from tests.helpers import small_sac
 from tests.numpy_networks import forward, layers
 from tests.on_policy_agents import KINDS as ON_POLICY
 
-every_algorithm = pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
 N = len(OBS)
 
 
-@every_algorithm
+@every_kind
 def test_the_values_of_a_batch_are_those_of_its_parts_and_the_least_is_the_default(kind):
     agent = small(kind, env_of(kind))
     actions = [agent.action_space.sample() for _ in range(N)]

@@ -26,6 +26,8 @@ from rejeu.schedules import Linear
 from rejeu.spaces import leaves, structure
 from tests.environments import Sampled
 
+pytestmark = pytest.mark.usefixtures("learners_are_shared")
+
 NUMBER = spaces.Box(-np.inf, np.inf, (1,), np.float64)
 GOALS = spaces.Dict(dict.fromkeys(("observation", "achieved_goal", "desired_goal"), NUMBER))
 
@@ -212,13 +214,6 @@ def test_td_errors_of_steps_overwritten_meanwhile_are_passed_over():
     np.testing.assert_allclose(buffer.priorities.tree[np.arange(4)], expected)
 
 
-def test_an_empty_buffer_says_so():
-    buffer = uniform(8)
-    Story(buffer)
-    with pytest.raises(ValueError, match="the replay buffer is empty"):
-        buffer.sample(np.random.default_rng(0), (4,))
-
-
 endings = st.lists(
     st.tuples(st.sets(st.integers(0, 2), max_size=2), st.booleans(), st.booleans()), min_size=1, max_size=40
 )
@@ -307,19 +302,6 @@ def test_relabelled_transitions_carry_high_and_low_priorities_alike():
     late = batch.obs["observation"][:, 0] >= 20
     assert late[:2000].mean() == pytest.approx(0.9, abs=0.03)
     assert late[2000:].mean() == pytest.approx(0.9, abs=0.03)
-
-
-def test_td_errors_belong_to_their_draw_in_whatever_order_they_come():
-    buffer = uniform(64, alpha=1.0)
-    story = Story(buffer)
-    for _ in range(6):
-        story.step()
-    rng = np.random.default_rng(0)
-    draws = [buffer.draw(rng, (6,)) for _ in range(4)]  # equal priorities: each draw has every step once
-    for batch, drawn in (draws[2], draws[0]):  # the others are never answered
-        buffer.update_priorities([(drawn, batch.obs[:, 0] + 1.0)])
-        np.testing.assert_allclose(buffer.priorities.tree[np.arange(6)], np.arange(6) + 1.0, rtol=1e-5)
-        buffer.update_priorities([(drawn, np.ones(6))])
 
 
 def test_a_restored_buffer_can_draw_all_its_steps_and_ignores_td_errors_of_earlier_draws():

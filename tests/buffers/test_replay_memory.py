@@ -45,15 +45,6 @@ def test_the_oldest_give_way_and_exactly_the_newest_are_kept():
     assert [row[0] for row in drawn(kept)] == [6.0, 7.0, 8.0, 9.0]
 
 
-def test_transitions_are_drawn_equally_often():
-    """2,000 draws of 4: each count is binomial with mean 500 and standard deviation 19.4."""
-    kept = memory()
-    for i in range(4):
-        push(kept, i)
-    counts = np.bincount(kept.sample(2_000).obs[:, 0].astype(int), minlength=4)
-    assert (abs(counts - 500) < 4 * 19.4).all()
-
-
 def test_a_seed_repeats_the_draws():
     first, second = memory(seed=3), memory(seed=3)
     for i in range(4):

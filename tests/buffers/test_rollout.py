@@ -21,6 +21,8 @@ from rejeu.loops.learner import Readings
 from tests.algorithms.test_gae import by_definition, random_steps
 from tests.environments import Counter
 
+pytestmark = pytest.mark.usefixtures("learners_are_shared")
+
 GAMMA = 0.9
 
 # Samples: a rollout with its values and log-probabilities.
@@ -289,12 +291,6 @@ def test_a_step_has_its_true_successor_whatever_ended_it(ends):
     np.testing.assert_array_equal(rollout.ended[:, 0], [False, False, True, False, True, False])
     last = np.float32(GAMMA if ends == "truncated" else 0.0)
     np.testing.assert_array_equal(rollout.discount[:, 0], np.float32([GAMMA, GAMMA, last, GAMMA, last, GAMMA]))
-
-
-def test_a_rollout_says_where_it_began_within_an_episode():
-    rollouts, _ = recorded(2, 24, (5, 3), "truncated")
-    assert [r.started.tolist() for r in rollouts] == [[True, True], [False, False], [True, True]]
-    assert [r.obs[0, :, :2].tolist() for r in rollouts] == [[[0, 0]] * 2, [[0, 4]] * 2, [[2, 0]] * 2]
 
 
 @pytest.mark.parametrize(("n_envs", "total"), [(1, 10), (3, 32), (8, 45), (8, 3)])

@@ -113,12 +113,6 @@ def test_counters_are_those_of_the_episodes(case):
         assert until_end == [end - place for place, end in zip(places, ends, strict=True)]
 
 
-def test_a_ring_keeps_no_counters_that_nobody_asked_for():
-    bare, one = make_ring(4, 1), make_ring(4, 1, counters=["until_end"])
-    assert (bare.counters, bare.since_start, bare.until_end) == ((), None, None)
-    assert (one.counters, one.since_start) == (("until_end",), None)
-
-
 NO_END = Turn([True] * 2, ["no"] * 2, [False] * 2)
 
 
@@ -147,12 +141,6 @@ def test_a_batch_has_the_shape_that_was_asked_for():
     assert batch.obs["more"][1].dtype == np.uint8
 
 
-def test_sampling_is_decided_by_the_generator_alone():
-    replay, _ = filled(2, 8, [NO_END] * 6)
-    one, two = (replay.sample(np.random.default_rng(4), (9,)) for _ in range(2))
-    np.testing.assert_array_equal(one.obs["where"], two.obs["where"])
-
-
 def test_a_sample_does_not_change_when_the_ring_goes_on():
     replay, model = filled(2, 4, [NO_END] * 6)
     batch = replay.sample(np.random.default_rng(0), (32,))
@@ -160,14 +148,6 @@ def test_a_sample_does_not_change_when_the_ring_goes_on():
     play(replay, model, [NO_END] * 6)
     np.testing.assert_array_equal(batch.obs["where"], before[0])
     np.testing.assert_array_equal(batch.next_obs["where"], before[1])
-
-
-def test_a_time_limit_bootstraps_and_a_termination_does_not():
-    for end, discount in (("truncated", GAMMA), ("terminated", 0.0)):
-        replay, _ = filled(1, 4, [Turn([True], [end], [False])])
-        batch = replay.sample(np.random.default_rng(0), (4,))
-        np.testing.assert_array_equal(batch.discount, np.full(4, discount, np.float32))
-        np.testing.assert_array_equal(batch.next_obs["where"], [[0, 1]] * 4)
 
 
 def test_an_empty_buffer_says_that_it_is_empty():
@@ -180,11 +160,6 @@ def test_capacity_is_shared_among_environments():
     assert ring.rows == 3
     needed = sum(a.nbytes for a in (*ring.obs, ring.action, ring.reward, ring.kind))
     assert needed <= ring.nbytes < needed + 9 * 4, "a row takes what it holds, and less than 4 bytes of alignment"
-
-
-def test_a_row_of_pendulum_takes_what_a_transition_needs():
-    """Three observations, an action and a reward of 4 bytes each, and one byte for the kind."""
-    assert make_ring(1000, 4, gym.spaces.Box(-8, 8, (3,), np.float32)).nbytes == 1000 * (4 * (3 + 1 + 1) + 1)
 
 
 def test_priorities_take_sixteen_bytes_a_row_where_their_number_is_a_power_of_two():
@@ -203,16 +178,6 @@ def test_small_numbers_leave_no_gaps_between_larger_ones():
 
 
 # Files of buffers.
-
-
-@pytest.fixture
-def arrays():
-    return {name: array.copy() for name, array in filled(2, 6, [NO_END] * 8)[0].arrays().items()}
-
-
-def test_arrays_leave_out_rows_that_were_never_written():
-    ring_arrays = filled(2, 100, [NO_END] * 3)[0].arrays()
-    assert ring_arrays["obs.where"].shape == (2, 4, 2)
 
 
 @settings(max_examples=60)

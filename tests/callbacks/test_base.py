@@ -7,6 +7,8 @@ from rejeu.callbacks import Checkpoint, TrainingCallback
 from rejeu.errors import CheckpointError
 from tests.helpers import small_sac
 
+pytestmark = pytest.mark.usefixtures("learners_are_shared")
+
 BALL = "rejeu/Ball-v0"
 
 
@@ -61,13 +63,6 @@ def test_callbacks_are_called_in_the_given_order_and_those_that_run_last_after_t
         ("a", "after", "NoneType"),
         ("last", "after", "NoneType"),
     ]
-
-
-def test_a_single_object_can_stop_training():
-    notes = []
-    agent = small_sac(BALL).learn(9, Noting(notes, "a", stop_at=3))
-    assert agent.num_timesteps == 3
-    assert notes[-1] == ("a", "after", "NoneType")
 
 
 def test_an_error_is_told_to_all_callbacks_that_had_started():

@@ -27,6 +27,7 @@ from rejeu.reporting.history import History
 from rejeu.reporting.logging import Logger
 from tests.environments import Counter
 from tests.helpers import small_sac
+from tests.tiers import exhaustive
 
 pytestmark = pytest.mark.usefixtures("learners_are_shared")
 
@@ -61,11 +62,8 @@ def finished(returns, successes=None):
     return SimpleNamespace(history=History(rows)), Progress(10 * len(rows), rows[-1:], None)
 
 
-def test_success_decides_before_return_which_model_is_better():
-    assert better(evaluation([-50, -50], [1, 1]), evaluation([-1, -1], [1, 0]))
-
-
 def test_return_decides_where_success_is_equal_or_unknown():
+    assert better(evaluation([-50, -50], [1, 1]), evaluation([-1, -1], [1, 0]))
     assert better(evaluation([2, 2], [1, 0]), evaluation([1, 1], [0, 1]))
     assert better(evaluation([2, 2]), evaluation([1, 1]))
     assert not better(evaluation([1, 1]), evaluation([1, 1]))
@@ -160,20 +158,12 @@ def test_stop_on_success_counts_the_last_episodes():
     stop = stop_on_success(0.75, episodes=4)
     assert stop(*finished([0] * 5, [0, 1, 1, 1, 0])) is False
     assert stop(*finished([0] * 5, [1, 1, 1, 0, 0])) is True
-
-
-def test_stop_on_success_never_stops_where_success_is_unknown():
-    assert stop_on_success(0.0, episodes=1)(*finished([0])) is True
+    assert stop_on_success(0.0, episodes=1)(*finished([0])) is True  # unknown
 
 
 def test_stop_on_success_refuses_a_percentage():
     with pytest.raises(ValueError, match=r"0\.9"):
         stop_on_success(90)
-
-
-def test_stop_on_return_ends_learning():
-    agent = pendulum().learn(5_000, stop_on_return(-1e6, episodes=3))
-    assert agent.num_timesteps == 600
 
 
 NO_TIME = dict.fromkeys(("env", "replay", "update", "total"), 0.0)
@@ -187,15 +177,6 @@ def shown(n_steps, seconds, steps, console, spent=lambda step: NO_TIME):
         bar(agent, Progress(step, [], None))
     bar.close()
     return console.file.getvalue()
-
-
-def test_progress_bar_prints_plain_lines_without_a_terminal():
-    text = shown(1_000, None, range(1, 1_001), Console(file=io.StringIO(), force_terminal=False, width=200))
-    assert text.count("\n") == 1  # one line every ten seconds, and this took less
-    assert "\x1b" not in text
-    assert "\r" not in text
-    assert "100%  1,000/1,000 steps" in text
-    assert "return -3.00 · success 50%" in text
 
 
 def test_progress_bar_prints_a_line_every_ten_seconds_without_a_terminal(monkeypatch):
@@ -291,11 +272,6 @@ def test_a_progress_bar_that_never_began_closes_silently():
     assert console.file.getvalue() == ""
 
 
-def test_learn_shows_progress_when_asked(capsys):
-    pendulum().learn(30, progress_bar=True)
-    assert "30/30 steps" in capsys.readouterr().out
-
-
 class Turning(gym.Env):
     """Wants the action 1, and after ``turn`` steps the action -1: what was learnt first is then unlearnt."""
 
@@ -315,6 +291,7 @@ class Turning(gym.Env):
         return np.zeros(1, np.float32), -float((action[0] - wanted) ** 2), True, False, {}
 
 
+@exhaustive
 def test_an_agent_that_improves_and_then_cracks_is_restored_to_its_best():
     evaluate = Evaluate(Turning, every=100, episodes=1, seed=0)
     agent = rejeu.SAC(

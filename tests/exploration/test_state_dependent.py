@@ -21,6 +21,9 @@ from rejeu.spaces import leaves
 from tests.algorithms.probes.environments import ByAction, BySightAndAction, Discretely
 from tests.environments import Counter
 from tests.helpers import assert_same_parameters
+from tests.tiers import only
+
+pytestmark = pytest.mark.usefixtures("learners_are_shared")
 
 CLOCK = Clock(np.uint32(0), np.uint32(0), np.float32(0.0))
 OBS_SPACE = gym.spaces.Box(-5.0, 5.0, (3,), np.float32)
@@ -135,7 +138,7 @@ def test_no_gradient_reaches_the_hidden_layer_through_the_deviation():
 SMALL = {"policy_kwargs": {"net_arch": [8]}, "use_sde": True, "n_steps": 32, "gamma": 0.5, "seed": 0}
 
 
-@pytest.mark.parametrize("algorithm", [rejeu.PPO, rejeu.A2C])
+@pytest.mark.parametrize("algorithm", only([rejeu.A2C], [rejeu.PPO, rejeu.A2C]))
 def test_a_file_keeps_it_and_goes_on(algorithm, tmp_path):
     agent = algorithm("MlpPolicy", Counter((5,)), sde_sample_freq=4, **SMALL).learn(64)
     assert agent.state.network.log_std.shape == (8, 1)

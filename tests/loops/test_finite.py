@@ -28,7 +28,7 @@ from rejeu.loops.learner import Readings
 from rejeu.normalization import merged, no_moments
 from rejeu.spaces import Leaf
 from tests.environments import Counter, Reach, Sampled
-from tests.tiers import crossed, exhaustive, only
+from tests.tiers import exhaustive, only, only_tuples
 
 pytestmark = pytest.mark.usefixtures("learners_are_shared")
 
@@ -129,7 +129,7 @@ def assert_same(one, two):
         np.testing.assert_array_equal(value, two[name], err_msg=name)
 
 
-@pytest.mark.parametrize("name", only([name for name in MAKE if "normal" not in name and "three" not in name], MAKE))
+@pytest.mark.parametrize("name", only(["SAC, four steps in a scan", "DQN with priorities", "PPO"], MAKE))
 def test_an_update_that_breaks_something_ends_training_with_the_state_before_it(name, tmp_path):
     is_on_policy = name in ON_POLICY
     which = 1 if is_on_policy else 5
@@ -223,7 +223,13 @@ def test_a_bad_weight_between_wide_layers_is_found(monkeypatch, tmp_path):
         assert float(read(caught.value.batch, "batch")[1]["reward"][0]) == 100.0
 
 
-@pytest.mark.parametrize(("name", "size"), crossed(list(LEAVES), [1, 3]))
+@pytest.mark.parametrize(
+    ("name", "size"),
+    only_tuples(
+        [("critics_optimizer.nu.head.weight", 3)],
+        [(name, size) for name in LEAVES for size in (1, 3)],
+    ),
+)
 def test_a_gradient_that_breaks_a_weight_is_named_though_all_losses_are_finite(name, size, monkeypatch, tmp_path):
     monkeypatch.setattr(sac, "make", broken_at(LEAVES[name]))
     agent = rejeu.SAC("MlpPolicy", box(), gradient_steps=size, **OFF)
@@ -310,48 +316,31 @@ class _Nothing:
         pass
 
 
-def test_a_batch_that_cannot_be_saved_does_not_hide_what_happened(tmp_path):
+USES = {
+    "save": lambda agent: agent.save("model"),
+    "predict": lambda agent: agent.predict(np.zeros(3)),
+    "remember_best": lambda agent: agent.remember_best(1.0),
+    "state": lambda agent: agent.state,
+    "the end of learn": None,
+}
+
+
+@pytest.mark.parametrize("use", USES)
+def test_using_the_agent_right_after_a_bad_update_raises(use, tmp_path, monkeypatch):
+    """And what happened is told where the batch cannot be saved."""
+    monkeypatch.chdir(tmp_path)
     (tmp_path / "file").touch()
     agent = MAKE["SAC"]()
     agent.report_folder = tmp_path / "file" / "folder"
     poison(agent, 1, np.nan)
-    with pytest.raises(NonFiniteError, match=r"the batch held reward .* The batch could not be saved") as caught:
-        agent.learn(TOTAL)
-    assert caught.value.batch is None
-
-
-@pytest.mark.parametrize("name", ["SAC", "A2C"])
-def test_the_last_update_of_a_run_is_looked_at_too(name, tmp_path):
-    agent = MAKE[name]()
-    agent.report_folder = tmp_path
-    poison(agent, 1, np.nan)
-    with pytest.raises(NonFiniteError):
-        agent.learn(16 if name == "A2C" else 10)
-    other = MAKE[name]()
-    other.report_folder = tmp_path
-    poison(other, 1, np.nan)
-    with pytest.raises(NonFiniteError):  # also where a callback ends it
-        other.learn(TOTAL, lambda _, progress: progress.step < (16 if name == "A2C" else 10))
-
-
-@pytest.mark.parametrize("use", ["save", "predict", "remember_best", "state"])
-def test_using_the_agent_right_after_a_bad_update_raises(use, tmp_path):
-    agent = MAKE["SAC"]()
-    agent.report_folder = tmp_path
 
     def look(agent, progress):
-        if progress.step == 10:
-            calls = {
-                "save": lambda: agent.save(tmp_path / "model"),
-                "predict": lambda: agent.predict(np.zeros(3)),
-                "remember_best": lambda: agent.remember_best(1.0),
-                "state": lambda: agent.state,
-            }
-            calls[use]()
+        if progress.step == 10 and USES[use] is not None:
+            USES[use](agent)
 
-    poison(agent, 1, np.nan)
-    with pytest.raises(NonFiniteError) as caught:
-        agent.learn(TOTAL, look)
+    with pytest.raises(NonFiniteError, match=r"the batch held reward .* The batch could not be saved") as caught:
+        agent.learn(10 if USES[use] is None else TOTAL, look)
+    assert caught.value.batch is None
     assert caught.value.step == 10
     assert agent.run.step == 10
     assert not (tmp_path / "model.safetensors").exists()
@@ -374,9 +363,7 @@ def test_parameters_that_are_not_finite_are_named_before_learning_begins():
 # Skipping
 
 
-@pytest.mark.parametrize(
-    "name", only(["SAC", "DQN with priorities", "PPO"], [name for name in MAKE if name not in SCANS])
-)
+@pytest.mark.parametrize("name", only(["DQN with priorities", "PPO"], [name for name in MAKE if name not in SCANS]))
 def test_skipping_an_update_is_as_if_its_batch_had_never_been_given(name):
     which = 1 if name in ON_POLICY else 5
     agent, twin = MAKE[name](nonfinite="skip"), MAKE[name](nonfinite="skip")
@@ -472,26 +459,12 @@ class Saying(Counter):
 
 
 @pytest.mark.parametrize(("at", "steps"), [((0, 0), 0), ((1, 0), 6)])
-@pytest.mark.parametrize("make", [rejeu.SAC, rejeu.PPO])
+@pytest.mark.parametrize("make", only([rejeu.PPO], [rejeu.SAC, rejeu.PPO]))
 def test_so_does_one_that_reset_returns(make, at, steps):
     agent = make("MlpPolicy", InProcess([Saying(at=at), Saying(at=(9, 9))], seed=0), seed=0)
     with pytest.raises(
         BadEnvironmentError, match=rf"reset returned an observation .* environment 0 after {steps} steps"
     ):
-        agent.learn(40)
-
-
-class Lost(Reach):
-    """Forgets where it stands after two steps."""
-
-    def _observe(self):
-        obs = super()._observe()
-        return {**obs, "achieved_goal": obs["achieved_goal"] * (np.nan if self.time == 2 else 1)}
-
-
-def test_the_part_of_an_observation_is_named():
-    agent = rejeu.SAC("MultiInputPolicy", InProcess([Lost()], seed=0), replay_buffer_class="HerReplayBuffer", **OFF)
-    with pytest.raises(BadEnvironmentError, match=r"nan at \[0\] of 'achieved_goal' in environment 0 after 1 steps"):
         agent.learn(40)
 
 
@@ -542,10 +515,8 @@ def test_all_finite_is_numpys_answer(sizes, place, value):
     assert bool(learner.check([jnp.arange(3)], {}))
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_metrics_must_be_finite_but_for_td_errors_and_explained_variance(value):
-    fine, bad = jnp.float32(1), jnp.float32(value)
-    assert not bool(learner.check([jnp.zeros(3)], {"critic_loss": bad, "q_value": fine}))
+def test_metrics_must_be_finite_but_for_td_errors_and_explained_variance():
+    fine, bad = jnp.float32(1), jnp.float32(np.inf)
     assert not bool(learner.check([], {"loss": jnp.stack([fine, bad])}))
     assert bool(learner.check([jnp.zeros(3)], {"policy_loss": fine, EXPLAINED_VARIANCE: bad, TD_ERROR: bad}))
 
@@ -577,6 +548,7 @@ def test_statistics_pass_over_what_is_not_finite_and_do_not_overflow():
     jax.tree.map(np.testing.assert_array_equal, two, after)
 
 
+@exhaustive
 def test_rejeu_train_says_in_one_line_what_broke_and_keeps_the_batch_in_the_run_folder(tmp_path, capsys):
     command = ["train", "Pendulum-v1", "--steps", "300", "--out", str(tmp_path / "run"), "--backend", "gymnasium"]
     settings = ["learning_rate=1e30", "learning_starts=50", "batch_size=8", "policy_kwargs.net_arch=[8]"]
@@ -588,11 +560,3 @@ def test_rejeu_train_says_in_one_line_what_broke_and_keeps_the_batch_in_the_run_
     assert "lower learning_rate (it is 1e+30)" in said
     agent = rejeu.load(tmp_path / "run" / "agent")
     assert all(np.isfinite(value).all() for value in agent.get_parameters().values())
-
-
-def test_rewards_that_are_clipped_one_by_one_are_named(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    agent = MAKE["SAC, normalised"](n_steps=3)
-    spoil(agent, "rewards")
-    with pytest.raises(NonFiniteError, match=r"the batch held .*rewards \(nan\)"):
-        agent.learn(TOTAL)

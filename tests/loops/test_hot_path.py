@@ -17,6 +17,7 @@ import pytest
 import rejeu
 from rejeu.envs.make import InProcess
 from tests.environments import Reach, Sampled
+from tests.tiers import only
 
 COMPILED = "/jax/core/compile/backend_compile_duration"
 _compilations: list[str] = []
@@ -62,7 +63,7 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", only(["SAC, normalized", "DQN with priorities", "PPO, 3 environments"], CASES))
 def test_after_the_first_steps_nothing_is_compiled_and_few_programs_run(name):
     """Nothing is compiled where episodes end, in a last turn that keeps some of its steps, or in a further ``learn``."""
     case = CASES[name]

@@ -75,12 +75,6 @@ def test_activations_equal_their_formulas(name):
     np.testing.assert_allclose(ACTIVATIONS[name](jnp.float32(x)), FORMULAS[name](x), atol=1e-6)
 
 
-def test_the_members_of_an_ensemble_start_different():
-    stack = ensemble(lambda key: Linear(key, 3, 2), KEY, 4)
-    assert stack.weight.shape == (4, 3, 2)
-    assert len({np.asarray(weight).tobytes() for weight in stack.weight}) == 4
-
-
 class ReLU:
     """Named as ``torch.nn.ReLU`` is."""
 

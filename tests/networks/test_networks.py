@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
 from pathlib import Path
 
 import equinox as eqx
@@ -11,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from gymnasium import spaces
-from scipy import signal, stats
+from scipy import stats
 
 import rejeu
 from rejeu import cli, validation
@@ -33,7 +32,9 @@ from rejeu.networks import (
 )
 from rejeu.networks.encoder import CNN, NATURE, SMALL, channels_last, image_shape
 from rejeu.spaces import leaves
-from tests.tiers import exhaustive
+from tests.tiers import only
+
+pytestmark = pytest.mark.usefixtures("learners_are_shared")
 
 DOCUMENT = {
     "action_layers": (16, 32),
@@ -148,33 +149,6 @@ def test_forward_passes_equal_numpy(kind, strict_dtypes):
     np.testing.assert_allclose(call(critic, OBS, ACTION), values, rtol=1e-4, atol=1e-4)
 
 
-def dense(*sizes):
-    """Parameters of linear layers between those sizes."""
-    return sum(i * o + o for i, o in pairwise(sizes))
-
-
-@pytest.mark.parametrize(
-    ("kind", "actor", "critic"),
-    [
-        ("mlp", dense(5, 6, 4, 4), dense(8, 6, 4, 1)),
-        ("layer norm", dense(5, 6, 4, 4) + 2 * 10, dense(8, 6, 4, 1) + 2 * 10),
-        (
-            "branches",
-            dense(5, 17, 33, 60, 70, 24, 4),
-            dense(5, 17, 33) + dense(3, 16, 32) + dense(33 + 32, 60, 70, 12, 1),
-        ),
-        ("critic layers alone", dense(5, 4), dense(8, 12, 1)),
-        # embedding, two blocks of 6-24-6 with a norm of 12, the last norm, the head
-        ("simba", dense(5, 6) + 2 * (12 + dense(6, 24, 6)) + 12 + dense(6, 4),
-         dense(8, 6) + 2 * (12 + dense(6, 24, 6)) + 12 + dense(6, 1)),
-        ("own", 5 * 6 + dense(11, 4), 8 * 6 + dense(14, 1)),
-    ],
-)  # fmt: skip
-def test_numbers_of_parameters(kind, actor, critic):
-    networks = make(SHAPES[kind])
-    assert [sum(p.size for p in jax.tree.leaves(network)) for network in networks] == [actor, critic]
-
-
 @pytest.mark.parametrize("kind", SHAPES)
 def test_gradients_reach_every_parameter(kind):
     actor, critic = make(SHAPES[kind])
@@ -182,14 +156,6 @@ def test_gradients_reach_every_parameter(kind):
     gradients = jax.jit(jax.grad(loss))((actor, critic))
     for path, gradient in jax.tree_util.tree_leaves_with_path(gradients):
         assert np.abs(gradient).max() > 0, jax.tree_util.keystr(path)
-
-
-def test_plain_networks_keep_the_names_of_their_parameters():
-    actor, critic = make({"net_arch": [6], "layer_norm": True})
-    expected = ["torso.layers.0.weight", "torso.layers.0.bias", "torso.norms.0.scale", "torso.norms.0.offset"]
-    expected += ["head.weight", "head.bias"]
-    for network in (actor, critic):
-        assert rejeu.core.names(network) == expected
 
 
 def test_action_values_are_those_of_each_critic():
@@ -224,11 +190,8 @@ def test_the_default_widths_are_the_algorithms_own():
         ({"architecture": "simba", "net_arch": [8, 16]}, r"net_arch=\[8, 16\] must hold equal numbers"),
         ({"architecture": "transformer"}, "must be 'mlp' or 'simba'"),
         ({"actor_layers": [0]}, r"actor_layers=\[0\] must hold positive whole numbers"),
-        ({"width": 0}, "width=0 must be a whole number of at least 1"),
         ({"n_blocks": True}, "n_blocks=True must be a whole number"),
-        ({"net_arch": 64}, "net_arch=64 must be a list of layer widths"),
         ({"net_arch": "64"}, "net_arch='64' must be a list"),
-        ({"net_arch": [0]}, r"net_arch=\[0\] must hold positive whole numbers"),
         ({"net_arch": [6.5]}, "must hold positive whole numbers"),
         ({"net_arch": [True]}, "must hold positive whole numbers"),
         ({"net_arch": {"vf": [8]}}, r"net_arch has the unknown keys \['vf'\]; expected 'pi' and 'qf'"),
@@ -302,21 +265,6 @@ def test_nested_observations_are_encoded_leaf_by_leaf_in_the_order_of_sorted_key
     np.testing.assert_array_equal(Encoder(leaves(space))(obs), expected)
 
 
-@pytest.mark.parametrize(
-    ("side", "kernel", "stride"), [((9, 12), 4, 2), ((11, 8), 8, 4), ((5, 6), 3, 1), ((10, 7), 2, 2)]
-)
-def test_a_convolution_equals_scipys_correlation(side, kernel, stride):
-    layer = filled(jax.eval_shape(lambda key: Convolution(key, 3, 5, kernel, stride), jax.random.PRNGKey(0)))
-    x = RNG.normal(size=(2, *side, 3)).astype(np.float32)
-    found = call(layer, x)
-    weight, bias = np.asarray(layer.weight, np.float64), np.asarray(layer.bias, np.float64)
-    for n in range(2):
-        for f in range(5):
-            channels = [signal.correlate(x[n, :, :, c].astype(float), weight[:, :, c, f], "valid") for c in range(3)]
-            expected = sum(channels)[::stride, ::stride] + bias[f]
-            np.testing.assert_allclose(found[n, :, :, f], expected, atol=2e-5)
-
-
 def numpy_cnn(cnn, pixels):
     """Pixels ``(batch, height, width, channels)`` through the network, by explicit loops over rows and columns."""
     x = pixels.astype(np.float64) / 255
@@ -333,7 +281,7 @@ def numpy_cnn(cnn, pixels):
     return relu(linear(cnn.linear, x.reshape(len(x), -1)))
 
 
-@pytest.mark.parametrize(("shape", "kind"), [((84, 84, 4), NATURE), ((36, 40, 1), NATURE), ((10, 8, 3), SMALL)])
+@pytest.mark.parametrize(("shape", "kind"), [((36, 40, 1), NATURE), ((10, 8, 3), SMALL)])
 def test_the_convolutional_encoder_equals_loops(shape, kind):
     (leaf,) = leaves(spaces.Box(0, 255, shape, np.uint8))
     assert convolutions(leaf) == kind
@@ -355,12 +303,6 @@ def test_weights_begin_uniform_within_the_inverse_root_of_the_number_of_inputs(m
     for parameters in (layer.weight, layer.bias):
         values = np.asarray(parameters).ravel()
         assert stats.kstest(values, stats.uniform(-bound, 2 * bound).cdf).pvalue > 1e-4
-
-
-def test_the_nature_network_has_the_published_number_of_parameters():
-    cnn = jax.eval_shape(lambda key: CNN(key, (84, 84, 4), NATURE), jax.random.PRNGKey(0))
-    expected = (8 * 8 * 4 + 1) * 32 + (4 * 4 * 32 + 1) * 64 + (3 * 3 * 64 + 1) * 64 + (7 * 7 * 64 + 1) * 512
-    assert sum(p.size for p in jax.tree.leaves(cnn)) == expected == 1_684_128
 
 
 def test_images_in_chunks_give_the_same_features_and_gradients(monkeypatch):
@@ -423,11 +365,6 @@ def test_each_image_of_a_nested_observation_has_an_encoder_of_its_own():
     loss = lambda networks: jnp.sum(networks[0](obs)) + jnp.sum(networks[1](obs, ACTION[:2]))  # noqa: E731
     gradients = jax.jit(jax.grad(loss))((actor, critic))
     assert all(np.abs(gradient).max() > 0 for gradient in jax.tree.leaves(gradients))
-
-
-def test_an_encoder_of_images_asks_for_its_key():
-    with pytest.raises(TypeError, match="needs a key"):
-        Encoder(leaves(spaces.Box(0, 255, (9, 8, 3), np.uint8)))
 
 
 # --- a user's own module --------------------------------------------------------------------------------------------
@@ -511,19 +448,6 @@ class OwnGoalEncoder(eqx.Module):
         return (obs["desired_goal"] - obs["achieved_goal"]) @ self.weight
 
 
-def test_a_plain_equinox_mlp_is_a_torso_and_a_head():
-    shape = PolicyConfig(torso=own_mlp, head=lambda key, n, m: eqx.nn.Linear(n, m, key=key))
-    network = Network(KEY, leaves(VECTOR), 2, (), shape)
-    critics = ensemble(lambda key: QNetwork(key, leaves(VECTOR), 3, (), shape), KEY, 2)
-    obs = RNG.normal(size=(5, *VECTOR.shape)).astype(np.float32)
-    torso = eqx.combine(network.torso.arrays, network.torso.constants)
-    head = eqx.combine(network.head.arrays, network.head.constants)
-    expected = np.stack([head(torso(row)) for row in obs.reshape(5, -1)])
-    np.testing.assert_allclose(network(obs), expected, rtol=1e-5)
-    assert all(leaf.dtype == jnp.float32 for leaf in jax.tree.leaves(network))
-    assert action_values(critics, obs, np.zeros((5, 3), np.float32)).shape == (2, 5)
-
-
 def test_an_own_encoder_reads_one_image_or_a_dict():
     image = spaces.Box(0, 255, (3, 9, 9), np.uint8)
     network = Network(KEY, leaves(image), 2, (4,), PolicyConfig(encoder=OwnCNN))
@@ -541,7 +465,7 @@ def test_a_head_of_another_width_is_refused():
         Network(KEY, leaves(VECTOR), 2, (4,), shape)
 
 
-@pytest.mark.parametrize("agent", [rejeu.SAC, rejeu.PPO])
+@pytest.mark.parametrize("agent", only([rejeu.PPO], [rejeu.SAC, rejeu.PPO]))
 def test_an_agent_with_own_modules_learns_and_loads(agent, tmp_path):
     policy = {"torso": own_mlp, "head": lambda key, n, m: eqx.nn.Linear(n, m, key=key)}
     short = (
@@ -589,35 +513,3 @@ def test_a_named_encoder_is_given_on_the_command_line_saved_and_loaded(tmp_path,
 
 def numbers(key, leaves):
     return eqx.nn.Linear(leaves[0].n_features, 5, key=key)
-
-
-# --- in an agent ----------------------------------------------------------------------------------------------------
-
-
-@exhaustive
-@pytest.mark.parametrize("kind", ["branches", "own"])
-def test_an_agent_of_any_shape_learns(kind, tmp_path):
-    settings = {"policy_kwargs": SHAPES[kind], "learning_starts": 20, "batch_size": 8, "buffer_size": 300}
-    agent = rejeu.SAC("MlpPolicy", "Pendulum-v1", **settings, seed=0)
-    before = agent.get_parameters()
-    agent.learn(200)
-    assert agent.n_updates == 180
-    for key, value in agent.get_parameters().items():
-        assert np.isfinite(value).all(), key
-        assert key == "key" or not np.array_equal(value, before[key]), key
-    check_saved(agent, tmp_path)
-
-
-def test_an_agent_of_simba_saves_and_loads(tmp_path):
-    check_saved(rejeu.SAC("MlpPolicy", "Pendulum-v1", policy_kwargs=SHAPES["simba"], buffer_size=300, seed=0), tmp_path)
-
-
-def check_saved(agent, tmp_path):
-    again = {} if agent.config.policy_kwargs.torso is None else {"policy_kwargs": {"torso": OwnTorso}}
-    loaded = rejeu.SAC.load(agent.save(tmp_path / "agent"), **again)
-    assert loaded.config == agent.config
-    found = loaded.get_parameters()
-    assert all(np.array_equal(value, found[key]) for key, value in agent.get_parameters().items())
-    obs = np.array([0.6, -0.8, 2.0], np.float32)
-    action, expected = (a.predict(obs, deterministic=True)[0] for a in (loaded, agent))
-    np.testing.assert_array_equal(action, expected)

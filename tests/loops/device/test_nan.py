@@ -23,7 +23,7 @@ HUGE = {"learning_rate": 1e30}
 @pytest.mark.parametrize(
     ("what", "said"),
     [
-        ("reward", "returned the reward nan in environment 0 after 48 steps"),
+        pytest.param("reward", "returned the reward nan in environment 0 after 48 steps", marks=pytest.mark.exhaustive),
         pytest.param("observation", r"returned an observation with nan at \[0\]", marks=pytest.mark.exhaustive),
         ("reset", r"reset returned an observation with nan at \[0\]"),
     ],
@@ -72,7 +72,8 @@ def assert_same_errors(device: Any, host: Any, folder: Path) -> str:
         (rejeu.DQN, "jax/CartPole-v1", HUGE, "lower learning_rate"),
         pytest.param(rejeu.DQN, "jax/CartPole-v1", {**HUGE, "train_freq": 8, "gradient_steps": 3}, "update 2. ",
                      marks=pytest.mark.exhaustive),
-        (rejeu.DDPG, Undefined(), HINDSIGHT, "the batch held reward .nan.*compute_reward"),
+        pytest.param(rejeu.DDPG, Undefined(), HINDSIGHT, "the batch held reward .nan.*compute_reward",
+                     marks=pytest.mark.exhaustive),
         pytest.param(rejeu.DDPG, Undefined(), {**HINDSIGHT, "n_steps": 2}, "the batch held reward .nan",
                      marks=pytest.mark.exhaustive),
         pytest.param(rejeu.DQN, "jax/CartPole-v1", {**HUGE, "nonfinite": "skip", "train_freq": 1},
