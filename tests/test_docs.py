@@ -29,6 +29,7 @@ from rejeu.experiments.plan import read_plan
 from rejeu.runs.config import apply
 from rejeu.sb3 import load_zip
 from tests.sb3_models import MadeUp
+from tests.tiers import only
 
 ROOT = Path(__file__).parents[1]
 WRITTEN = Path(os.environ.get("REJEU_PAGES", ROOT))
@@ -82,6 +83,16 @@ PAGES_WITH_COMMANDS_IN_TABLES = [
     WRITTEN / "docs" / name for name in ("coming-from-rl-zoo.md", "coming-from-cleanrl.md")
 ]
 PYTHON_PAGES = [page for page in PAGES if any(block.language == "python" for block in blocks(page))]
+BY_DEFAULT = [
+    WRITTEN / f"{name}.md"
+    for name in (
+        "README",
+        *(f"docs/{name}" for name in ("quickstart", "own-environment", "own-loop", "logging", "comparing")),
+        *(f"docs/{name}" for name in ("environments", "troubleshooting", "coming-from-sb3", "coming-from-cleanrl")),
+        *(f"docs/algorithms/{name}" for name in ("dqn", "iqn", "td3", "trpo")),
+    )
+]
+"""What everybody reads first, and pages that take little time. The exhaustive tier has the others."""
 COMMANDS = [(page, arguments) for page in PAGES for arguments in commands(page)]
 COMMANDS += [(page, arguments) for page in PAGES_WITH_COMMANDS_IN_TABLES for arguments in table_commands(page)]
 
@@ -154,7 +165,7 @@ def windows_close(monkeypatch):
     monkeypatch.setattr(Window, "wait", lambda self, fps: None)
 
 
-@pytest.mark.parametrize("page", PYTHON_PAGES, ids=name)
+@pytest.mark.parametrize("page", only(BY_DEFAULT, PYTHON_PAGES), ids=name)
 def test_the_examples_of_a_page_run(page, short, request, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     if prepare := PREPARATIONS.get(page.relative_to(WRITTEN).as_posix()):
@@ -193,6 +204,7 @@ def test_the_plan_of_the_page_on_scaling_is_read(tmp_path):
 def test_blocks_are_found_in_the_pages():
     assert sum(block.language == "python" for page in PAGES for block in blocks(page)) > 20
     assert len(COMMANDS) > 10
+    assert {*BY_DEFAULT} <= {*PYTHON_PAGES}
 
 
 def script(name):

@@ -9,14 +9,18 @@ import pkgutil
 import pytest
 
 import rejeu
+from tests.tiers import only
 
 MODULES = [
     "rejeu",
     *sorted(m.name for m in pkgutil.walk_packages(rejeu.__path__, "rejeu.") if "__main__" not in m.name),
 ]
 
+SLOW = ("rejeu.agents.together", "rejeu.agents.policy", "rejeu.agents.on_policy", "rejeu.callbacks.checkpoint")
+"""Of seconds, which the exhaustive tier has."""
 
-@pytest.mark.parametrize("name", MODULES)
+
+@pytest.mark.parametrize("name", only({*MODULES} - {*SLOW}, MODULES))
 def test_the_examples_of_a_module_run(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     result = doctest.testmod(importlib.import_module(name), optionflags=doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE)

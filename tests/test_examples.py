@@ -8,15 +8,18 @@ from pathlib import Path
 
 import pytest
 
+from tests.tiers import exhaustive, only
+
 FOLDER = Path(__file__).parents[1] / "examples"
 TESTED_ELSEWHERE = ("awac", "fastapi_service", "ros2_node")
 """``awac.py`` registers an algorithm (``test_own_algorithm``); two need other systems (``export/test_deployment``)."""
 EXAMPLES = sorted(path for path in FOLDER.glob("*.py") if path.stem not in TESTED_ELSEWHERE)
+BY_DEFAULT = [FOLDER / f"{name}.py" for name in ("cartpole", "dqn_from_parts", "own_callback", "own_network")]
 ARGUMENTS = {"many_agents": ["--agents", "3", "--steps", "2000"]}
 """Arguments that shorten an example which does not call ``learn``."""
 
 
-@pytest.mark.parametrize("script", EXAMPLES, ids=lambda script: script.stem)
+@pytest.mark.parametrize("script", only(BY_DEFAULT, EXAMPLES), ids=lambda script: script.stem)
 def test_example_runs(script, short, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", [str(script), *ARGUMENTS.get(script.stem, [])])
@@ -25,6 +28,7 @@ def test_example_runs(script, short, tmp_path, monkeypatch):
     runpy.run_path(str(script), run_name="__main__")
 
 
+@exhaustive
 def test_the_agents_of_the_example_differ_and_their_returns_are_counted(monkeypatch, capsys):
     script = FOLDER / "many_agents.py"
     monkeypatch.setattr(sys, "argv", [str(script), "--agents", "4", "--steps", "2000"])
@@ -38,4 +42,4 @@ def test_the_agents_of_the_example_differ_and_their_returns_are_counted(monkeypa
 
 
 def test_examples_are_found():
-    assert {"cartpole", "parking", "resume"} <= {script.stem for script in EXAMPLES}
+    assert {*BY_DEFAULT, FOLDER / "parking.py", FOLDER / "resume.py"} <= {*EXAMPLES}

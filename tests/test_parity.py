@@ -22,6 +22,7 @@ from scipy import stats
 
 from rejeu import presets, spaces
 from rejeu.envs.make import make_vector
+from tests.tiers import only
 
 LANDERS = "LunarLander-v3", "LunarLanderContinuous-v3"
 
@@ -228,7 +229,7 @@ def episodes_of_each_kind(vector, replayed):
     raise AssertionError(f"of {replayed.ends} only {set(found)} came about")
 
 
-@pytest.mark.parametrize("env_id", REPLAYED)
+@pytest.mark.parametrize("env_id", only(REPLAYED.keys() - {"parking-v0"}, REPLAYED))
 def test_episodes_of_envpool_replayed_in_gymnasium_go_the_same_way(env_id):
     skip_without_robotics(env_id)
     replayed = REPLAYED[env_id]
@@ -289,7 +290,7 @@ def test_a_pendulum_at_its_top_speed_turns_further_in_envpool():
     assert reached > 100
 
 
-@pytest.mark.parametrize("env_id", COMPARED)
+@pytest.mark.parametrize("env_id", only({*COMPARED} - {"parking-v0"}, COMPARED))
 def test_episodes_begin_alike(env_id):
     """Every number of the first observation has the same distribution (Kolmogorov and Smirnov's test, p above 0.001)."""
     starts = []

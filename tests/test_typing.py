@@ -6,6 +6,8 @@ import tempfile
 from importlib import resources
 from pathlib import Path
 
+from tests.tiers import exhaustive
+
 SCRIPT = """
 import gymnasium as gym
 import numpy as np
@@ -50,6 +52,7 @@ CACHE = Path(tempfile.gettempdir()) / "rejeu-test-mypy"
 """What is known of the packages from earlier runs."""
 
 
+@exhaustive  # mypy takes seconds, and half a minute at first
 def test_a_script_type_checks_and_its_mistakes_are_found(tmp_path):
     assert resources.files("rejeu").joinpath("py.typed").is_file()
     script = tmp_path / "script.py"

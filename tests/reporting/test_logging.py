@@ -18,6 +18,7 @@ from rejeu.callbacks import Evaluate
 from rejeu.reporting import logging
 from rejeu.reporting.logging import CsvFile, JsonLines, check_logs
 from tests.helpers import small_sac
+from tests.tiers import exhaustive
 
 BALL = "rejeu/Ball-v0"
 ROOT = Path(__file__).parents[2]
@@ -128,6 +129,7 @@ def test_evaluations_are_rows_under_the_names_of_stable_baselines3(tmp_path):
     ]
 
 
+@exhaustive
 def test_every_name_in_the_log_is_documented():
     text = (ROOT / "docs" / "logging.md").read_text(encoding="utf-8")
     documented = set(re.findall(r"`((?:rollout|time|train|eval)/[a-z_]+)`", text))
