@@ -64,17 +64,17 @@ class Switches(gym.Env):
 class Broken(gym.Env):
     """An environment whose 120th reward is NaN; its episodes have 50 steps."""
 
-    observation_space = gym.spaces.Box(-1, 1, (2,))
-    action_space = gym.spaces.Box(-1, 1, (1,))
+    observation_space = gym.spaces.Box(np.array([-1, -1, -8], np.float32), np.array([1, 1, 8], np.float32))
+    action_space = gym.spaces.Box(-2, 2, (1,))  # those of Pendulum, so that nothing is compiled for it alone
     steps = 0
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
-        return np.zeros(2, np.float32), {}
+        return np.zeros(3, np.float32), {}
 
     def step(self, action):
         self.steps += 1
-        return np.zeros(2, np.float32), np.nan if self.steps == 120 else 1.0, False, self.steps % 50 == 0, {}
+        return np.zeros(3, np.float32), np.nan if self.steps == 120 else 1.0, False, self.steps % 50 == 0, {}
 
 
 gym.register("rejeu-test/Words-v0", Words)
@@ -386,7 +386,8 @@ def test_a_run_folder_is_never_overwritten(capsys, run):
 
 def test_a_nan_reward_is_an_error_and_what_was_learnt_until_then_is_saved(capsys, tmp_path):
     argv = ["train", "rejeu-test/Broken-v0", "--steps", "500", "--evaluate-every", "60", "--evaluate-episodes", "1"]
-    text = error_of(capsys, *argv, "--out", str(tmp_path / "run"), "--set", *TINY)
+    argv += ["--algo", "SAC", "--no-report", "--out", str(tmp_path / "run")]
+    text = error_of(capsys, *argv, "--set", *TINY, "learning_rate=1e-3")
     assert "returned the reward nan" in text
     assert rejeu.load(tmp_path / "run" / "agent.safetensors").num_timesteps == 119
     assert rejeu.load(tmp_path / "run" / "best.safetensors").num_timesteps == 60
@@ -408,7 +409,7 @@ def table(path):
 
 
 def test_a_run_that_was_killed_goes_on_to_the_same_end(tmp_path, capsys, monkeypatch):
-    argv = ["train", "rejeu/Ball-v0", "--steps", "500", "--seed", "3", "--evaluate-every", "150", *FEWER_FILES]
+    argv = ["train", "Pendulum-v1", "--steps", "500", "--seed", "3", "--evaluate-every", "150", *FEWER_FILES]
     evaluate = Evaluate.__call__
 
     def call(self, agent, progress):
@@ -417,12 +418,13 @@ def test_a_run_that_was_killed_goes_on_to_the_same_end(tmp_path, capsys, monkeyp
             shutil.copytree(tmp_path / "whole", tmp_path / "cut")
 
     monkeypatch.setattr(Evaluate, "__call__", call)
-    argv += ["--evaluate-episodes", "2", "--checkpoint-minutes", "0.0001", "--out", str(tmp_path / "whole")]
+    argv += ["--backend", "gymnasium", "--evaluate-episodes", "2", "--checkpoint-minutes", "0.001"]
+    argv += ["--out", str(tmp_path / "whole")]
     assert main([*argv, "--set", *TINY]) == 0
     monkeypatch.undo()
     assert not (tmp_path / "cut" / "agent.safetensors").exists()
     assert main(["resume", str(tmp_path / "cut"), *FEWER_FILES]) == 0
-    assert re.search(r"resumed at step 3\d\d, exactly as it was saved", capsys.readouterr().out)
+    assert re.search(r"resumed at step [23]\d\d, exactly as it was saved", capsys.readouterr().out)
     for name in ("episodes.csv", "evaluations.csv", "metrics.csv"):
         assert table(tmp_path / "cut" / name) == table(tmp_path / "whole" / name), name
     assert_same_parameters(*(rejeu.load(tmp_path / run / "agent.safetensors") for run in ("whole", "cut")))
@@ -529,7 +531,7 @@ def test_what_could_not_be_written_is_repeated_at_the_end_of_the_command(tmp_pat
 
     monkeypatch.setattr(Evaluate, "__call__", fill)
     out = tmp_path / "run"
-    assert train(out, "--seed", "3", "--evaluate-every", "40", env="rejeu/Ball-v0", steps=100) == 2
+    assert train(out, "--seed", "3", "--evaluate-every", "40", "--backend", "gymnasium", steps=250) == 2
     lines = capsys.readouterr().err.splitlines()
     assert all(line.startswith("warning: ") for line in lines)
     said = lines[-1].removeprefix("warning: ")

@@ -31,8 +31,8 @@ import gymnasium as gym, numpy as np
 
 class Drift(gym.Env):
     metadata = {"render_modes": ["rgb_array"], "render_fps": 30}
-    observation_space = gym.spaces.Box(-100, 100, (1,), np.float32)
-    action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+    observation_space = gym.spaces.Box(np.array([-1, -1, -8], np.float32), np.array([1, 1, 8], np.float32))
+    action_space = gym.spaces.Box(-2, 2, (1,))
 
     def __init__(self, gain=1.0, offsets=(), render_mode=None):
         self.gain, self.render_mode = gain, render_mode
@@ -40,11 +40,11 @@ class Drift(gym.Env):
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
         self.x = 0.0
-        return np.zeros(1, np.float32), {}
+        return np.zeros(3, np.float32), {}
 
     def step(self, action):
         self.x += float(action[0])
-        return np.array([self.x], np.float32), self.gain, False, False, {}
+        return np.zeros(3, np.float32), self.gain, False, False, {}
 
     def render(self):
         return np.zeros((16, 16, 3), np.uint8)
@@ -55,7 +55,8 @@ class Double(gym.RewardWrapper):
 
 gym.register("Drift-v0", "drift_env:Drift", max_episode_steps=10)
 """
-"""Every step of an episode of 10 is worth ``gain``, whatever is done."""
+"""Every step of an episode of 10 is worth ``gain``, whatever is done. The spaces are those of Pendulum, for which there is
+a compiled program."""
 
 
 @pytest.fixture
@@ -71,7 +72,7 @@ def here(tmp_path, monkeypatch):
 
 def train(*named, out="run"):
     argv = ["train", *named, "--algo", "SAC", "--steps", "60", "--seed", "0", "--out", out, "--evaluate-episodes", "1"]
-    assert main([*argv, *FEWER_FILES, "--set", *TINY]) == 0
+    assert main([*argv, *FEWER_FILES, "--set", *TINY, "learning_rate=1e-3"]) == 0
 
 
 def forget():
@@ -152,7 +153,19 @@ def test_an_error_of_ones_own_code_says_where(problem, here, capsys):
     source = here / "drift_env.py"
     source.write_text(SOURCE.replace("self.x += float(action[0])", problem))
     line = source.read_text().splitlines().index(f"        {problem}") + 1
-    argv = ["train", "drift_env.py", "--algo", "SAC", "--steps", "9", "--out", "run", "--set", *TINY]
+    argv = [
+        "train",
+        "drift_env.py",
+        "--algo",
+        "SAC",
+        "--steps",
+        "9",
+        "--out",
+        "run",
+        "--set",
+        *TINY,
+        "learning_rate=1e-3",
+    ]
     assert f"(drift_env.py, line {line}, in step)" in error_of(capsys, *argv)
 
 
@@ -213,17 +226,17 @@ def test_what_cannot_be_found_is_one_line(named, message, here, capsys):
 
 @pytest.fixture(scope="module")
 def registered_run(tmp_path_factory):
-    """The folder of a short run on an environment that rejeu registers, with a keyword argument."""
-    out = tmp_path_factory.mktemp("runs") / "ball"
-    train("rejeu/Ball-v0", "--env-kwargs", "sigma=2", out=str(out))
+    """The folder of a short run on a registered environment, with a keyword argument."""
+    out = tmp_path_factory.mktemp("runs") / "pendulum"
+    train("Pendulum-v1", "--env-kwargs", "g=2", out=str(out))
     return out
 
 
 def test_plain_keyword_arguments_of_a_registered_environment_are_read_from_the_run(registered_run, capsys):
     assert main(["evaluate", str(registered_run), "--episodes", "1"]) == 0
-    assert "rejeu/Ball-v0 (sigma=2) on gymnasium" in capsys.readouterr().out
-    assert main(["evaluate", str(registered_run), "--episodes", "1", "--env-kwargs", "sigma=1"]) == 0
-    assert "rejeu/Ball-v0 (sigma=1) on gymnasium" in capsys.readouterr().out
+    assert "Pendulum-v1 (g=2) on gymnasium" in capsys.readouterr().out
+    assert main(["evaluate", str(registered_run), "--episodes", "1", "--env-kwargs", "g=1"]) == 0
+    assert "Pendulum-v1 (g=1) on gymnasium" in capsys.readouterr().out
 
 
 EVIL = [
@@ -232,10 +245,10 @@ EVIL = [
     {"env": "os:system"},
     {"env_argument": "evil_env:Pendulum-v1"},
     {"wrappers": ["evil_env:Wrapper"]},
-    {"env_kwargs": {"sigma": "evil_env:Wrapper"}},
-    {"env_kwargs": {"sigma": "/etc/passwd"}},
-    {"env_kwargs": {"sigma": [1.0]}},
-    {"env_kwargs": {"dimension": 10**12}},
+    {"env_kwargs": {"g": "evil_env:Wrapper"}},
+    {"env_kwargs": {"g": "/etc/passwd"}},
+    {"env_kwargs": {"g": [1.0]}},
+    {"env_kwargs": {"g": 10**12}},
 ]
 
 

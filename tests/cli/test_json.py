@@ -18,7 +18,7 @@ from rejeu.cli.commands import COMMANDS
 from rejeu.interrupt import Stopped
 
 ROOT = Path(__file__).parents[2]
-BALL = "rejeu/Ball-v0"
+PENDULUM = "Pendulum-v1"
 TINY = ["policy_kwargs.net_arch=[8]", "batch_size=8", "buffer_size=5000", "learning_starts=50"]
 FEWER_FILES = ["--no-report", "--no-video"]
 
@@ -58,21 +58,32 @@ def documented_keys(command):
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    out = tmp_path_factory.mktemp("runs") / "ball"
-    argv = ["train", BALL, "--steps", "200", "--seed", "3", "--out", str(out), "--evaluate-episodes", "2"]
-    assert main([*argv, *FEWER_FILES, "--log", "json", "--set", *TINY]) == 0
+    out = tmp_path_factory.mktemp("runs") / "pendulum"
+    argv = ["train", PENDULUM, "--steps", "200", "--seed", "3", "--out", str(out), "--evaluate-episodes", "2"]
+    assert main([*argv, *FEWER_FILES, "--backend", "gymnasium", "--log", "json", "--set", *TINY]) == 0
     return out
 
 
 def test_train_prints_its_summary(capsys, tmp_path):
-    argv = ["train", BALL, "--steps", "60", "--seed", "3", "--out", str(tmp_path / "run"), "--evaluate-episodes", "1"]
-    result, messages = document(capsys, *argv, *FEWER_FILES, "--set", *TINY)
+    argv = [
+        "train",
+        PENDULUM,
+        "--steps",
+        "60",
+        "--seed",
+        "3",
+        "--out",
+        str(tmp_path / "run"),
+        "--evaluate-episodes",
+        "1",
+    ]
+    result, messages = document(capsys, *argv, *FEWER_FILES, "--backend", "gymnasium", "--set", *TINY)
     assert result.keys() == documented_keys("train")
     assert (result["complete"], result["signal"], result["steps"], result["not_written"]) == (True, None, 60, [])
     assert result["best"]["episodes"] == 1
     assert result["best"]["return_interval"] == [None, None]  # of one episode, NaN
     assert set(result["files"]) == {path.name for path in (tmp_path / "run").iterdir()}
-    assert "environment   rejeu/Ball-v0" in messages
+    assert "environment   Pendulum-v1" in messages
     assert "60/60 steps" in messages
 
 
@@ -139,9 +150,9 @@ def test_every_command_that_prints_a_result_is_documented_with_its_option():
 def test_a_log_that_is_missing_or_unknown_is_an_error_before_training(kind, run, capsys, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(sys.modules, kind, None)
-    assert main(["train", BALL, "--log", kind]) == 2
+    assert main(["train", PENDULUM, "--log", kind]) == 2
     assert capsys.readouterr().err.endswith(f'is not installed; run: pip install "rejeu[{kind}]"\n')
-    assert main(["train", BALL, "--log", f"{kind}s"]) == 2
+    assert main(["train", PENDULUM, "--log", f"{kind}s"]) == 2
     assert f"--log contains '{kind}s', expected any of 'csv', 'json'" in capsys.readouterr().err
     assert not [*tmp_path.iterdir()]
     config = json.loads((run / "config.json").read_text(encoding="utf-8"))

@@ -91,7 +91,7 @@ def test_record(spy, tmp_path):
 
 def test_export(spy, tmp_path):
     found, exported = spy(models, "find_model", tmp_path / "best.safetensors"), spy(models, "export", mock.Mock())
-    spy(models, "load")
+    spy(models, "load", mock.Mock())
     argv = ["export", "run", "--env", TYPED, "--to", "c", "--noise", "--batch", "3", "--frame-stack", "4"]
     assert main([*argv, "--which", "last", "--out", str(tmp_path / "policy.h")]) == 0
     assert includes(found, which="last")
@@ -271,9 +271,9 @@ def test_workers_and_datasets_of_train(spy):
 def test_train_for_minutes_with_the_report_and_the_video(sessions, tmp_path):
     argv = ["train", TYPED, "--algo", "DQN", "--minutes", "2", "--seed", "5", "--checkpoint-minutes", "0"]
     assert main([*argv, "--backend", "gymnasium", "--out", str(tmp_path / "run"), *SMALL]) == 0
-    write_task(
-        tmp_path / "task.json", Task(folder=str(tmp_path / "other"), run=RunConfig(env=TYPED, seed=6), no_video=True)
-    )
+    settings = {"policy_kwargs.net_arch": [4], "buffer_size": 100}
+    run = RunConfig(env=TYPED, algorithm="DQN", seed=6, backend="gymnasium", hyperparameters=settings)
+    write_task(tmp_path / "task.json", Task(folder=str(tmp_path / "other"), run=run, no_video=True))
     assert main(["--task", str(tmp_path / "task.json")]) == 0
     session, other = sessions
     assert (other.config.seed, other.has_report, other.has_video) == (6, True, False)
@@ -363,6 +363,9 @@ def test_clone(spy, tmp_path):
     assert taught[-1]["expert"]("obs") == "action"
     agent.predict.assert_called_with("obs", deterministic=True)
     assert len(cloned) == len(offline) == 1
+    spy(clone.environment, "recorded_id", "Acrobot-v1")
+    assert main([*argv, "--out", str(tmp_path / "c")]) == 2  # the expert plays another environment
+    assert not (tmp_path / "c").exists()
 
 
 def test_wrappers_are_applied_in_the_order_in_which_they_are_named():

@@ -138,11 +138,10 @@ def test_a_clone_is_corrected_by_hand(monkeypatch, tmp_path, capsys):
 
 
 def test_what_cannot_be_assisted_is_one_line(tmp_path, capsys):
-    out = ["--out", str(tmp_path / "run")]
+    out = ["--out", str(tmp_path / "run"), "--set", "policy_kwargs.net_arch=[8]"]
     imports = ["--import", "tests.playing"]
-    assert "learns from its own actions alone" in error_of(
-        capsys, "train", LEVER, "--assist", "--algo", "PPO", *out, *imports
-    )
+    argv = ["train", SLIDE, "--assist", "--algo", "PPO", "--import", __name__, *out]
+    assert "learns from its own actions alone" in error_of(capsys, *argv)
     assert "for a single run" in error_of(capsys, "train", LEVER, "--assist", "--seeds", "2", *imports)
     switches = ["rejeu-play-test/Switches-v0", "--assist", "--algo", "SAC"]
     assert error_of(capsys, "train", *switches, *out, *imports)
@@ -157,8 +156,8 @@ def test_without_a_screen_nothing_is_trained_first(monkeypatch, tmp_path, capsys
     pygame.quit()
     monkeypatch.setenv("SDL_VIDEODRIVER", "x11")
     monkeypatch.delenv("DISPLAY", raising=False)
-    out = tmp_path / "run"
-    assert "cannot open a window" in error_of(capsys, "train", "Pendulum-v1", "--assist", "--out", str(out))
+    how, out = [SLIDE, "--assist", "--algo", "SAC", "--set", "policy_kwargs.net_arch=[8]"], tmp_path / "run"
+    assert "cannot open a window" in error_of(capsys, "train", *how, "--out", str(out))
     assert not out.exists()
     with pytest.raises(OSError, match="cannot open a window"):
         Expert(gym.make(SLIDE, render_mode="rgb_array"))
