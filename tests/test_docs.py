@@ -250,19 +250,15 @@ def test_a_link_to_a_definition_that_does_not_exist_is_found():
     assert len(errors) == 4
 
 
-def test_the_home_page_links_to_every_page_on_an_algorithm():
+def test_overviews_link_to_every_page():
     index = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
-    pages = sorted(path.name for path in (ROOT / "docs" / "algorithms").glob("*.md"))
-    assert len(pages) == len(rejeu.agents.BUILT_IN)
-    assert [page for page in pages if f"(algorithms/{page})" not in index] == []
-
-
-@pytest.mark.parametrize("name", ["llms.txt", "docs/index.md"])
-def test_overviews_link_to_every_page(name):
-    overview = (ROOT / name).read_text(encoding="utf-8")
+    algorithms = sorted(path.name for path in (ROOT / "docs" / "algorithms").glob("*.md"))
+    assert len(algorithms) == len(rejeu.agents.BUILT_IN)
+    assert [page for page in algorithms if f"(algorithms/{page})" not in index] == []
     pages = {path.name for path in (ROOT / "docs").glob("*.md")} - {"index.md", "changelog.md"}
     assert len(pages) > 20
-    assert [page for page in sorted(pages) if not re.search(rf"\((docs/)?{page}\)", overview)] == []
+    for overview in (index, (ROOT / "llms.txt").read_text(encoding="utf-8")):
+        assert [page for page in sorted(pages) if not re.search(rf"\((docs/)?{page}\)", overview)] == []
 
 
 def test_the_settings_of_the_page_on_rl_zoo_exist():

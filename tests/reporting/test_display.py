@@ -20,6 +20,7 @@ from rejeu.reporting.history import History
 from rejeu.reporting.logging import Console, CsvFile
 from rejeu.sb3.common.vec_env import DummyVecEnv, VecNormalize
 
+pytestmark = pytest.mark.usefixtures("learners_are_shared")
 NAN = math.nan
 SECONDS = dict.fromkeys(("env", "replay", "update", "total"), 0.0)
 
@@ -70,9 +71,9 @@ def test_the_progress_bar_is_one_output_that_stays_in_the_notebook(notebook, mon
 
 def test_the_progress_bar_sends_few_messages_in_a_second(notebook):
     rejeu.PPO("MlpPolicy", "CartPole-v1", n_steps=64, policy_kwargs={"net_arch": [8]}, seed=0).learn(
-        512, progress_bar=True
+        256, progress_bar=True
     )
-    assert "512/512 steps" in notebook.shown()[0]
+    assert "256/256 steps" in notebook.shown()[0]
     assert len(notebook.outputs) < 60
 
 
@@ -92,7 +93,7 @@ def test_a_command_in_a_cell_prints_lines_though_the_notebook_forces_colors(monk
 def test_verbose_training_keeps_one_table_up_to_date(notebook, tmp_path, capsys):
     agent = rejeu.PPO("MlpPolicy", "CartPole-v1", n_steps=64, policy_kwargs={"net_arch": [8]}, seed=0, verbose=1)
     rows = CsvFile(tmp_path / "metrics.csv")
-    agent.learn(1_024, log_interval=1, sinks=[rows])
+    agent.learn(256, log_interval=1, sinks=[rows])
     rows.close()
     steps = [line.split(",")[0] for line in (tmp_path / "metrics.csv").read_text().splitlines()[1:]]
     assert len(steps) == len(agent.history)  # files get every row
@@ -133,16 +134,10 @@ def test_an_evaluation_shows_its_numbers():
     )  # t = 12.706
     assert "<tr><th>success</th><td>50.0%</td>" in shown["text/html"]
 
-
-def test_an_evaluation_of_one_episode_has_no_interval():
     shown = formatted(Evaluation(np.array([2.0]), np.array([10]), np.array([NAN])))
     assert shown["text/plain"] == "<Evaluation: return 2.00 ± 0.00, length 10.0, 1 episode>"
     assert "<tr><th>return</th><td>2.00</td><td></td><td>0.00</td></tr>" in shown["text/html"]
-
-
-def test_an_evaluation_without_successes_has_no_row_for_them():
-    shown = formatted(Evaluation(np.ones(3), np.ones(3), np.full(3, NAN)))
-    assert "success" not in shown["text/html"] + shown["text/plain"]
+    assert "success" not in shown["text/html"]
 
 
 def test_a_history_shows_a_summary():

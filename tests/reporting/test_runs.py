@@ -29,6 +29,7 @@ CONFIG = {
     "env_kwargs": {"sutton_barto_reward": True},
     "versions": {"python": "3.11.7", "envpool": None},
 }
+DEEP = b'{"env": "E", "hyperparameters": ' + b'{"a": ' * 400 + b"1" + b"}" * 401
 EPISODES = "step,env,return,length,success,seconds\r\n40,0,20.0,20,nan,0.5\r\n100,1,30.5,30,nan,1.25\r\n"
 EVALUATIONS = "step,seconds,success_rate,mean_return\r\n100,0.7,nan,25.0\r\n"
 METRICS = "step,rollout/ep_rew_mean,train/loss\r\n50,20.0,\r\n90,21.0,0.5\r\n"
@@ -160,8 +161,8 @@ def test_truncated_and_damaged_rows_are_left_out(folder):
 
 @pytest.mark.parametrize(
     "content",
-    [b"\xff\xfe\x00", b"[" * 100_000, b"[1]", b'{"env": 1e999}', b'{"a": 1, "a": 2}', b"x" * 2_000_000],
-    ids=["not UTF-8", "deep", "no object", "huge number", "repeated name", "large"],
+    [b"\xff\xfe\x00", b"[" * 100_000, DEEP, b"[1]", b'{"env": 1e999}', b'{"a": 1, "a": 2}', b"x" * 2_000_000],
+    ids=["not UTF-8", "deep", "a deep value", "no object", "huge number", "repeated name", "large"],
 )
 def test_damaged_config_becomes_a_note(folder, content):
     (folder / "config.json").write_bytes(content)

@@ -119,25 +119,6 @@ def test_run_that_crashed_before_the_first_evaluation(tmp_path):
     assert data_of(text) == {"charts": {}, "histograms": {}}
 
 
-@pytest.mark.parametrize(
-    "config",
-    [
-        [],
-        {"hyperparameters": 3, "env": {"a": 1}, "versions": [1], "env_kwargs": "x"},
-        {"seed": -1, "n_envs": "many", "steps": 1e300},
-    ],
-)
-def test_page_is_complete_with_a_configuration_of_other_types(tmp_path, config):
-    assert "</html>" in text_of(write(tmp_path / "run", config))
-
-
-def test_deeply_nested_configuration_is_a_note(tmp_path):
-    folder = write(tmp_path / "run")
-    deep = '{"schedule": "x", "a":' * 400 + "1" + "}" * 400
-    (folder / "config.json").write_text(f'{{"hyperparameters": {{"a": {deep}}}, "env": "E"}}', encoding="utf-8")
-    assert "</html>" in text_of(folder)
-
-
 def test_videos_are_embedded_within_the_budget_and_else_linked(tmp_path, monkeypatch):
     folder = write(tmp_path / "run")
     (folder / "video.mp4").write_bytes(MP4)
