@@ -34,7 +34,7 @@ from unittest import mock
 
 import gymnasium as gym
 import numpy as np
-from provenance import provenance, write
+from provenance import commit, provenance, write
 
 RESULTS = Path(__file__).parent / "results" / "ported_settings.json"
 TOLERANCE = 2e-4
@@ -230,6 +230,11 @@ LAST = 2
 def learned(lib: Library, name: str, space: gym.Space, total: int, settings: dict[str, Any]) -> Any:
     """Returns what an agent says after ``total`` steps in ``Line``, from the original's weights."""
     settings = copy.deepcopy(settings)  # the original adds to policy_kwargs
+    shape = settings.get("policy_kwargs", {})
+    if lib.is_original and "activation_fn" in shape:
+        import torch
+
+        shape["activation_fn"] = getattr(torch.nn, shape["activation_fn"])
     of_line = {key: settings.pop(key) for key in ("length", "truncates", "varies") if key in settings}
     lines = [Line(space, **of_line) for _ in range(settings.pop("n_envs", 1))]
     env = lib("common.vec_env", "DummyVecEnv")([partial(lambda one: one, one) for one in lines])
@@ -300,7 +305,14 @@ PPO_LIKE = {
     "max_grad_norm": [0.05],
     "target_kl": [1e-4],
 }
-REPLAYS = {**COMMON, "n_steps": [3], "gradient_steps": [2, -1], "train_freq": [10, (4, "episode")], "truncates": [True]}
+REPLAYS = {
+    **COMMON,
+    "batch_size": [120],
+    "n_steps": [3],
+    "gradient_steps": [2, -1],
+    "train_freq": [10, (4, "episode")],
+    "truncates": [True],
+}
 CRITICS = {"tau": [0.3], "policy_kwargs": [{"net_arch": {"pi": [8], "qf": [16, 8]}}, {"net_arch": [8], "n_critics": 3}]}
 KWARGS = [{"net_arch": [8, 8]}, {"net_arch": [8], "optimizer_kwargs": {"eps": 0.1}}]
 UPDATES: list[tuple[str, gym.Space, int, dict[str, Any], dict[str, list[Any]]]] = [
@@ -314,7 +326,13 @@ UPDATES: list[tuple[str, gym.Space, int, dict[str, Any], dict[str, list[Any]]]] 
             "ent_coef": [0.2],
             "use_sde": [True],
             "clip_range": [0.02],
-            "policy_kwargs": [{"net_arch": [8], "log_std_init": -1.0}, {"net_arch": {"pi": [8], "vf": [16, 8]}}],
+            "policy_kwargs": [
+                {"net_arch": [8], "log_std_init": -1.0},
+                {"net_arch": {"pi": [8], "vf": [16, 8]}},
+                {"net_arch": [8], "activation_fn": "ReLU", "ortho_init": False, "share_features_extractor": True},
+                {"net_arch": [8], "use_expln": True, "log_std_init": 0.3, "use_sde": True},
+                {"net_arch": [8], "squash_output": True, "use_sde": True},
+            ],
         },
     ),
     (
@@ -430,6 +448,8 @@ UPDATES: list[tuple[str, gym.Space, int, dict[str, Any], dict[str, list[Any]]]] 
                 *CRITICS["policy_kwargs"],
                 {"net_arch": [8], "log_std_init": -1.0, "use_sde": True},
                 {"net_arch": [8], "optimizer_kwargs": {"eps": 0.1}},
+                {"net_arch": [8], "activation_fn": "Tanh"},
+                {"net_arch": [8], "use_expln": True, "log_std_init": 0.3, "use_sde": True},
             ],
         },
     ),
@@ -443,6 +463,7 @@ UPDATES: list[tuple[str, gym.Space, int, dict[str, Any], dict[str, list[Any]]]] 
             "tau": [0.3],
             "ent_coef": [0.5],
             "target_entropy": [-5.0],
+            "use_sde": [True],
             "top_quantiles_to_drop_per_net": [0, 5],
             "policy_kwargs": [{"net_arch": [8], "n_critics": 3}, {"net_arch": [8], "n_quantiles": 7}],
         },
@@ -452,7 +473,11 @@ UPDATES: list[tuple[str, gym.Space, int, dict[str, Any], dict[str, list[Any]]]] 
         BOX,
         40,
         {"policy_kwargs": {"net_arch": [16]}, **REPLAY},
-        {**COMMON, "n_steps": [3], "ent_coef": [0.5], "target_entropy": [-5.0], "policy_delay": [1]},
+        {
+            **COMMON,
+            **{"n_steps": [3], "ent_coef": [0.5], "target_entropy": [-5.0], "policy_delay": [1], "train_freq": [10]},
+            "use_sde": [True],
+        },
     ),
 ]
 """Algorithm, space of the actions, steps, settings, and for each further setting the values that replace those."""
@@ -468,6 +493,8 @@ def update_cases() -> None:
                 given = base if setting == "" else {**base, setting: value}
                 if setting == "n_steps" and "batch_size" in base and name not in OFF:
                     given = {**given, "batch_size": value}
+                if setting == "train_freq":
+                    given = {**given, "batch_size": 120}  # a multiple of all numbers of rows: each counts as much
                 if setting == "n_envs" and "batch_size" in base:
                     given = {**given, "batch_size": 32}
                 if setting == "policy_kwargs" and value.get("use_sde"):
@@ -1192,12 +1219,20 @@ def masks(lib: Library) -> Any:
     return found
 
 
+class Played(Line):
+    """``Line`` that does not count an episode without a step: the original resets once more between candidates."""
+
+    def reset(self, **options: Any) -> Any:
+        self.episode -= self.t == 0 and self.episode > 0
+        return super().reset(**options)
+
+
 @case("ARS.n_delta,n_top,alive_bonus_offset")
 def random_search(lib: Library) -> Any:
     found = []
     for given in ({}, {"n_delta": 3}, {"n_top": 2}, {"alive_bonus_offset": -1.0}, {"alive_bonus_offset": 2.0}):
         settings = {"n_delta": 4, "policy_kwargs": {}, **given}
-        model = small(lib, vec(lib, Line(THREE, 3, varies=True), monitored=True), "ARS", **settings)
+        model = small(lib, vec(lib, Played(THREE, 3, varies=True), monitored=True), "ARS", **settings)
         logger = lib("common.logger", "Logger")(None, [])
         model.set_logger(logger)
         values: dict[str, float] = {}
@@ -1220,7 +1255,7 @@ def random_search(lib: Library) -> Any:
     return found
 
 
-@case("HerReplayBuffer.n_sampled_goal,goal_selection_strategy", 0.1)
+@case("HerReplayBuffer.n_sampled_goal,goal_selection_strategy SAC.replay_buffer_class,replay_buffer_kwargs", 0.1)
 def hindsight(lib: Library) -> Any:
     found = []
     her = lib("", "HerReplayBuffer")
@@ -1262,6 +1297,407 @@ def hindsight(lib: Library) -> Any:
         found.append(
             [float(new.mean()), float(ahead[new].mean()), float(ahead[new].min() / 10), float(np.mean(reward))]
         )
+    return found
+
+
+@case("OrnsteinUhlenbeckActionNoise.dtype")
+def noise_types(lib: Library) -> Any:
+    one, path = lib("common.noise", "NormalActionNoise", "OrnsteinUhlenbeckActionNoise")
+    zeros = np.zeros(2)
+    return [str(kind(zeros, zeros, dtype=dtype)().dtype) for kind in (one, path) for dtype in (np.float32, np.float64)]
+
+
+@case(
+    "DiagGaussianDistribution.action_dim SquashedDiagGaussianDistribution.action_dim CategoricalDistribution.action_dim MultiCategoricalDistribution.action_dims BernoulliDistribution.action_dims kl_divergence.dist_true,dist_pred sum_independent_dims.tensor",
+    1e-4,
+)
+def distributions(lib: Library) -> Any:
+    names = ("DiagGaussianDistribution", "SquashedDiagGaussianDistribution", "CategoricalDistribution")
+    names += ("MultiCategoricalDistribution", "BernoulliDistribution", "kl_divergence", "sum_independent_dims")
+    gauss, squashed, choice, choices, bits, divergence, total = lib("common.distributions", *names)
+    given, other = (lib.tensor(np.array([[0.3, -0.4, 0.9], [x, 0.1, -1.2]], np.float32)) for x in (0.7, -0.2))
+    log_std, found = lib.tensor(np.array([-0.5, 0.2, 0.0], np.float32)), []
+    for made, arguments, action in (
+        (gauss(3), (log_std,), [[0.1, 0.2, 0.3], [1.0, -1.0, 0.0]]),
+        (squashed(3), (log_std,), [[0.1, 0.2, 0.3], [0.9, -0.9, 0.0]]),
+        (choice(3), (), [1, 2]),
+        (choices([2, 1]), (), [[1, 0], [0, 0]]),
+        (bits(3), (), [[1, 0, 1], [0, 0, 1]]),
+    ):
+        first = made.proba_distribution(given, *arguments)
+        dtype = np.float32 if arguments or made.__class__.__name__.startswith("Bernoulli") else np.int64
+        found += [plain(first.log_prob(lib.tensor(np.array(action, dtype)))), plain(first.mode())]
+        entropy = first.entropy()
+        found.append(None if entropy is None else plain(entropy))
+    for make in (lambda: gauss(3), lambda: choice(3), lambda: bits(3)):
+        arguments = (log_std,) if make().__class__.__name__.startswith("Diag") else ()
+        pair = [make().proba_distribution(one, *arguments) for one in (given, other)]
+        found.append(plain(divergence(*pair)))
+    return [*found, plain(total(given))]
+
+
+@case("TanhBijector.epsilon StateDependentNoiseDistribution.action_dim,use_expln,squash_output,epsilon", 1e-4)
+def distribution_of_states(lib: Library) -> Any:
+    bijector, kind = lib("common.distributions", "TanhBijector", "StateDependentNoiseDistribution")
+    x, found = lib.tensor(np.array([[0.3, -0.4], [0.9, 0.1]], np.float32)), []
+    for one in (bijector(), bijector(epsilon=0.1)):
+        found += [plain(one.forward(x)), plain(one.inverse(one.forward(x))), plain(one.log_prob_correction(x))]
+    hidden = lib.tensor(np.array([[0.5, -1.0, 2.0], [0.2, 0.3, 0.1]], np.float32))
+    log_std = lib.tensor(np.array([[-0.5, 0.5], [0.2, -2.0], [0.1, 0.3]], np.float32))
+    for given in ({}, {"use_expln": True}, {"squash_output": True}, {"epsilon": 0.1}):
+        made = kind(2, **given)
+        found += [list(made.proba_distribution_net(4, -1.0, 3)[1].shape), plain(made.proba_distribution_net(3)[1])]
+        made.proba_distribution(x, log_std, hidden)
+        found += [plain(made.log_prob(lib.tensor(np.array([[0.1, 0.2], [-0.3, 0.4]], np.float32)))), plain(made.mode())]
+    return found
+
+
+@case("make_proba_distribution.use_sde,dist_kwargs")
+def kinds_of_distributions(lib: Library) -> Any:
+    make, spaces = lib("common.distributions", "make_proba_distribution"), gym.spaces
+    given = [BOX, THREE, spaces.MultiDiscrete([2, 3]), spaces.MultiBinary(2)]
+    found = [type(make(one)).__name__ for one in given]
+    return [*found, type(make(BOX, use_sde=True, dist_kwargs={"use_expln": True})).__name__]
+
+
+@case("unwrap_wrapper.wrapper_class is_wrapped.wrapper_class unwrap_vec_wrapper.vec_wrapper_class is_vecenv_wrapped.vec_wrapper_class sync_envs_normalization.eval_env VecEnvWrapper.venv DummyVecEnv.env_fns VecEnv.num_envs VecCheckNan.venv VecExtractDictObs.venv VecMonitor.venv VecNormalize.venv VecTransposeImage.venv StackedObservations.num_envs")  # fmt: skip
+def wrapped(lib: Library) -> Any:
+    is_in, unwrap = lib("common.env_util", "is_wrapped", "unwrap_wrapper")
+    is_vec, unwrap_vec, sync = lib(
+        "common.vec_env", "is_vecenv_wrapped", "unwrap_vec_wrapper", "sync_envs_normalization"
+    )
+    names = ("VecCheckNan", "VecMonitor", "VecNormalize", "VecFrameStack", "VecExtractDictObs", "VecTransposeImage")
+    nan, monitor, normalize, stack, extract, transpose = lib("common.vec_env", *names)
+    env = gym.wrappers.TimeLimit(Line(THREE), 5)
+    found = [is_in(env, gym.wrappers.TimeLimit), is_in(env, gym.wrappers.ClipAction)]
+    found += [unwrap(env, gym.wrappers.TimeLimit) is env, unwrap(env, gym.wrappers.ClipAction)]
+    plain_env = vec(lib, Line(THREE), Line(THREE))
+    both = normalize(nan(plain_env))
+    other = normalize(nan(vec(lib, Line(THREE))), training=False)
+    stepped(both, 4, np.zeros(2, int))
+    sync(both, other)
+    found += [is_vec(both, nan), is_vec(both, stack), unwrap_vec(both, nan) is both.venv, unwrap_vec(both, stack)]
+    found += [other.obs_rms.mean, other.ret_rms.var, both.venv.venv is plain_env, plain_env.num_envs, both.num_envs]
+    for made in (monitor(plain_env), stack(plain_env, 2), extract(vec(lib, Goals(THREE)), "a")):
+        found.append([made.num_envs, made.venv.num_envs, list(made.observation_space.shape)])
+    return [*found, transpose(vec(lib, Images((36, 36, 3)))).venv.num_envs]
+
+
+@case("make_atari_env.env_id,n_envs,seed,start_index,monitor_dir,wrapper_kwargs,env_kwargs,vec_env_cls,vec_env_kwargs,monitor_kwargs", 0.02)  # fmt: skip
+def make_atari(lib: Library) -> Any:
+    make, dummy = lib("common.env_util", "make_atari_env"), lib("common.vec_env", "DummyVecEnv")
+    env = make(
+        lambda **_: Screen(), n_envs=2, seed=4, start_index=1, monitor_dir="m", vec_env_cls=dummy, vec_env_kwargs={},
+        wrapper_kwargs={"noop_max": 0, "frame_skip": 2, "screen_size": 40}, env_kwargs={},
+        monitor_kwargs={"override_existing": True},
+    )  # fmt: skip
+    found = [list(env.observation_space.shape), list(env.reset().shape)]
+    found += [[x.tolist() for x in env.step([1, 2])[1:3]] for _ in range(4)]
+    env.close()
+    return [found, sorted(path.name for path in Path("m").iterdir())]
+
+
+@case(
+    "Video.frames,fps Figure.figure,close Image.image,dataformats HParam.hparam_dict,metric_dict FormatUnsupportedError.unsupported_formats,value_description filter_excluded_keys.key_values,key_excluded,_format"
+)
+def logged_values(lib: Library) -> Any:
+    names = ("Video", "Figure", "Image", "HParam", "FormatUnsupportedError", "filter_excluded_keys", "CSVOutputFormat")
+    video, figure, image, hparam, error, excluded, table_of = lib("common.logger", *names)
+    made = [video(np.zeros(2), 4.0), figure("f", close=True), image(np.ones(2), "HW"), hparam({"a": 1}, {"b": 2.0})]
+    found = [{key: str(x) for key, x in vars(one).items()} for one in made]
+    found.append(excluded({"a": 1, "b": 2, "c": 3}, {"a": ("csv",), "b": None, "c": ("log", "stdout")}, "log"))
+    writer, errors = table_of("x.csv"), []
+    for one in made:
+        try:
+            writer.write({"k": one}, {"k": ()}, 0)
+        except error as raised:
+            errors.append(isinstance(raised, NotImplementedError))
+    texts = [word in str(error(["json", "csv"], "video")) for word in ("json", "csv", "video")]
+    return [found, errors, texts]
+
+
+@case("get_monitor_files.path load_results.path ts2xy.data_frame,x_axis ResultsWriter.header")
+def monitor_files(lib: Library) -> Any:
+    writer, files, load = lib("common.monitor", "ResultsWriter", "get_monitor_files", "load_results")
+    curve = lib("common.results_plotter", "ts2xy")
+    for i, start in enumerate((10.0, 5.5)):
+        one = writer(f"m/{i}", {"t_start": start, "env_id": "E"})
+        for k in range(3):
+            one.write_row({"r": k + 0.5, "l": 4 + k, "t": 2.0 * k + i})
+        one.close()
+    table = load("m")
+    found = [[np.asarray(x, float) for x in curve(table, axis)] for axis in ("timesteps", "episodes", "walltime_hrs")]
+    return [[Path(name).name for name in sorted(files("m"))], found, [list(map(float, table[key])) for key in "rlt"]]
+
+
+class Holder:
+    """Something with attributes."""
+
+
+@case(
+    "recursive_getattr.obj,attr recursive_setattr.obj,attr,val is_json_serializable.item open_path.path,mode,verbose,suffix open_path_str.path,mode,suffix open_path_pathlib.path,mode,suffix save_to_pkl.path,obj,verbose load_from_pkl.path,verbose"
+)
+def saving(lib: Library) -> Any:
+    names = ("recursive_getattr", "recursive_setattr", "is_json_serializable", "open_path", "save_to_pkl")
+    get, put, serializable, opened, save, load = lib("common.save_util", *names, "load_from_pkl")
+    outer, outer_in = Holder(), Holder()
+    outer.inner, outer_in.value = outer_in, 3
+    put(outer, "inner.value", 5)
+    found: list[Any] = [get(outer, "inner.value"), [serializable(x) for x in (1, "a", [None], {1: 2}, Holder(), {3})]]
+    for path, mode, suffix in (("a", "w", "zip"), (Path("deep/b"), "w", "pkl"), ("a", "r", "zip"), ("c.x", "w", "zip")):
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            for verbose in (0, 2):
+                file = opened(path, mode, verbose, suffix)
+                found.append(Path(getattr(file, "name", str(file))).name)
+                file.close()
+        found.append(len(caught))
+    save("numbers", {"a": [1, 2.5]}, verbose=0)
+    return [found, load("numbers"), sorted(path.name for path in Path().iterdir())]
+
+
+@case(
+    "is_vectorized_observation.observation is_vectorized_box_observation.observation is_vectorized_discrete_observation.observation is_vectorized_multidiscrete_observation.observation is_vectorized_multibinary_observation.observation is_vectorized_dict_observation.observation check_shape_equal.space1,space2 set_random_seed.seed,using_cuda check_for_nested_spaces.obs_space preprocess_obs.obs,normalize_images configure_logger.verbose,tensorboard_log,tb_log_name,reset_num_timesteps get_system_info.print_info polyak_update.params,target_params,tau"
+)
+def helpers(lib: Library) -> Any:
+    kinds = ("box", "discrete", "multidiscrete", "multibinary", "dict")
+    is_vector = lib("common.utils", "is_vectorized_observation", *(f"is_vectorized_{k}_observation" for k in kinds))
+    spaces = gym.spaces
+    nested = spaces.Dict(a=BOX, b=THREE)
+    examples = [BOX, THREE, spaces.MultiDiscrete([2, 3]), spaces.MultiBinary(3), nested]
+    found: list[Any] = []
+    for i, space in enumerate(examples):
+        one = space.sample()
+        many = {k: np.stack([x, x]) for k, x in one.items()} if isinstance(one, dict) else np.stack([one, one])
+        found += [[bool(check(x, space)) for check in (is_vector[0], is_vector[1 + i])] for x in (one, many)]
+    equal, nests, seeds = lib("common.utils", "check_shape_equal", "zip_strict", "set_random_seed")
+    nests = lib("common.preprocessing", "check_for_nested_spaces")
+    for check in (
+        lambda: equal(BOX, spaces.Box(-1, 1, (3,))),
+        lambda: equal(nested, nested),
+        lambda: equal(nested, spaces.Dict(a=BOX)),
+        lambda: nests(nested),
+        lambda: nests(spaces.Dict(a=nested)),
+        lambda: nests(spaces.Tuple([nested])),
+    ):
+        try:
+            check()
+            found.append("")
+        except (AssertionError, NotImplementedError, KeyError) as error:
+            found.append(type(error).__name__)
+    seeds(7, using_cuda=False)
+    found.append(np.random.rand(2))
+    process = lib("common.preprocessing", "preprocess_obs")
+    image = spaces.Box(0, 255, (36, 36, 1), np.uint8)
+    for space in (image, spaces.Discrete(3), spaces.MultiDiscrete([2, 3]), spaces.MultiBinary(2)):
+        for normalizes in (True, False):
+            given = lib.tensor(np.array([space.high if space is image else (2 if space.shape == () else [1] * 2)]))
+            found.append(np.ravel(plain(process(given, space, normalize_images=normalizes)))[:6])
+    configure = lib("common.utils", "configure_logger")
+    for name in ("run_1", "run_3"):
+        (Path("logs") / name).mkdir(parents=True, exist_ok=True)
+    for verbose in (0, 1):
+        formats = [type(one).__name__ for one in configure(verbose, None).output_formats]
+        found.append(formats)
+    with contextlib.redirect_stdout(io.StringIO()) as text:
+        info = lib("common.utils", "get_system_info")(print_info=False)
+    found.append([text.getvalue(), type(info).__name__, len(info)])
+    update = lib("common.utils", "polyak_update")
+    ours, target = (lib.tensor(np.array([x, 2.0], np.float32)) for x in (1.0, 3.0))
+    target = target if lib.is_original else np.array(target)
+    update([ours], [target], 0.25)
+    return [*found, plain(target)]
+
+
+@case(
+    "RolloutBufferSamples.observations,actions,old_values,old_log_prob,advantages,returns ReplayBufferSamples.observations,actions,next_observations,dones,rewards,discounts DictRolloutBufferSamples.observations,actions,old_values,old_log_prob,advantages,returns DictReplayBufferSamples.observations,actions,next_observations,dones,rewards,discounts RolloutReturn.episode_timesteps,n_episodes,continue_training TrainFreq.frequency,unit"
+)
+def tuples(lib: Library) -> Any:
+    names = ("RolloutBufferSamples", "ReplayBufferSamples", "DictRolloutBufferSamples", "DictReplayBufferSamples")
+    kinds = lib("common.type_aliases", *names, "RolloutReturn", "TrainFreq")
+    return [list(one._fields) for one in kinds]
+
+
+@case("VecVideoRecorder.venv,video_folder,record_video_trigger,video_length,name_prefix")
+def video_recorder(lib: Library) -> Any:
+    kind = lib("common.vec_env", "VecVideoRecorder")
+    env = lib("common.env_util", "make_vec_env")("CartPole-v1", n_envs=1)
+    asked: list[int] = []
+    env = kind(env, "videos", lambda step: bool(asked.append(step)) or step % 7 == 2, video_length=3, name_prefix="p")
+    env.reset()
+    recording = []
+    for _ in range(13):
+        env.step([0])
+        recording.append(bool(env.recording))
+    env.close()
+    return [asked, recording, sorted(path.name for path in Path("videos").glob("*.mp4"))]
+
+
+@case("SubprocVecEnv.env_fns,start_method")
+def in_processes(lib: Library) -> Any:
+    kind = lib("common.vec_env", "SubprocVecEnv")
+    env = kind([partial(gym.make, "CartPole-v1"), partial(gym.make, "CartPole-v1")], start_method="forkserver")
+    env.seed(3)
+    found = stepped(env, 4, np.zeros(2, int))
+    env.close()
+    return found
+
+
+@case(
+    "BaseCallback.verbose EventCallback.verbose ConvertCallback.verbose StopTrainingOnRewardThreshold.verbose StopTrainingOnMaxEpisodes.verbose StopTrainingOnNoModelImprovement.verbose EvalCallback.render,verbose MaskableEvalCallback.use_masking"
+)
+def verbose_callbacks(lib: Library) -> Any:
+    names = ("EvalCallback", "StopTrainingOnRewardThreshold", "StopTrainingOnNoModelImprovement")
+    evaluate, threshold, improvement, episodes = lib("common.callbacks", *names, "StopTrainingOnMaxEpisodes")
+    convert, found, rendered = lib("common.callbacks", "ConvertCallback"), [], []
+
+    class Shown(Constant):
+        metadata = {"render_modes": ["human"]}
+        render_mode = "human"
+
+        def render(self) -> None:
+            rendered.append(self.t)
+
+    for verbose in (0, 1):
+        fixed = {"eval_freq": 5, "n_eval_episodes": 1, "warn": False, "verbose": verbose}
+        for callback in (
+            evaluate(vec(lib, Constant(THREE)), callback_on_new_best=threshold(-50.0, verbose=verbose), **fixed),
+            evaluate(vec(lib, Constant(THREE)), callback_after_eval=improvement(1, 0, verbose=verbose), **fixed),
+            episodes(2, verbose=verbose),
+        ):
+            with contextlib.redirect_stdout(io.StringIO()) as text:
+                small(lib, vec(lib, Line(THREE))).learn(20, callback=callback)
+            found.append(bool(text.getvalue()))
+        found.append(convert(lambda l, g: True, verbose=verbose).verbose)  # noqa: E741
+    shown = evaluate(vec(lib, Shown(THREE)), eval_freq=10, n_eval_episodes=1, render=True, warn=False, verbose=0)
+    small(lib, vec(lib, Line(THREE))).learn(10, callback=shown)
+    return [found, rendered]
+
+
+@case("DQN.stats_window_size,verbose,seed")
+def outputs_off_policy(lib: Library) -> Any:
+    found = []
+    fast = {"learning_starts": 8, "buffer_size": 100, "batch_size": 4}
+    for name, given in (("DQN", fast), ("A2C", {})):
+        for window in (2, 7):
+            env = vec(lib, Line(THREE), monitored=True)
+            model = small(lib, env, name, stats_window_size=window, **given).learn(40)
+            found.append([len(model.ep_info_buffer), [one["l"] for one in model.ep_info_buffer]])
+        for verbose in (0, 1):
+            with contextlib.redirect_stdout(io.StringIO()) as text:
+                env = vec(lib, Line(THREE), monitored=True)
+                small(lib, env, name, verbose=verbose, **given).learn(100, log_interval=1)
+            found.append(bool(text.getvalue()))
+        same = [small(lib, vec(lib, Line(THREE)), name, seed=3, **given).learn(20) for _ in range(2)]
+        found.append(bool(np.array_equal(*(one.predict(LOOKS, deterministic=True)[0] for one in same))))
+    return found
+
+
+@case("A2C.tensorboard_log DQN.tensorboard_log TensorBoardOutputFormat.folder")
+def tensorboard(lib: Library) -> Any:
+    writer = lib("common.logger", "TensorBoardOutputFormat")("by_hand")
+    writer.write({"a": 1.0}, {"a": ()}, 3)
+    writer.close()
+    for name, given in (("A2C", {}), ("DQN", {"learning_starts": 8, "buffer_size": 100, "batch_size": 4})):
+        model = small(lib, vec(lib, Line(THREE)), name, tensorboard_log="logs", **given)
+        model.learn(10)
+        model.learn(10, tb_log_name="own", reset_num_timesteps=False)
+        model.learn(10, tb_log_name="own")
+        model.learn(10, tb_log_name="own", reset_num_timesteps=False)
+    return sorted({path.parent.as_posix() for path in Path().glob("**/events.out*")})
+
+
+@case("check_env.warn,skip_render_check")
+def checker(lib: Library) -> Any:
+    check, found = lib("common.env_checker", "check_env"), []
+
+    class Shown(Line):
+        metadata = {"render_modes": ["rgb_array"]}
+        render_mode = "rgb_array"
+
+        def render(self) -> np.ndarray:
+            rendered.append(1)
+            return np.zeros((8, 8, 3), np.uint8)
+
+    for space in (WIDE, BOX):
+        for given in ({}, {"warn": False}, {"skip_render_check": False}):
+            rendered: list[int] = []
+            with warnings.catch_warnings(record=True) as caught:
+                warnings.simplefilter("always")
+                check(Shown(space), **given)
+            found.append([bool(caught), bool(rendered)])
+    return found
+
+
+class Shares(Images):
+    """``Images`` with numbers in [0, 1]."""
+
+    def __init__(self) -> None:
+        super().__init__((1, 36, 36))
+        self.observation_space = gym.spaces.Box(0.0, 1.0, (1, 36, 36), np.float32)
+
+    def look(self) -> Any:
+        return super().look().astype(np.float32)
+
+
+@case("PPO.policy_kwargs.normalize_images DQN.policy_kwargs.normalize_images", 1e-4)
+def images(lib: Library) -> Any:
+    found = []
+    for name in ("PPO", "DQN"):
+        for normalizes in (True, False):
+            env = vec(lib, Images((1, 36, 36)) if normalizes else Shares())
+            kwargs = {"features_dim": 16, **({} if normalizes else {"normalized_image": True})}
+            shape = {"net_arch": [4], "normalize_images": normalizes, "features_extractor_kwargs": kwargs}
+            given = {"buffer_size": 50} if name == "DQN" else {"n_steps": 16, "batch_size": 16}
+            model = lib.make(name, "CnnPolicy", env, f"{name}{normalizes}", policy_kwargs=shape, **given)
+            looks = np.random.default_rng(0).integers(0, 256, (3, 1, 36, 36))
+            looks = looks.astype(np.uint8) if normalizes else (looks / 255).astype(np.float32)
+            if name == "PPO":
+                values = model.policy.evaluate_actions(lib.tensor(looks), lib.tensor(np.arange(3)))
+                found += [plain(one) for one in values[:2]]
+            else:
+                found.append(plain(model.policy.q_net(lib.tensor(looks))) if lib.is_original else model.q_values(looks))
+    return [np.ravel(one) for one in found]
+
+
+class Same(Line):
+    """``Line`` with the same observation and reward in every step."""
+
+    def look(self) -> np.ndarray:
+        return np.ones(3, np.float32)
+
+    def step(self, action: Any) -> Any:
+        obs, _, *rest = super().step(action)
+        return obs, 1.0, *rest
+
+
+@case("PPO.batch_size MaskablePPO.batch_size TRPO.batch_size")
+def batches_on_policy(lib: Library) -> Any:
+    """All steps are the same, with gamma=0 also in their advantages, so that only the number of minibatches counts."""
+    found = []
+    for name, size in (("PPO", 4), ("PPO", 16), ("MaskablePPO", 8), ("TRPO", 4), ("TRPO", 16)):
+        given = {**SMALL, **EPOCHS} if name != "TRPO" else {**SMALL, **ROLLOUT, "normalize_advantage": False}
+        env = vec(lib, Same(THREE))
+        model = lib.make(name, "MlpPolicy", env, f"{name}{size}", **given | {"batch_size": size, "gamma": 0.0})
+        with constant_noise(lib):
+            model.learn(16)
+        found.append(says(lib, name, model, THREE))
+    return found
+
+
+@case("ARS.zero_policy,delta_std,n_eval_episodes,policy_kwargs")
+def first_candidates(lib: Library) -> Any:
+    found = []
+    for given in ({}, {"zero_policy": False}):
+        model = small(lib, vec(lib, Line(THREE, 3)), "ARS", n_delta=2, delta_std=0.0, policy_kwargs={}, **given)
+        own = model.policy.parameters_to_vector()
+        found.append([int(np.asarray(own).size), bool(np.abs(np.asarray(own)).max() > 0)])
+        model.learn(24)  # candidates that do not differ from the policy do not move it
+        found.append(bool(np.array_equal(own, model.policy.parameters_to_vector())))
+    for episodes in (1, 2):
+        env = Line(THREE, 3)
+        small(lib, vec(lib, env), "ARS", n_delta=2, n_eval_episodes=episodes, policy_kwargs={}).learn(12 * episodes)
+        found.append(len(env.actions))
     return found
 
 
@@ -1319,20 +1755,48 @@ DIFFERENT: dict[str, str] = {
     "sub_sampling_factor": "every k-th step in the order of the rollout, there after shuffling",
     "TRPO_Box": "target_kl and cg_damping bound the sum over action dimensions, there their mean",
     "TRPO": "conjugate gradients in another precision",
-    "RecurrentPPO": "not explained yet; a critic without LSTM is refused. Perhaps the memory of the first steps of each rollout",
+    "RecurrentPPO_Box_policy_kwargs2": "a critic without LSTM is refused",
     "CrossQ": "the variance of a batch is divided by n, there by n - 1",
-    "train_freq": "open: counted in environment steps from learning_starts on; schedules and targets between two updates",
-    "use_sde": "not explained yet: the noise that next actions are drawn with in TD targets",
-    "SAC_Box_policy_kwargs2": "as use_sde",
+    "noise_types": "noise is float32 in any case, as the actions that it is added to",
     "atari_wrapper": "the last frame of an episode is the maximum of its frames; there a frame of the action before may be in it",
     "exploration": "callbacks see the rate of the next action, there that of the last one",
     "updates_counted": "train_freq is counted from the end of learning_starts, and with n environments in environment steps",
     "logging": "columns of a CSV file are sorted; no line 'Logging to'",
     "checkpoints": "total_timesteps is exact, there a lower bound",
-    "random_search": "not explained yet: an environment is reset once more between candidates there, so other episodes are counted",
     "evaluating": "returns are not rounded to 6 digits; no warning without Monitor, which is optional here; environments that have played their share are told where episodes start, there always that one does",
 }
 """Reasons of the differences, by a part of the case's name; the first that fits. docs/coming-from-sb3.md has them."""
+MODULE = "a part of a PyTorch network; those of rejeu are made by policy_kwargs"
+BY_HAND = "buffers cannot be made by hand; an agent's are compared in its cases"
+NO_EFFECT = "without effect, which a warning says where it matters"
+DEFAULT = "other values than the default are refused or warn"
+REASONS: dict[str, str] = {
+    "common.envs.": "environments for the original's own tests, which rejeu does not have",
+    **dict.fromkeys((".QNetwork.", ".Actor.", ".ContinuousCritic.", ".Critic.", ".CrossQCritic."), MODULE),
+    **dict.fromkeys((".QuantileNetwork.", ".BaseModel.", "torch_layers.", "rmsprop_tf_like", ".BasePolicy."), MODULE),
+    **dict.fromkeys(("contrib.common.utils", "recurrent.buffers.pad", ".create_sequencers."), "of PyTorch's tensors"),
+    **dict.fromkeys(
+        (".MaskableCategorical.", "update_learning_rate", "get_parameters_by_name"), "of PyTorch's tensors"
+    ),
+    **dict.fromkeys(("obs_as_tensor",), "of PyTorch's tensors"),
+    **dict.fromkeys(("common.buffers.", "maskable.buffers.", "recurrent.buffers.", "HerReplayBuffer."), BY_HAND),
+    **dict.fromkeys(("recurrent.type_aliases",), BY_HAND),
+    **dict.fromkeys(("TrainFrequencyUnit.", "GoalSelectionStrategy."), "arguments of every Python Enum"),
+    **dict.fromkeys((".data_to_json.", ".json_to_data.", "_zip_file."), "files are not zip files with pickles"),
+    **dict.fromkeys((".optimize_memory_usage", ".use_sde_at_warmup", ".rollout_buffer_", ".sde_support"), NO_EFFECT),
+    **dict.fromkeys((".monitor_wrapper", ".support_multi_env", ".full_std", ".learn_features"), NO_EFFECT),
+    **dict.fromkeys((".n_lstm_layers", ".lstm_kwargs", ".clip_mean", ".share_features_extractor"), DEFAULT),
+    **dict.fromkeys((".batch_norm", ".with_bias"), DEFAULT),
+    "maybe_make_env.verbose": "prints that an environment is made",
+    ".buffer_size": "transitions there, rows here, of which an episode that ends uses one more (Replay buffers)",
+    "features_extractor_kwargs": "arguments of a PyTorch module",
+    "AsyncEval": "rejeu does not have it",
+    **dict.fromkeys((".tile_images.", ".CloudpickleWrapper.", "vec_env.util."), "internal"),
+    **dict.fromkeys((".plot_curves.", ".plot_results."), "a figure for people to look at"),
+    "SquashedDiagGaussianDistribution.epsilon": "rejeu's is exact and has none",
+    "BernoulliDistribution.action_dim": "compared by position",
+}
+"""Reasons, by a part of module, owner and argument."""
 NOT_COMPARABLE = {
     "device": "of PyTorch",
     "_init_setup_model": "internal",
@@ -1382,14 +1846,79 @@ def compared(rows: list[dict[str, Any]]) -> dict[str, list[str]]:
     return found
 
 
-def state_of(owner: str, argument: str, results: dict[str, list[str]]) -> str:
-    """Returns what is known of a setting."""
-    key = f"{owner}.{argument}"
-    if key in results:
-        return "equal" if {*results[key]} == {"equal"} else "different"
-    if argument in NOT_COMPARABLE:
-        return f"not comparable: {NOT_COMPARABLE[argument]}"
-    return "not compared"
+ON_POLICY = ("A2C", "PPO", "TRPO", "ARS", "RecurrentPPO", "MaskablePPO", "OnPolicyAlgorithm", "ActorCritic", "ars")
+"""Parts of the names of algorithms and policies that have no replay buffer."""
+
+
+def definition_of(module: str, owner: str, argument: str) -> str | None:
+    """Returns the name of the code of ours that takes an argument; None if there is none.
+
+    The settings of algorithms are the fields of their configurations, each of which one class defines, or arguments of all
+    agents; those of policies, that all go to ``policy_kwargs``, are the same for algorithms with replay and for those without.
+    """
+    package, _, rest = module.partition(".")
+    kind = "on policy" if any(part in f"{rest}.{owner}" for part in ON_POLICY) else "off policy"
+    if owner.endswith("Algorithm"):
+        return f"{kind}, any {argument}"
+    try:
+        found = getattr(importlib.import_module(f"{PACKAGES[package]}.{rest}".rstrip(".")), owner)
+    except (ImportError, AttributeError):
+        return None
+    from rejeu.algorithms.config import OffPolicyConfig
+    from rejeu.sb3 import algorithms, arguments, policy
+
+    if isinstance(found, str):  # of a policy
+        return f"{kind}, policy_kwargs.{argument}"
+    if isinstance(found, type) and issubclass(found, algorithms.Original):
+        config = found.algorithm.Config
+        kind = "off policy" if issubclass(config, OffPolicyConfig) else "on policy"
+        places = [one for one in config.__mro__ if argument in vars(one).get("__annotations__", {})]
+        if places:
+            place = places[-1].__module__.rpartition("rejeu.algorithms.")[2]
+            return f"{kind}, {'any' if place.endswith('config') else place} {argument}"
+        known = {*algorithms.AGENT_ARGUMENTS, *arguments.WITHOUT_EFFECT, "use_sde", "sde_sample_freq"}
+        return f"{kind}, {'any ' if argument in known else 'policy_kwargs.'}{argument}"
+    if isinstance(found, type) and issubclass(found, policy.BaseModel):
+        own = {
+            "n_critics": "any ",
+            "use_sde": "any ",
+            "n_quantiles": f"{rest.partition('.')[0]} ",
+        }  # not of policy_kwargs
+        return f"{kind}, {own.get(argument, 'policy_kwargs.')}{argument}"
+    if isinstance(found, type):
+        if issubclass(found, tuple):
+            return f"{found.__mro__[-3].__qualname__}.{argument}"
+        found = next((vars(one)["__init__"] for one in found.__mro__ if "__init__" in vars(one)), found)
+    names = inspect.signature(found).parameters
+    takes = argument in names or any(one.kind in (one.VAR_KEYWORD, one.VAR_POSITIONAL) for one in names.values())
+    return f"{getattr(found, '__module__', '')}.{getattr(found, '__qualname__', found)}.{argument}" if takes else None
+
+
+def states_of(settings: list[tuple[str, str, str]], results: dict[str, list[str]]) -> list[str]:
+    """Returns what is known of each setting: compared itself, or by another one that the same code of ours takes."""
+    codes = [definition_of(*one) for one in settings]
+    by_code: dict[str, set[str]] = {}
+    modules = {owner: module for module, owner, _ in settings}
+    for key, found in results.items():
+        owner, _, argument = key.partition(".")
+        if owner in modules and (code := definition_of(modules[owner], owner, argument)) is not None:
+            by_code.setdefault(code, set()).update(found)
+    states = []
+    for code, (module, owner, argument) in zip(codes, settings, strict=True):
+        found = {*results.get(f"{owner}.{argument}", ())}
+        places = [code] if owner != "BaseAlgorithm" else [f"{kind} policy, any {argument}" for kind in ("on", "off")]
+        same = {one for place in places for one in by_code.get(place, ())} if code is not None else set()
+        if found:
+            states.append("equal" if found == {"equal"} else "different")
+        elif same:
+            states.append("equal: by the same code" if same == {"equal"} else "different: by the same code")
+        elif reason := next((text for part, text in REASONS.items() if part in f"{module}.{owner}.{argument}"), ""):
+            states.append(f"not comparable: {reason}")
+        elif argument in NOT_COMPARABLE:
+            states.append(f"not comparable: {NOT_COMPARABLE[argument]}")
+        else:
+            states.append("not compared" if code is not None else "not compared: not in rejeu")
+    return states
 
 
 def result_row(name: str, original: Any, own: Any) -> dict[str, Any]:
@@ -1398,7 +1927,7 @@ def result_row(name: str, original: Any, own: Any) -> dict[str, Any]:
     same = gap <= TOLERANCES.get(name, TOLERANCE)
     reason = "" if same else next((text for part, text in DIFFERENT.items() if part in name), "not explained yet")
     errors = [side["error"] for side in (original, own) if isinstance(side, dict) and "error" in side]
-    row = {"case": name, "settings": CASES[name][0], "result": "equal" if same else "different"}
+    row = {"case": name, "settings": CASES[name][0], "result": "equal" if same else "different", "commit": commit()}
     return {
         **row,
         "difference": gap if math.isfinite(gap) else "other",
@@ -1406,14 +1935,21 @@ def result_row(name: str, original: Any, own: Any) -> dict[str, Any]:
     }
 
 
-def report(peer: str, original: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
-    """Returns the content of the file of results."""
+def report(peer: str, original: dict[str, Any], own: dict[str, Any], kept: list[dict[str, Any]]) -> dict[str, Any]:
+    """Returns the content of the file of results, with the rows of cases that did not run now."""
+    earlier = {row["case"]: row for row in kept if row["case"] in CASES and row["case"] not in original}
     rows = [result_row(name, original[name], own[name]) for name in original]
+    rows = [
+        earlier.get(name) or next(row for row in rows if row["case"] == name)
+        for name in CASES
+        if name in earlier or name in original
+    ]
     listed = subprocess.run([peer, __file__, "--list"], stdout=subprocess.PIPE, text=True, check=True).stdout
     results = compared(rows)
+    every_one = json.loads(listed.strip().splitlines()[-1])
     settings = [
-        {"module": module, "setting": f"{owner}.{argument}", "state": state_of(owner, argument, results)}
-        for module, owner, argument in json.loads(listed.strip().splitlines()[-1])
+        {"setting": f"{owner}.{argument}", "state": state}
+        for (_, owner, argument), state in zip(every_one, states_of(every_one, results), strict=True)
     ]
     by_state: dict[str, list[str]] = {}
     for one in settings:
@@ -1436,6 +1972,7 @@ def main() -> None:
     parser.add_argument("--raw", type=Path, nargs="*", help="results of --keep to join instead of running")
     parser.add_argument("--keep", type=Path, help="file for what both libraries returned")
     parser.add_argument("--only", nargs="*", default=[])
+    parser.add_argument("--join", action="store_true", help="take the other cases from the file of results")
     parser.add_argument("--side", choices=["original", "rejeu"])
     parser.add_argument("--folder", type=Path)
     parser.add_argument("--list", action="store_true")
@@ -1458,11 +1995,12 @@ def main() -> None:
         original, own = both(options.peer, options.only)
     if options.keep:
         options.keep.write_text(json.dumps([original, own]))
-    content = report(options.peer, original, own)
+    kept = json.loads(RESULTS.read_text())["rows"] if options.join else []
+    content = report(options.peer, original, own, kept)
     for row in content["rows"]:
         print(f"{row['case']:45} {row['result']:10} {row['difference']} {row['why'][:150]}")
     print(content["settings"], content["cases"])
-    if not options.only:
+    if not options.only or options.join:
         write(RESULTS, content, "rows")
 
 

@@ -422,6 +422,8 @@ def test_state_dependent_noise_has_the_variance_of_its_matrix():
 
     latent, log_std = np.array([[0.5, -1.0]]).repeat(4000, axis=0), np.log(np.array([[0.4], [0.3]]))
     distribution = StateDependentNoiseDistribution(1)
+    _, first = distribution.proba_distribution_net(4, latent_sde_dim=2)
+    assert first.tolist() == [[-2.0], [-2.0]]
     distribution.sample_weights(log_std, batch_size=4000)
     made = distribution.proba_distribution(np.full((4000, 1), 2.0), log_std, latent)
     std = np.sqrt((0.5 * 0.4) ** 2 + (1.0 * 0.3) ** 2)

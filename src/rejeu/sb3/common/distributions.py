@@ -100,10 +100,17 @@ class GaussianDistribution(Distribution):
         super().__init__()
         self.action_dim = action_dim
 
-    def proba_distribution_net(self, latent_dim: int, log_std_init: float = 0.0) -> tuple[eqx.Module, np.ndarray]:
-        """Returns a linear layer for the means, and logarithms of standard deviations."""
-        shape = (latent_dim, self.action_dim) if isinstance(self, StateDependentNoiseDistribution) else self.action_dim
-        return create_mlp(latent_dim, self.action_dim, [])[0], Tensor.of(np.full(shape, np.float32(log_std_init)))
+    def proba_distribution_net(
+        self, latent_dim: int, log_std_init: float | None = None, latent_sde_dim: int | None = None
+    ) -> tuple[eqx.Module, np.ndarray]:
+        """Returns a linear layer for the means, and logarithms of standard deviations.
+
+        They are ``log_std_init``; None: -2 for gSDE, where they are ``(latent_sde_dim or latent_dim, action_dim)``, else 0.
+        """
+        by_state = isinstance(self, StateDependentNoiseDistribution)
+        shape = (latent_sde_dim or latent_dim, self.action_dim) if by_state else self.action_dim
+        start = (-2.0 if by_state else 0.0) if log_std_init is None else log_std_init
+        return create_mlp(latent_dim, self.action_dim, [])[0], Tensor.of(np.full(shape, np.float32(start)))
 
     def proba_distribution(self, mean_actions: Any, log_std: Any) -> Self:
         """Sets the parameters, and returns itself."""
