@@ -11,7 +11,7 @@ import sys
 import types
 import zipfile
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 from unittest import mock
 
@@ -37,9 +37,14 @@ class Tensor:
         self.array = np.ascontiguousarray(array, np.float32)
 
 
-def torch_file(content: Any, storages: Mapping[str, bytes] | None = None) -> bytes:
-    """Returns a file of PyTorch; ``Tensor`` objects in ``content`` become tensors, each with a storage of its own."""
-    modules, found = torch_modules(), {}
+def pickled(
+    content: Any, stream: io.BytesIO, place: Callable[[str, int], tuple[Any, ...]], **options: Any
+) -> list[bytes]:
+    """Pickles ``content`` as PyTorch does and returns the storages of its ``Tensor`` objects, each with one of its own.
+
+    ``place`` returns how a storage is named in the file, by its number and its size.
+    """
+    found: list[bytes] = []
 
     class Writer(pickle.Pickler):
         def persistent_id(self, obj: Any) -> Any:
@@ -48,18 +53,26 @@ def torch_file(content: Any, storages: Mapping[str, bytes] | None = None) -> byt
         def reducer_override(self, obj: Any) -> Any:
             if not isinstance(obj, Tensor):
                 return NotImplemented
-            array, key = obj.array, str(len(found))
-            found[key] = array.tobytes()
-            storage = ("a storage", ("storage", modules["torch"].FloatStorage, key, "cpu", array.size))
+            array = obj.array
+            storage = ("a storage", place(str(len(found)), array.size))
+            found.append(array.tobytes())
             strides = tuple(n // 4 for n in array.strides)
             arguments = (storage, 0, array.shape, strides, False, OrderedDict())
-            return modules["torch._utils"]._rebuild_tensor_v2, arguments
+            return sys.modules["torch._utils"]._rebuild_tensor_v2, arguments
 
-    stream = io.BytesIO()
+    Writer(stream, **options).dump(content)
+    return found
+
+
+def torch_file(content: Any, storages: Mapping[str, bytes] | None = None) -> bytes:
+    """Returns a file of PyTorch; ``storages`` replaces those of the ``Tensor`` objects in ``content``, by number."""
+    stream, modules = io.BytesIO(), torch_modules()
+    place = lambda key, size: ("storage", modules["torch"].FloatStorage, key, "cpu", size)  # noqa: E731
     with mock.patch.dict(sys.modules, modules):
-        Writer(stream, protocol=2).dump(content)
+        found = pickled(content, stream, place, protocol=2)
     members = {"data.pkl": stream.getvalue(), "byteorder": b"little"}
-    members |= {f"data/{key}": value for key, value in {**found, **(storages or {})}.items()}
+    members |= {f"data/{i}": storage for i, storage in enumerate(found)}
+    members |= {f"data/{key}": storage for key, storage in (storages or {}).items()}
     return zipped({f"archive/{name}": value for name, value in members.items()}, zipfile.ZIP_STORED)
 
 
@@ -93,32 +106,15 @@ def serialized(value: Any) -> dict[str, str]:
 
 def old_torch_file(content: Any, kind: str = "FloatStorage", size: int | None = None) -> bytes:
     """Returns a file of PyTorch before 1.6 with the arrays of a dict; ``size`` replaces the number of values of storages."""
-    modules = torch_modules()
+    stream, modules = io.BytesIO(), torch_modules()
     modules["torch"].__dict__[kind] = type(kind, (), {"__module__": "torch"})
-    arrays: dict[str, np.ndarray] = {}
-
-    class Writer(pickle.Pickler):
-        def persistent_id(self, obj: Any) -> Any:
-            return obj[1] if isinstance(obj, tuple) and obj[:1] == ("a storage",) else None
-
-        def reducer_override(self, obj: Any) -> Any:
-            if not isinstance(obj, Tensor):
-                return NotImplemented
-            key, array = str(1000 + len(arrays)), obj.array
-            arrays[key] = array
-            n = array.size if size is None else size
-            storage = ("a storage", ("storage", getattr(modules["torch"], kind), key, "cpu", n, None))
-            strides = tuple(n // 4 for n in array.strides)
-            return modules["torch._utils"]._rebuild_tensor_v2, (storage, 0, array.shape, strides, False, OrderedDict())
-
-    stream = io.BytesIO()
+    place = lambda key, n: ("storage", getattr(modules["torch"], kind), key, "cpu", size or n, None)  # noqa: E731
     with mock.patch.dict(sys.modules, modules):
         for value in (0x1950A86A20F9469CFC6C, 1001, {"protocol_version": 1001, "little_endian": True}):
             pickle.dump(value, stream, protocol=2)
-        Writer(stream, protocol=2).dump(content)
-        pickle.dump(list(arrays), stream, protocol=2)
-    contents = (struct.pack("<q", one.size) + one.tobytes() for one in arrays.values())
-    return stream.getvalue() + b"".join(contents)
+        found = pickled(content, stream, place, protocol=2)
+        pickle.dump([str(key) for key in range(len(found))], stream, protocol=2)
+    return stream.getvalue() + b"".join(struct.pack("<q", len(one) // 4) + one for one in found)
 
 
 def vecnormalize_file(obs_rms: Any, protocol: int = 4, **attributes: Any) -> bytes:

@@ -24,7 +24,7 @@ from rejeu.loops.checks import check_finite
 from rejeu.sb3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor
 from tests.bad_environments import EVERY, Good, Line, RewardReadsInfo, RewardWithAxis, SameArray, seeing
 from tests.helpers import small_sac
-from tests.tiers import crossed
+from tests.tiers import crossed, only
 
 ENDING = [name for name, fault in EVERY.items() if fault.trained is not None]
 GOING_ON = [name for name, fault in EVERY.items() if fault.trained is None]
@@ -58,7 +58,9 @@ def test_all_errors_are_raised_together_and_warnings_as_warnings():
 
 
 @pytest.mark.filterwarnings("ignore")  # Box2D's module warns when it is imported, and crashes where that is an error
-@pytest.mark.parametrize("env_id", [*dict.fromkeys(preset.env_id for preset in presets.ALL), "rejeu/Ball-v0"])
+@pytest.mark.parametrize(
+    "env_id", only({"Pendulum-v1"}, [*dict.fromkeys(one.env_id for one in presets.ALL), "rejeu/Ball-v0"])
+)
 def test_no_environment_with_a_preset_is_refused(env_id):
     try:
         env = make_env(env_id)
@@ -113,7 +115,7 @@ def test_a_fault_that_can_be_mended_or_borne_does_not_end_a_run(name, backend):
     walk(BACKENDS[backend](EVERY[name].make))
 
 
-@pytest.mark.parametrize("name", ["scalar", "missing key", "no reward", "four values", "only observation", "no seed"])
+@pytest.mark.parametrize("name", only({"scalar", "no seed"}, ["scalar", "missing key", "four values", "no seed"]))
 def test_training_ends_with_the_words(name):
     fault = EVERY[name]
     agent = small_sac(fault.make(), learning_starts=99)
@@ -370,7 +372,7 @@ class Far(Good):
         return super().observe() * np.float32([1.0, 1.0, self.scale])
 
 
-@pytest.mark.parametrize("algorithm", ["SAC", "PPO"])
+@pytest.mark.parametrize("algorithm", only(["SAC"], ["SAC", "PPO"]))
 def test_observations_far_outside_of_the_declared_bounds_are_told_once(algorithm):
     agent = rejeu.AGENTS[algorithm]("MlpPolicy", make_vector(Far, 2, "gymnasium"), policy_kwargs={"net_arch": [4]})
     words = r"Far returned the observation with -?\d.*e\+0\d at index 2 in environment 0, far outside of .*\[-20, 20\]"

@@ -390,11 +390,7 @@ def self_seeding():
         ("parkin-v0", {}, "no environment is called 'parkin-v0'; did you mean .*parking-v0"),
         ("Zzzzzz", {}, "no environment is called 'Zzzzzz'; rejeu list"),
         ("Pendulun-v1", {"backend": "envpool"}, "no environment is called 'Pendulun-v1'; did you mean"),
-        (
-            "Pendulum-v1",
-            {"n_envs": 3, "seed": [1, 2]},
-            r"seed=\[1, 2\] must be a number, or a sequence of 3 numbers, o",
-        ),
+        ("Pendulum-v1", {"n_envs": 3, "seed": [1, 2]}, r"seed=\[1, 2\] must be a number, or a sequence of 3 numbers"),
         ("Pendulum-v1", {"n_envs": 3, "seed": [1, 2, -3]}, "must have whole numbers from 0 to 2"),
         ("Pendulum-v1", {"n_envs": 3, "seed": [1, 2, 2.5]}, "must have whole numbers from 0 to 2"),
         ("Pendulum-v1", {"n_envs": 3, "seed": [1, 2, 2**31]}, "must have whole numbers from 0 to 2"),
@@ -426,10 +422,7 @@ def test_a_missing_package_is_named_with_the_command_that_installs_it(monkeypatc
 @pytest.mark.parametrize(
     ("env_id", "words"),
     [
-        (
-            "dm_control/cartpole-balance-v0",
-            r'package shimmy, which is not installed: pip install "shimmy\[dm-control\]"$',
-        ),
+        ("dm_control/cartpole-balance-v0", r'package shimmy, .*: pip install "shimmy\[dm-control\]"$'),
         ("PandaReach-v3", "package panda_gym, which is not installed: pip install panda-gym$"),
         ("Meta-World/MT1", "pip install metaworld$"),
         ("MiniGrid-Empty-5x5-v0", "pip install minigrid; EnvPool has MiniGrid-Empty-5x5-v0: backend='envpool'"),

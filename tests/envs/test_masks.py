@@ -18,10 +18,11 @@ from rejeu.core import Clock, Masked
 from rejeu.envs.make import InProcess, make_vector
 from rejeu.envs.masks import make_masked
 from rejeu.errors import BadEnvironmentError, WorkerError
+from rejeu.loops.learner import Readings
 from rejeu.sb3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor
 from tests.environments import Counter
 from tests.helpers import assert_same_parameters
-from tests.tiers import crossed
+from tests.tiers import crossed, exhaustive, only
 from tests.worker_environments import ACTIONS, Leaving, Rules, Silent, sizes
 
 CLOCK = Clock(np.uint32(0), np.uint32(0), np.float32(0.0))
@@ -41,13 +42,15 @@ def vector(kind, by="info", n_envs=3):
 # What is forbidden is not done: the environment itself checks every action.
 
 
-@pytest.mark.parametrize(("kind", "given"), crossed(list(ACTIONS), [("info", 3), ("method", 1)]))
-def test_what_is_forbidden_is_never_done(kind, given):
-    by, n_envs = given
+NEVER = [("multi", "info", 3), *(pytest.param(kind, "method", 1, marks=exhaustive) for kind in ACTIONS)]
+
+
+@pytest.mark.parametrize(("kind", "by", "n_envs"), NEVER)
+def test_what_is_forbidden_is_never_done(kind, by, n_envs):
     env = vector(kind, by, n_envs)
-    agent = small(env, learning_rate=0.05).learn(1000)
-    assert sum(one.taken for one in env.envs) == -(-1000 // n_envs) * n_envs
-    assert len(agent.history) > 100
+    agent = small(env).learn(600)
+    assert sum(one.taken for one in env.envs) == 600
+    assert len(agent.history) > 60
     other = vector(kind, by, n_envs)
     for deterministic in (True, False):
         agent.evaluate(60, env=other, deterministic=deterministic)
@@ -55,6 +58,7 @@ def test_what_is_forbidden_is_never_done(kind, given):
     assert all(np.isfinite(value).all() for value in agent.get_parameters().values())
 
 
+@exhaustive
 def test_a_rollout_of_whole_episodes_keeps_to_the_masks():
     env = vector("multi")
     small(env, n_episodes=2, n_steps=6).learn(300)
@@ -99,6 +103,7 @@ def test_masks_of_environments_elsewhere_are_those_of_environments_in_this_proce
         there.close()
 
 
+@exhaustive
 def test_an_agent_learns_with_the_masks_of_worker_processes():
     env = SubprocVecEnv([functools.partial(Rules, "discrete", "method")] * 2)
     try:
@@ -117,6 +122,7 @@ def test_masks_that_workers_do_not_have_are_asked_for():
         vector.close()
 
 
+@exhaustive
 def test_a_lost_worker_with_masks_is_started_anew_where_that_is_asked_for():
     env = make_masked(Leaving, 2, "gymnasium-async", seed=0, worker_timeout=60.0, restart_workers=1)
     try:
@@ -144,7 +150,7 @@ def test_worker_options_without_meaning_are_refused_for_masks_too(given, message
             make_masked(env, **given)
 
 
-@pytest.mark.parametrize("normalize", [True, {"norm_reward": False}])
+@pytest.mark.parametrize("normalize", only([True], [True, {"norm_reward": False}]))
 def test_masks_and_normalisation_go_together(normalize):
     env = vector("discrete")
     agent = small(env, normalize=normalize).learn(384)
@@ -157,22 +163,23 @@ def test_masks_and_normalisation_go_together(normalize):
 # What is learnt from.
 
 
+@functools.cache
 def recorded(kind):
-    """An agent after one rollout, the rollout that it is about to learn from, and the environments."""
+    """An agent's state before its first update, the rollout that it is about to learn from, and the environments."""
     env = vector(kind, n_envs=2)
     agent = small(env, n_steps=32)
-    rollouts, update = [], agent.learner.update
+    rollouts = []
 
     def keep(state, batches, clock):
         rollouts.append((agent.state, jax.tree.map(np.array, batches)))
-        return update(state, batches, clock)
+        return state, Readings((), np.zeros(1)), None
 
     agent.learner.update = keep
     agent.learn(64)
     return rollouts[0], env
 
 
-@pytest.mark.parametrize("kind", list(ACTIONS))
+@pytest.mark.parametrize("kind", only({"discrete", "multi"}, ACTIONS))
 def test_masks_are_stored_with_the_step_that_they_belong_to(kind):
     (_, rollout), env = recorded(kind)
     mask = rollout.obs.mask
@@ -209,7 +216,7 @@ def allowed_distribution(logits, mask, space):
     return parts
 
 
-@pytest.mark.parametrize("kind", list(ACTIONS))
+@pytest.mark.parametrize("kind", only({"discrete", "multi"}, ACTIONS))
 def test_learning_knows_the_probabilities_among_what_was_allowed(kind):
     (state, rollout), _ = recorded(kind)
     space = ACTIONS[kind]
@@ -241,6 +248,7 @@ def test_what_is_forbidden_gets_no_gradient():
     assert np.abs(np.delete(weight, 3, axis=1)).min() > 0.0
 
 
+@exhaustive
 def test_the_best_of_what_is_allowed_is_learnt():
     """Rewards are the action itself: with the mask in hand the best is the largest that is allowed."""
     agent = small(vector("discrete"), gamma=0.0, learning_rate=0.02, n_steps=128, n_epochs=4).learn(4000)
@@ -271,7 +279,9 @@ def test_predict_refuses_a_mask_of_another_length_and_other_agents_take_none():
     with pytest.raises(ValueError, match=r"action_masks has shape \(3,\), expected \(1, 4\)"):
         small(vector("shifted")).predict(np.zeros(2, np.float32), action_masks=[1, 1, 1])
     with pytest.raises(TypeError, match="made without action_masks=True"):
-        rejeu.PPO("MlpPolicy", Rules(), n_steps=4).predict(np.zeros(2, np.float32), action_masks=np.ones(5))
+        rejeu.A2C("MlpPolicy", Rules(), policy_kwargs={"net_arch": [4]}).predict(
+            np.zeros(2, np.float32), action_masks=np.ones(5)
+        )
 
 
 def test_a_file_keeps_all_of_it(tmp_path):
@@ -289,7 +299,7 @@ def test_a_file_keeps_all_of_it(tmp_path):
 
 def test_a_registered_environment_is_made_anew_for_evaluation():
     gym.register("rejeu-test/Rules-v0", functools.partial(Rules, "discrete"), max_episode_steps=50)
-    agent = small("rejeu-test/Rules-v0").learn(64)
+    agent = small("rejeu-test/Rules-v0")
     assert agent.env.max_episode_steps == 50
     one, other = (agent.evaluate(8, seed=3).returns for _ in range(2))
     assert np.array_equal(one, other)
@@ -310,7 +320,7 @@ def test_environments_seeded_before_masks_were_asked_for_stay_seeded():
 
 def test_an_episode_may_end_where_nothing_is_allowed():
     env = InProcess([Rules(all_at_end=False) for _ in range(2)], seed=0)
-    agent = small(env, n_steps=16).learn(64)
+    agent = small(env).learn(64)
     agent.evaluate(4, env=InProcess([Rules(all_at_end=False)], seed=0))
     assert all(np.isfinite(value).all() for value in agent.get_parameters().values())
 
@@ -326,8 +336,7 @@ class Fixed(Counter):
 
 def test_masks_may_come_as_a_list_of_parts():
     env = Fixed([np.array([1, 0]), [False, True]], spaces.MultiDiscrete([2, 2]))
-    small(env, n_steps=4).learn(8)
-    assert np.array_equal(np.unique(env.actions, axis=0), [[0, 1]])
+    assert make_masked(env).reset().mask.tolist() == [[True, False, False, True]]
 
 
 class Mute(Fixed):
@@ -345,16 +354,8 @@ class Mute(Fixed):
         (Silent, BadEnvironmentError, r'put info\["action_mask"\] into what reset and step return'),
         # the id of one of EnvPool's environments is made where its masks can be reached
         (lambda: "CartPole-v1", BadEnvironmentError, "CartPole-v1 does not return action masks"),
-        (
-            Counter,
-            ValueError,
-            "masks need Discrete, MultiDiscrete or MultiBinary actions; Counter has .* leave action_masks out",
-        ),
-        (
-            lambda: make_vector("CartPole-v1", 2, "envpool"),
-            TypeError,
-            "masks of EnvPool cannot be accessed; give the i",
-        ),
+        (Counter, ValueError, "masks need Discrete, MultiDiscrete or MultiBinary actions; Counter has"),
+        (lambda: make_vector("CartPole-v1", 2, "envpool"), TypeError, "masks of EnvPool cannot be accessed"),
         (lambda: 3, TypeError, "must be an id, an environment or a function that makes one, got int"),
     ],
 )

@@ -11,21 +11,17 @@ import textwrap
 import time
 import warnings
 
-import gymnasium as gym
 import numpy as np
 import pytest
 
 import rejeu
-from rejeu import cluster
 from rejeu.callbacks import Checkpoint
 from rejeu.envs.make import make_vector
-from rejeu.envs.masks import make_masked
 from rejeu.envs.workers import pool, remote
-from rejeu.errors import ClusterError, WorkerError
+from rejeu.errors import WorkerError
 from tests import ray_cluster
-from tests.environments import Reach
 from tests.helpers import assert_same_parameters, small_sac
-from tests.worker_environments import Faulty, Losable, Paced, Rules, UnsendableError, imports_jax, in_order, process_id
+from tests.worker_environments import Losable, Paced, imports_jax, in_order, process_id
 
 pytestmark = [
     pytest.mark.exhaustive,
@@ -130,26 +126,6 @@ def test_nothing_is_left_when_a_program_ends(tmp_path, ends):
     assert_gone(pids)
 
 
-@pytest.mark.parametrize(
-    ("fault", "words"), [("make", "no such device"), ("reset", "cannot begin"), ("step", "the wheel came off")]
-)
-def test_the_traceback_of_an_actor_reaches_the_user(fault, words):
-    here = os.getpid()
-
-    def make():
-        if fault == "make" and os.getpid() != here:
-            raise UnsendableError(1, "no such device")
-        return Faulty("nothing" if fault == "make" else fault)
-
-    def fail():
-        with opened(make) as vector:
-            vector.reset()
-            vector.step(actions(0, 1))
-
-    with pytest.raises(WorkerError, match=rf"(?s)environment.*Traceback .*UnsendableError: {words}"):
-        fail()
-
-
 @pytest.mark.parametrize("act", [1, 2])
 def test_an_actor_that_crashes_or_hangs_is_named_and_all_are_ended(act):
     with opened(Losable, 3, worker_timeout=2.0) as vector:
@@ -194,26 +170,6 @@ def play(vector, action):
     return step
 
 
-def test_agents_learn_the_same_in_actors():
-    agents = []
-    for backend in ("ray", "gymnasium-async"):
-        with contextlib.closing(make_vector(Reach, 2, backend, seed=0)) as env:
-            agents.append(small_sac(env, replay_buffer_class="HerReplayBuffer", learning_starts=25).learn(80))
-    assert_same_parameters(*agents)
-    successes = [[episode.success for episode in agent.history.episodes] for agent in agents]
-    assert successes[0] == successes[1] != []
-
-
-def test_masks_reach_the_policy():
-    agents = []
-    for backend in ("ray", "gymnasium"):
-        env = make_masked(functools.partial(Rules, "discrete"), 2, backend, seed=0)
-        with contextlib.closing(env):
-            kwargs = {"n_steps": 8, "batch_size": 8, "seed": 0, "policy_kwargs": {"net_arch": [8]}}
-            agents.append(rejeu.MaskablePPO("MlpPolicy", env, **kwargs).learn(40))  # Rules refuses forbidden actions
-    assert_same_parameters(*agents)
-
-
 def test_a_run_resumes_exactly(tmp_path):
     def train(n, env, callback=None):
         return small_sac(env).learn(n, callback)
@@ -235,14 +191,6 @@ def test_results_in_the_same_order_train_the_same_agent_in_actors_and_in_process
     with contextlib.closing(make_vector(Paced, 3, "gymnasium-async", seed=0, wait_for=2)) as env:
         again = small_sac(in_order(env)).learn(60)
     assert_same_parameters(live, again)
-
-
-def test_another_version_is_one_line(monkeypatch):
-    monkeypatch.setattr(cluster, "versions", lambda: {"Python": "3.99", "rejeu": "9", "gymnasium": gym.__version__})
-    with pytest.raises(
-        ClusterError, match=r"^node 127\.0\.0\.1 has Python 3\.\d+ and not 3\.99, rejeu .* and not 9 as here"
-    ):
-        make_vector(Paced, 2, "ray")
 
 
 def test_environments_without_a_place_are_named(monkeypatch):

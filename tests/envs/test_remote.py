@@ -80,6 +80,7 @@ class Ray(SimpleNamespace):
 def ray(monkeypatch):
     ray = Ray(closed=[])
     monkeypatch.setattr(process, "node_address", lambda: "10.0.0.7")
+    monkeypatch.setattr(remote, "LOOK_SECONDS", 0.05)
     monkeypatch.setattr(
         cluster,
         "connect",

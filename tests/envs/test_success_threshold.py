@@ -116,6 +116,7 @@ def test_evaluation_takes_a_threshold_of_its_own_else_the_agents(tmp_path):
     assert math.isnan(rejeu.A2C("MlpPolicy", counter(), **SMALL).evaluate(2, env=counter()).success_rate)
 
 
+@exhaustive
 def test_masks_and_memory_leave_the_judgement_alone():
     env = counter()
     env.action_space, env.action_masks = gym.spaces.Discrete(2), lambda: [1, 0]

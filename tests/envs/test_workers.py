@@ -26,7 +26,7 @@ from rejeu.errors import BadEnvironmentError, WorkerError
 from rejeu.sb3.common.vec_env import SubprocVecEnv
 from tests.environments import Counter
 from tests.helpers import small_sac
-from tests.tiers import exhaustive
+from tests.tiers import exhaustive, only
 from tests.worker_environments import DrawsGlobally, Faulty, Losable, Rare
 
 
@@ -161,7 +161,7 @@ def test_a_worker_that_crashes_or_hangs_is_named_and_all_are_ended(act):
     vector.close()
 
 
-@pytest.mark.parametrize("act", [1, 2])
+@pytest.mark.parametrize("act", only([1], [1, 2]))
 def test_a_lost_worker_is_started_anew_and_its_episode_truncated(act):
     vector = make_vector(Losable, 2, "gymnasium-async", seed=0, worker_timeout=1.0, restart_workers=1)
     vector.reset()
@@ -206,12 +206,12 @@ def test_training_goes_on_where_workers_are_started_anew():
 
 
 def test_a_subproc_vector_replaces_lost_processes_too():
-    env = SubprocVecEnv([Losable] * 2, worker_timeout=3.0, restart_workers=1)
+    env = SubprocVecEnv([Losable] * 2, restart_workers=1)
     try:
         env.reset()
         before = env.step(actions(0, 0))[0]
-        with pytest.warns(RuntimeWarning, match="environment 0 gave no answer"):
-            obs, rewards, dones, infos = env.step(actions(2, 0))
+        with pytest.warns(RuntimeWarning, match="environment 0 ended by itself"):
+            obs, rewards, dones, infos = env.step(actions(1, 0))
         assert (dones.tolist(), rewards[0], infos[0]["TimeLimit.truncated"]) == ([True, False], 0.0, True)
         np.testing.assert_array_equal(infos[0]["terminal_observation"], before[0])
         np.testing.assert_array_equal(obs[:, 1], [0, 2])
@@ -371,6 +371,7 @@ def test_a_script_without_a_guard_is_told_so(tmp_path):
     assert "must stand under `if __name__ == '__main__':`" in ran.stderr.splitlines()[-1]
 
 
+@exhaustive
 def test_a_script_with_a_guard_makes_workers(tmp_path):
     ran = run_script(
         tmp_path,

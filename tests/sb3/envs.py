@@ -60,31 +60,18 @@ class IdentityEnvBox(IdentityEnv):
         return float(np.all(np.abs(self.state - action) <= self.eps))
 
 
-class InvalidActionEnv(IdentityEnv):
-    """An :class:`IdentityEnv` that allows the right action and all others but ``n_invalid_actions``. Abstract."""
+class InvalidActionEnvDiscrete(IdentityEnv):
+    """An :class:`IdentityEnv` of ``dim`` choices, of which ``n_invalid_actions`` wrong ones are masked."""
 
-    def __init__(self, space: spaces.Space, sizes: list[int], n_invalid_actions: int, ep_length: int) -> None:
-        if n_invalid_actions > sum(sizes) - len(sizes):
-            raise ValueError(f"n_invalid_actions={n_invalid_actions} must leave a choice of {space}")
-        super().__init__(space=space, ep_length=ep_length)
-        self.sizes, self.n_invalid_actions = sizes, n_invalid_actions
+    def __init__(self, dim: int, ep_length: int = 100, n_invalid_actions: int = 0) -> None:
+        super().__init__(dim, ep_length=ep_length)
+        self.n_invalid_actions = n_invalid_actions
 
     def action_masks(self) -> np.ndarray:
-        """Returns which options are allowed, ``bool (n,)``; the right ones always are."""
-        right = np.concatenate([np.eye(n, dtype=bool)[i] for n, i in zip(self.sizes, self._choices(), strict=True)])
-        forbidden = np.random.default_rng().choice(np.flatnonzero(~right), self.n_invalid_actions, replace=False)
-        return ~np.isin(np.arange(len(right)), forbidden)
-
-    def _choices(self) -> list[int]:
-        return np.ravel(self.state).tolist()
-
-
-class InvalidActionEnvDiscrete(InvalidActionEnv):
-    """One choice among ``dim``, of which ``n_invalid_actions`` are masked."""
-
-    def __init__(self, dim: int | None = None, ep_length: int = 100, n_invalid_actions: int = 0) -> None:
-        dim = 1 if dim is None else dim
-        super().__init__(spaces.Discrete(dim), [dim], n_invalid_actions, ep_length)
+        """Returns which options are allowed, ``bool (dim,)``; the right one always is."""
+        wrong = np.delete(np.arange(self.action_space.n), self.state)
+        forbidden = np.random.default_rng().choice(wrong, self.n_invalid_actions, replace=False)
+        return ~np.isin(np.arange(self.action_space.n), forbidden)
 
 
 class FakeImageEnv(gym.Env):
@@ -136,58 +123,25 @@ class BitFlippingEnv(gym.Env):
         n_bits: number of bits.
         continuous: one action in [-1, 1] for each bit, which flips it if it is positive.
         max_steps: steps of an episode; None: ``n_bits``.
-        discrete_obs_space: observe the bits as one number.
-        image_obs_space: observe the bits as the first pixels of an image.
-        channel_first: put the channels of that image first.
-        render_mode: ``"human"`` prints the bits.
     """
 
-    metadata: dict[str, Any] = {"render_modes": ["human"], "render_fps": 4}
-
-    def __init__(
-        self,
-        n_bits: int = 10,
-        continuous: bool = False,
-        max_steps: int | None = None,
-        discrete_obs_space: bool = False,
-        image_obs_space: bool = False,
-        channel_first: bool = True,
-        render_mode: str = "human",
-    ) -> None:
-        self.render_mode = render_mode
-        self.image_shape = (1, 36, 36) if channel_first else (36, 36, 1)
-        space: spaces.Space = spaces.MultiBinary(n_bits)
-        if discrete_obs_space:
-            space = spaces.Discrete(2**n_bits)
-        elif image_obs_space:
-            space = spaces.Box(low=0, high=255, shape=self.image_shape, dtype=np.uint8)
-        self.obs_space = space
-        self.observation_space = spaces.Dict(dict.fromkeys(("observation", "achieved_goal", "desired_goal"), space))
+    def __init__(self, n_bits: int = 10, continuous: bool = False, max_steps: int | None = None) -> None:
+        keys = ("observation", "achieved_goal", "desired_goal")
+        self.observation_space = spaces.Dict(dict.fromkeys(keys, spaces.MultiBinary(n_bits)))
         self.action_space = spaces.Box(-1, 1, (n_bits,), np.float32) if continuous else spaces.Discrete(n_bits)
-        self.n_bits, self.continuous = n_bits, continuous
-        self.max_steps = n_bits if max_steps is None else max_steps
+        self.continuous, self.max_steps = continuous, n_bits if max_steps is None else max_steps
         self.state = np.zeros(n_bits, np.int8)
         self.desired_goal = np.ones(n_bits, np.int8)
         self.current_step = 0
 
-    def convert_if_needed(self, state: np.ndarray) -> Any:
-        """Returns bits as they are observed."""
-        if isinstance(self.obs_space, spaces.Discrete):
-            return int(np.sum(2 ** np.arange(self.n_bits) * state))
-        if isinstance(self.obs_space, spaces.Box):
-            image = np.zeros(self.image_shape, np.uint8)
-            image.reshape(-1)[: self.n_bits] = np.where(state, 255, 0)
-            return image
-        return state.copy()
-
     def _observation(self) -> dict[str, Any]:
-        bits, goal = self.convert_if_needed(self.state), self.convert_if_needed(self.desired_goal)
-        return {"observation": bits, "achieved_goal": bits, "desired_goal": goal}
+        bits = self.state.copy()
+        return {"observation": bits, "achieved_goal": bits, "desired_goal": self.desired_goal.copy()}
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         super().reset(seed=seed)
         self.current_step = 0
-        self.state = self.np_random.integers(0, 2, self.n_bits).astype(np.int8)
+        self.state = self.np_random.integers(0, 2, len(self.state)).astype(np.int8)
         return self._observation(), {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -201,13 +155,7 @@ class BitFlippingEnv(gym.Env):
 
     def compute_reward(self, achieved_goal: Any, desired_goal: Any, _info: Any) -> Any:
         """Returns 0 where the goals are equal and -1 elsewhere, for one pair of goals or a batch of them."""
-        axes = len(self.obs_space.shape or ())
-        different = np.not_equal(achieved_goal, desired_goal)
-        return -np.any(different, axis=tuple(range(-axes, 0))).astype(np.float32)
-
-    def render(self) -> None:
-        """Prints the bits."""
-        print(self.state)
+        return -np.any(np.not_equal(achieved_goal, desired_goal), axis=-1).astype(np.float32)
 
 
 class SimpleMultiObsEnv(gym.Env):

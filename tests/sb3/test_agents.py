@@ -17,6 +17,8 @@ from rejeu.sb3.common.evaluation import evaluate_policy
 from rejeu.sb3.common.monitor import Monitor
 from rejeu.sb3.common.vec_env import DummyVecEnv, VecNormalize
 
+pytestmark = pytest.mark.usefixtures("learners_are_shared")
+
 TINY = {"policy_kwargs": {"net_arch": [4]}}
 
 

@@ -27,6 +27,8 @@ from rejeu.sb3.common.vec_env import VecNormalize
 from tests.golden.vec_env_script import Walk
 from tests.sb3.test_vec_env import taught
 
+pytestmark = pytest.mark.usefixtures("learners_are_shared")
+
 
 def dqn(env=None, **settings):
     settings = {"learning_starts": 1000, "policy_kwargs": {"net_arch": [4]}, "seed": 0, **settings}

@@ -8,7 +8,7 @@ import pytest
 
 from tests.sb3.examples import EXAMPLES
 
-QUICK = ("train_save_load_and_evaluate", "save_and_load_replay_buffer_and_policy", "several_callbacks", "log_values")
+QUICK = ("train_save_load_and_evaluate", "log_values")
 """Those that run without ``--slow``."""
 
 

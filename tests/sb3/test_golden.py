@@ -9,6 +9,8 @@ import pytest
 
 from tests.golden import vec_env_script as script
 
+pytestmark = pytest.mark.usefixtures("learners_are_shared")
+
 GOLDEN = Path(__file__).parents[1] / "golden" / "vec_env_sb3.npz"
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import os
 import subprocess
 import sys
@@ -12,89 +11,14 @@ import numpy as np
 import pytest
 
 import rejeu
-from rejeu.reporting.video import record_video, show_videos
+from rejeu.reporting.video import record_video
 from rejeu.sb3.common.vec_env import DummyVecEnv, VecVideoRecorder
 from rejeu.sb3.common.vec_env.base_vec_env import tile_images
 from tests.reporting.test_video import Lamp, decode
+from tests.tiers import exhaustive
 
 
-@pytest.fixture
-def in_tmp_path(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
-def test_a_script_for_stable_baselines3_runs(in_tmp_path, capsys):
-    """The calls of the teaching document on hindsight replay in their order, shorter."""
-    import highway_env  # noqa: F401
-
-    from rejeu.sb3 import SAC, HerReplayBuffer
-    from rejeu.sb3.common.evaluation import evaluate_policy
-    from rejeu.sb3.common.monitor import Monitor
-    from rejeu.sb3.common.noise import NormalActionNoise
-    from rejeu.sb3.common.vec_env import DummyVecEnv, VecVideoRecorder
-
-    env = gym.make("parking-v0")
-    obs, _ = env.reset()
-    assert obs["observation"].shape == obs["desired_goal"].shape == (6,)
-    n_actions = env.action_space.shape[0]
-
-    model = SAC(
-        "MultiInputPolicy",
-        env,
-        replay_buffer_class=HerReplayBuffer,
-        replay_buffer_kwargs={"n_sampled_goal": 4, "goal_selection_strategy": "future"},
-        learning_starts=100,
-        buffer_size=50000,
-        batch_size=64,
-        action_noise=NormalActionNoise(mean=np.zeros(n_actions), sigma=0.2 * np.ones(n_actions)),
-        policy_kwargs={"net_arch": [64, 64]},
-        train_freq=1,
-        gradient_steps=1,
-        verbose=1,
-    )
-    model.learn(total_timesteps=300, log_interval=100)
-    before = model.predict(obs, deterministic=True)[0]
-    model.save("her_sac_parking")
-    model.save_replay_buffer("her_sac_parking_replay_buffer")
-    del model
-
-    model = SAC.load("her_sac_parking", env=env)
-    np.testing.assert_array_equal(model.predict(obs, deterministic=True)[0], before)
-    eval_env = Monitor(env)
-    mean_reward, std_reward = evaluate_policy(model, eval_env, n_eval_episodes=2, deterministic=True)
-    assert mean_reward < 0 <= std_reward
-    np.testing.assert_allclose(np.mean(eval_env.get_episode_rewards()), mean_reward, rtol=1e-4)
-
-    assert model.replay_buffer.size() == 0
-    model.load_replay_buffer("her_sac_parking_replay_buffer")
-    assert model.replay_buffer.size() == 300
-    model.learn(50)
-    assert model.replay_buffer.size() == 350
-
-    def record_as_in_the_document(env_id, model, video_length=1000, prefix="", video_folder="videos/"):
-        eval_env = DummyVecEnv([lambda: gym.make(env_id, render_mode="rgb_array")])
-        eval_env = VecVideoRecorder(
-            eval_env,
-            video_folder,
-            record_video_trigger=lambda step: step == 0,
-            video_length=video_length,
-            name_prefix=prefix,
-        )
-        obs = eval_env.reset()
-        for _ in range(video_length):
-            action, _ = model.predict(obs, deterministic=True)
-            obs, _, _done, _info = eval_env.step(action)
-        eval_env.close()
-
-    record_as_in_the_document("parking-v0", model, video_length=10, prefix="sac-parking")
-    assert os.listdir("videos") == ["sac-parking-step-0-to-step-10.mp4"]
-    frames = decode(in_tmp_path / "videos" / "sac-parking-step-0-to-step-10.mp4").frames
-    assert frames.shape == (11, 300, 600, 3)
-    assert frames.std() > 10
-    assert "<video" in show_videos("videos", prefix="sac-parking").data
-
-
+@exhaustive
 def test_an_agent_is_recorded_on_an_environment_like_its_own(tmp_path):
     """highway-env's observations are an OrderedDict; the agent was made with a configuration of its own."""
     import highway_env  # noqa: F401
@@ -106,25 +30,10 @@ def test_an_agent_is_recorded_on_an_environment_like_its_own(tmp_path):
     assert frames.std() > 10
 
 
-@pytest.mark.parametrize(
-    ("module", "names"),
-    [
-        (".her", ["GoalSelectionStrategy"]),
-        (".her.goal_selection_strategy", ["GoalSelectionStrategy"]),
-        (".common.noise", ["NormalActionNoise", "OrnsteinUhlenbeckActionNoise"]),
-        (".common.evaluation", ["evaluate_policy"]),
-    ],
-)
-def test_paths_lead_to_the_same_objects(module, names):
-    for name in names:
-        assert getattr(importlib.import_module(f"rejeu.sb3{module}"), name) is getattr(rejeu, name)
-
-
 def test_the_core_does_not_import_rejeu_sb3_and_get_env_still_returns_a_vec_env():
     script = """
 import sys, rejeu
 agent = rejeu.DQN("MlpPolicy", rejeu.make_vector("CartPole-v1", backend="gymnasium"), policy_kwargs={"net_arch": [4]})
-agent.learn(5)
 assert not [name for name in sys.modules if name.startswith("rejeu.sb3")]
 print(type(agent.get_env()).__name__)
 """

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import io
 from pathlib import Path
 from types import SimpleNamespace
@@ -28,16 +27,13 @@ from rejeu.sb3.common.buffers import HerReplayBuffer
 from rejeu.sb3.common.callbacks import LogEveryNTimesteps
 from rejeu.sb3.common.env_util import make_atari_env, make_vec_env
 from rejeu.sb3.common.monitor import ResultsWriter, load_results
-from rejeu.sb3.common.preprocessing import (
-    get_action_dim,
-    get_flattened_obs_dim,
-    get_obs_shape,
-    is_image_space,
-    preprocess_obs,
-)
 from rejeu.sb3.common.vec_env import DummyVecEnv, VecNormalize, VecTransposeImage, is_vecenv_wrapped
 from rejeu.sb3.common.vec_env.base_vec_env import VecEnvWrapper
 from tests.sb3 import envs
+from tests.sb3.test_original import Features
+from tests.tiers import crossed, exhaustive
+
+pytestmark = pytest.mark.usefixtures("learners_are_shared")
 
 SMALL = {"policy_kwargs": {"net_arch": [8]}}
 
@@ -64,8 +60,7 @@ class Weighing(envs.BitFlippingEnv):
         return weight * (super().compute_reward(achieved_goal, desired_goal, info) - 0.5)
 
 
-@pytest.mark.parametrize("n_steps", [1, 2])
-@pytest.mark.parametrize("n_envs", [1, 2])
+@pytest.mark.parametrize(("n_steps", "n_envs"), crossed([1, 2], [1, 2]))
 def test_rewards_of_new_goals_are_computed_from_the_infos_of_their_steps(n_steps, n_envs, tmp_path):
     model = sb3.SAC(
         "MultiInputPolicy",
@@ -91,7 +86,7 @@ def test_rewards_of_new_goals_are_computed_from_the_infos_of_their_steps(n_steps
 
 
 def test_the_default_optimizer_of_a2c_is_the_rmsprop_of_pytorch():
-    made = [sb3.A2C("MlpPolicy", "CartPole-v1", **settings) for settings in ({}, {"use_rms_prop": False})]
+    made = [sb3.A2C("MlpPolicy", "CartPole-v1", **SMALL, **settings) for settings in ({}, {"use_rms_prop": False})]
     rule = a2c.optimizer_of(made[0].config)
     gradient = np.array([0.3, -2.0], np.float32)
     direction, state = rule.update(gradient, rule.init(gradient))
@@ -104,7 +99,8 @@ def test_the_default_optimizer_of_a2c_is_the_rmsprop_of_pytorch():
     class RMSpropTFLike:
         """Stands for the original's class of that name."""
 
-    settings = {"optimizer_class": RMSpropTFLike, "optimizer_kwargs": {"eps": 1e-5, "alpha": 0.9}}
+    settings = {**SMALL["policy_kwargs"], "optimizer_class": RMSpropTFLike}
+    settings["optimizer_kwargs"] = {"eps": 1e-5, "alpha": 0.9}
     like = optimizers.make(sb3.A2C("MlpPolicy", "CartPole-v1", policy_kwargs=settings).config.optimizer)
     direction, _ = like.update(gradient, like.init(gradient))
     np.testing.assert_allclose(direction, gradient / np.sqrt(0.9 + 0.1 * gradient**2 + 1e-5), rtol=1e-5)
@@ -118,6 +114,7 @@ def test_nothing_is_learned_without_gradient_steps():
     assert all((array == before[name]).all() for name, array in still.policy.state_dict().items())
 
 
+@exhaustive
 def test_targets_stay_with_a_tau_of_zero():
     fixed = sb3.SAC("MlpPolicy", "Pendulum-v1", learning_starts=4, batch_size=4, tau=0, seed=0, **SMALL)
     before = fixed.policy.state_dict()
@@ -128,27 +125,18 @@ def test_targets_stay_with_a_tau_of_zero():
 
 
 def test_files_leave_out_and_contain_what_save_is_told(tmp_path):
-    model = sb3.PPO("MlpPolicy", "CartPole-v1", verbose=2, gamma=0.5, ent_coef=0.1, **SMALL)
+    model = sb3.A2C("MlpPolicy", "CartPole-v1", verbose=2, gamma=0.5, ent_coef=0.1, **SMALL)
     model.note = {"trained by": "me", "scores": [1, 2.5]}
     file = io.BytesIO()
     model.save(file, exclude=["gamma", "verbose", "policy_kwargs", "unknown"], include=["note"])
-    loaded = sb3.PPO.load(file)
+    loaded = sb3.A2C.load(file)
     assert (loaded.gamma, loaded.ent_coef, loaded.verbose, loaded.note) == (0.99, 0.1, 0, model.note)
     model.save(tmp_path / "model", exclude=["verbose"], include=["verbose"])
-    assert sb3.PPO.load(tmp_path / "model").verbose == 2
-    assert sb3.PPO.load(tmp_path / "model", verbose=0).verbose == 0
+    assert sb3.A2C.load(tmp_path / "model").verbose == 2
+    assert sb3.A2C.load(tmp_path / "model", verbose=0).verbose == 0
     with pytest.raises(TypeError):
         model.save(tmp_path / "other", include=["rollout_buffer"])
     assert not (tmp_path / "other.zip").exists()
-
-
-def test_images_that_are_scaled_already_need_normalize_images_false():
-    env = VecNormalize(DummyVecEnv([lambda: envs.FakeImageEnv(screen_height=36, screen_width=36, channel_first=True)]))
-    shape = {"features_extractor_kwargs": {"features_dim": 8}, "normalize_images": False}
-    model = sb3.A2C("CnnPolicy", env, n_steps=8, policy_kwargs=shape).learn(8)
-    assert any(array.ndim == 4 for array in model.policy.parameters())
-    with pytest.raises(AssertionError, match="uint8"):
-        sb3.A2C("CnnPolicy", env, n_steps=8)
 
 
 def test_the_environments_of_an_agent_show_images_with_the_channels_first():
@@ -190,41 +178,26 @@ def test_an_attribute_of_two_inner_wrappers_is_ambiguous():
 
 
 def test_actor_and_critic_share_their_extractor_or_not():
-    env = envs.FakeImageEnv(screen_height=36, screen_width=36)
-    sizes = []
-    for shares in (True, False):
-        shape = {"share_features_extractor": shares, "features_extractor_kwargs": {"features_dim": 8}}
-        model = sb3.PPO("CnnPolicy", env, n_steps=8, batch_size=8, n_epochs=1, policy_kwargs=shape).learn(8)
-        sizes.append(sum(array.ndim == 4 for array in model.policy.parameters()))
-    assert sizes[1] == 2 * sizes[0]
+    shape = {"features_extractor_class": Features, "net_arch": [5]}
+    for shares, n_extractors in ((True, 1), (False, 2)):
+        model = sb3.A2C("MlpPolicy", "CartPole-v1", policy_kwargs={**shape, "share_features_extractor": shares})
+        assert sum(array.shape == (3, 4) for array in model.policy.parameters()) == n_extractors
     with pytest.warns(UserWarning, match="share_features_extractor"):
-        sb3.SAC("MlpPolicy", "Pendulum-v1", policy_kwargs={"share_features_extractor": True})
+        sb3.SAC("MlpPolicy", "Pendulum-v1", policy_kwargs={**SMALL["policy_kwargs"], "share_features_extractor": True})
 
 
 def test_squashed_actions_stay_in_their_bounds():
     shape = {"squash_output": True, "net_arch": [8], "log_std_init": 3.0}
-    model = sb3.PPO("MlpPolicy", "Pendulum-v1", use_sde=True, n_steps=16, batch_size=16, policy_kwargs=shape, seed=0)
-    actions = model.learn(16).policy.get_distribution(np.ones((256, 3), np.float32)).sample()
+    model = sb3.A2C("MlpPolicy", "Pendulum-v1", use_sde=True, policy_kwargs=shape, seed=0)
+    actions = model.policy.get_distribution(np.ones((256, 3), np.float32)).sample()
     assert 1.9 < np.abs(actions).max() <= 2.0  # of Pendulum
 
 
-def test_attributes_of_agents():
-    model = sb3.DQN("MlpPolicy", "CartPole-v1", learning_rate=1e-3, batch_size=16, learning_starts=8, **SMALL)
-    assert (model.gamma, model.learning_rate, model.batch_size, model.lr_schedule(0.5)) == (0.99, 1e-3, 16, 1e-3)
-    model.learn(16)
-    assert (model.num_timesteps, model._n_updates, model._last_obs.shape) == (16, 2, (1, 4))
-    assert model.exploration_rate == pytest.approx(0.05)
-    assert (str(model.device), model.policy.observation_space) == ("auto", model.observation_space)
-    assert model.q_net(model.policy.obs_to_tensor(np.zeros(4, np.float32))[0]).shape == (1, 2)
-    assert sb3.PPO("MlpPolicy", "CartPole-v1").clip_range(1.0) == 0.2
-
-
-def test_tqc_explores_by_state_dependent_noise_and_td3_has_none_as_in_the_original():
+@exhaustive
+def test_tqc_explores_by_state_dependent_noise_as_in_the_original():
     model = sb3.TQC("MlpPolicy", "Pendulum-v1", use_sde=True, sde_sample_freq=4, learning_starts=8, seed=0, **SMALL)
     model.learn(16)
     assert any(name.endswith("log_std") for name in model.policy.state_dict())
-    with pytest.raises(TypeError, match="use_sde"):
-        sb3.TD3("MlpPolicy", "Pendulum-v1", use_sde=True)
 
 
 def test_a_row_is_logged_every_so_many_steps(tmp_path):
@@ -378,17 +351,6 @@ def test_the_wrappers_of_atari_one_by_one():
     assert [atari_wrappers.ClipRewardEnv(Game()).reward(x) for x in (-7.0, 0.0, 0.5)] == [-1.0, 0.0, 1.0]
 
 
-def test_observations_are_prepared_by_their_spaces():
-    assert preprocess_obs(np.array([1]), spaces.Discrete(3)).tolist() == [[0, 1, 0]]
-    assert preprocess_obs(np.array([[1, 0]]), spaces.MultiDiscrete([2, 3])).tolist() == [[0, 1, 1, 0, 0]]
-    image = spaces.Box(0, 255, (36, 36, 3), np.uint8)
-    assert float(preprocess_obs(np.full((1, 36, 36, 3), 255, np.uint8), image).max()) == 1.0
-    assert get_obs_shape(spaces.Dict({"a": spaces.Discrete(3), "b": image})) == {"a": (1,), "b": (36, 36, 3)}
-    assert (get_action_dim(spaces.MultiBinary(4)), get_flattened_obs_dim(spaces.MultiDiscrete([2, 3]))) == (4, 5)
-    assert is_image_space(image)
-    assert not is_image_space(spaces.Box(0, 1, (36, 36, 3)))
-
-
 def test_random_actions_of_dqn_follow_the_seed_and_steps_can_be_set():
     obs, actions = np.zeros(4, np.float32), []
     for _ in range(2):
@@ -431,7 +393,9 @@ def test_small_functions(tmp_path):
 
 def test_what_tensorboard_shows(tmp_path):
     accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    from matplotlib import pyplot
     from PIL import Image
+    from tensorboard.plugins.hparams import metadata, plugin_data_pb2
 
     logger = loggers.Logger(str(tmp_path), [loggers.TensorBoardOutputFormat(tmp_path)])
     logger.record("number", np.float64(0.5))
@@ -444,9 +408,17 @@ def test_what_tensorboard_shows(tmp_path):
     frames[0, 1] = 255
     logger.record("video", loggers.Video(frames, fps=4))
     logger.record("left out", 1.0, exclude="tensorboard")
+    logger.record("hparams", loggers.HParam({"gamma": 0.5, "name": "A2C", "masks": True}, {"loss": 0.0}))
+    figure = pyplot.figure()
+    logger.record("figure", loggers.Figure(figure, close=True))
     logger.dump(7)
     logger.close()
+    assert not pyplot.fignum_exists(figure.number)
     seen = accumulator.EventAccumulator(str(tmp_path), {"images": 0, "histograms": 0}).Reload()
+    content = seen.SummaryMetadata(metadata.SESSION_START_INFO_TAG).plugin_data.content
+    given = plugin_data_pb2.HParamsPluginData.FromString(content).session_start_info.hparams
+    assert (given["gamma"].number_value, given["name"].string_value, given["masks"].bool_value) == (0.5, "A2C", True)
+    assert "figure" in seen.Tags()["images"]
     assert seen.Tags()["scalars"] == ["number"]
     assert [(one.step, one.value) for one in seen.Scalars("number")] == [(7, 0.5)]
     (event,) = seen.Histograms("values")
@@ -471,54 +443,3 @@ def test_masks_forbid_choices_and_bits():
     bits = distributions.BernoulliDistribution(3).proba_distribution(np.zeros((1, 3)))
     bits.apply_masking([[True, True, False, True, True, False]])  # 0 and 1 of each bit
     assert {tuple(bits.sample()[0].tolist()) for _ in range(20)} == {(0, 1, 0), (1, 1, 0)}
-
-
-LINES = {
-    "policy_kwargs: features_extractor_class, features_extractor_kwargs": "test_a_features_extractor_is_used_saved_and_loaded",
-    "policy_kwargs: the built-in extractors": "test_the_width_of_convolutions_and_images_that_are_scaled_already",
-    "policy_kwargs: n_critics, optimizer_class, dicts in net_arch": "test_policy_kwargs_of_the_original_are_translated",
-    "policy_kwargs: normalize_images": "test_images_that_are_scaled_already_need_normalize_images_false",
-    "policy_kwargs: share_features_extractor": "test_actor_and_critic_share_their_extractor_or_not",
-    "policy_kwargs: use_expln": "test_expln_continues_the_exponential_smoothly",
-    "policy_kwargs: squash_output": "test_squashed_actions_stay_in_their_bounds",
-    "policy classes of one's own": "test_a_policy_class_of_ones_own_sets_the_layers",
-    "buffers: what a replay buffer shows, draws and is set to": "test_everything_of_a_replay_buffer_works_on_agents",
-    "buffers: what a rollout buffer shows": "test_everything_of_a_rollout_buffer_works_on_agents",
-    "buffers: copy_info_dict": "test_rewards_of_new_goals_are_computed_from_the_infos_of_their_steps",
-    "buffers: handle_timeout_termination": "test_time_limits_are_terminal_without_handle_timeout_termination",
-    "model.policy": "test_policy_parts_agree_with_the_agent",
-    "model.policy: get_distribution, evaluate_actions": "test_box_distributions_are_in_the_environments_units",
-    "attributes": "test_attributes_of_agents",
-    "attributes: those that can be set": "test_hyperparameters_are_attributes_that_can_be_set",
-    "attributes: replay_buffer": "test_the_replay_buffer_of_an_agent_is_shown_extended_and_replaced",
-    "functions of the remaining progress": "test_every_function_given_as_a_schedule_takes_the_remaining_progress",
-    "functions of the remaining progress in files": "test_files_contain_functions_given_as_schedules_as_tables",
-    "neutral values of arguments": "test_neutral_arguments_are_accepted_and_those_not_followed_warn",
-    "use_sde for SAC": "test_sac_explores_by_state_dependent_noise",
-    "use_sde for TQC": "test_tqc_explores_by_state_dependent_noise_and_td3_has_none_as_in_the_original",
-    "compute_reward with an array of one": "test_compute_reward_may_return_an_array_of_one_for_one_goal",
-    "batch_size above the buffer's content": "test_a_batch_may_be_larger_than_the_buffer",
-    "save: include, exclude": "test_files_leave_out_and_contain_what_save_is_told",
-    "save: names of files, file objects; custom_objects": "test_files_have_exactly_the_given_name_or_are_file_objects",
-    "callbacks: LogEveryNTimesteps": "test_a_row_is_logged_every_so_many_steps",
-    "callbacks: functions of locals and globals": "test_functions_as_callbacks_take_locals_and_globals",
-    "logger": "test_logger_formats",
-    "env_checker": "test_the_checker_states_the_difference",
-    "atari_wrappers, make_atari_env": "test_atari_wrappers_by_a_game_that_is_none",
-    "preprocessing": "test_observations_are_prepared_by_their_spaces",
-    "save_util": "test_files_by_path_or_open",
-    "type_aliases, distributions, torch_layers, utils: names": "test_names_stand_where_stable_baselines3_has_them",
-    "distributions": "test_state_dependent_noise_has_the_variance_of_its_matrix",
-    "torch_layers": "test_create_mlp_makes_layers",
-    "utils": "test_utilities",
-    "VectorizedActionNoise": "test_neutral_arguments_are_accepted_and_those_not_followed_warn",
-    "VecNormalize with HER": "test_a_replay_buffer_behind_vec_normalize_keeps_original_values_and_draws_scaled_ones",
-    "StackedObservations": "test_stacks_of_observations_by_hand",
-}
-"""What scripts do, by the test that shows it."""
-
-
-@pytest.mark.parametrize("line", LINES)
-def test_what_scripts_do_has_a_test(line):
-    trees = [ast.parse(path.read_text(encoding="utf-8")) for path in sorted(Path(__file__).parent.glob("test_*.py"))]
-    assert LINES[line] in {node.name for tree in trees for node in tree.body if isinstance(node, ast.FunctionDef)}

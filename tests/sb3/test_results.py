@@ -15,6 +15,7 @@ from rejeu.sb3.common.results_plotter import (
     X_WALLTIME,
     load_results,
     plot_curves,
+    plot_results,
     ts2xy,
     window_func,
 )
@@ -38,6 +39,10 @@ def test_files_of_several_monitors_are_read_in_the_order_of_time(tmp_path):
     assert (x.tolist(), y.tolist()) == ([1, 2, 3], [2.0, 4.0, 6.0])
     plot_curves([(np.arange(150), np.arange(150.0))], X_EPISODES, "line")
     assert pyplot.gcf().axes[0].lines[0].get_xdata()[0] == 99
+    pyplot.close()
+    plot_results([tmp_path], 10, X_TIMESTEPS, "runs")
+    axes = pyplot.gcf().axes[0]
+    assert (axes.get_title(), axes.collections[0].get_offsets().tolist()) == ("runs", [[3.0, 1.5], [8.0, -3.0]])
     pyplot.close()
 
 

@@ -32,7 +32,9 @@ def policy_of(model):
     return {name: np.array(array) for name, array in model.get_parameters()["policy"].items()}
 
 
-@pytest.mark.parametrize(("kind", "settings"), [(A2C, {"n_steps": 8}), (DQN, FAST)])
+@pytest.mark.parametrize(
+    ("kind", "settings"), [(A2C, {"n_steps": 8}), pytest.param(DQN, FAST, marks=pytest.mark.exhaustive)]
+)
 def test_a_learning_rate_set_in_a_callback_counts_from_the_next_update(kind, settings):
     def stop_learning(model):
         model.learning_rate = 0.0

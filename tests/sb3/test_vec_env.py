@@ -228,16 +228,6 @@ def test_an_agent_gives_back_the_vector_it_was_given():
     assert agent.get_env().get_attr("rank") == [0, 1]
 
 
-def test_a_gymnasium_environment_comes_back_as_a_vector_of_one():
-    agent = rejeu.DQN("MlpPolicy", gym.make("CartPole-v1", render_mode="rgb_array"), **SMALL)
-    env = agent.get_env()
-    assert isinstance(env, DummyVecEnv)
-    assert env is agent.get_env()
-    assert env.reset().shape == (1, 4)
-    assert env.render().shape == (400, 600, 3)
-    assert env.envs[0].spec.id == "CartPole-v1"
-
-
 def test_environments_of_envpool_are_returned_as_a_vector_without_access_to_single_ones():
     agent = rejeu.DQN("MlpPolicy", rejeu.make_vector("CartPole-v1", 1, "envpool"), **SMALL)
     env = agent.get_env()
@@ -282,8 +272,8 @@ def test_masks_are_found_in_a_vector():
     agent = rejeu.MaskablePPO("MlpPolicy", make_vec_env(Masked, n_envs=2), n_steps=8, batch_size=16, **SMALL)
     taught(agent)
     assert agent.learn(16).num_timesteps == 16
-    wrapped = rejeu.MaskablePPO("MlpPolicy", Doubled(make_vec_env(Masked)), n_steps=8, batch_size=8, **SMALL)
-    assert wrapped.learn(8).num_timesteps == 8
+    wrapped = rejeu.MaskablePPO("MlpPolicy", Doubled(make_vec_env(Masked, 2)), n_steps=8, batch_size=16, **SMALL)
+    assert wrapped.learn(16).num_timesteps == 16
 
 
 def test_hindsight_works_in_wrapped_vectors_and_refuses_scaled_goals():

@@ -25,7 +25,10 @@ from rejeu.sb3 import algorithms, load_zip
 from rejeu.sb3.conversion import Policy, converted, parts_of
 from tests.hostile_zips import hostile_zips
 from tests.sb3_models import MadeUp, difference_from, loaded
+from tests.tiers import exhaustive, only
 from tests.torch_files import Tensor, changed, members_of, serialized, torch_file, zipped
+
+pytestmark = pytest.mark.usefixtures("learners_are_shared")
 
 FOLDER = Path(__file__).parents[1] / "data" / "sb3"
 """Files that ``trials/sb3_models.py small`` made with Stable-Baselines3, and what they did there."""
@@ -41,7 +44,9 @@ def write(tmp_path, content, name="model.zip"):
     return path
 
 
-@pytest.mark.parametrize("name", AGENTS)
+@pytest.mark.parametrize(
+    "name", only({"ppo-normalized", "recurrent-mlp", "a2c-sde", "sac-her", "dqn-mlp", "qrdqn-mlp"}, AGENTS)
+)
 def test_actions_values_and_log_probabilities_are_those_of_the_original(name):
     agent = loaded(FOLDER / name)
     found = difference_from(agent, dict(np.load(FOLDER / f"{name}.npz")))
@@ -73,7 +78,7 @@ def test_the_next_gradient_step_is_the_one_of_the_original(name):
         np.testing.assert_allclose(ours[key], value, atol=2e-6, err_msg=key)
 
 
-@pytest.mark.parametrize(("name", "file"), [("DQN", "dqn-mlp"), ("A2C", "a2c-sde"), ("TRPO", "trpo-mlp")])
+@pytest.mark.parametrize(("name", "file"), [("DQN", "dqn-mlp")])
 def test_the_class_of_the_drop_in_loads_a_file_of_the_original(name, file):
     kind, path = getattr(algorithms, name), FOLDER / f"{file}.zip"
     with path.open("rb") as file:
@@ -89,15 +94,16 @@ def test_the_class_of_the_drop_in_loads_a_file_of_the_original(name, file):
         algorithms.PPO.load(path)
 
 
-@pytest.mark.parametrize("name", ["dqn-mlp", "sac-her", "ppo-normalized"])
+@pytest.mark.parametrize("name", only({"sac-her"}, ["dqn-mlp", "sac-her", "ppo-normalized"]))
 def test_training_continues(name):
     agent = loaded(FOLDER / name)
     env = MadeUp(agent.observation_space, agent.action_space)
     before = agent.get_parameters()
     agent.set_env(env)
     n_updates = agent.n_updates
-    agent.learn(300, reset_num_timesteps=False)
-    assert agent.num_timesteps >= 600
+    before_them = agent.num_timesteps
+    agent.learn(150, reset_num_timesteps=False)
+    assert agent.num_timesteps >= before_them + 150
     assert agent.n_updates > n_updates
     after = agent.get_parameters()
     assert all(np.isfinite(value).all() for value in after.values())
@@ -242,6 +248,7 @@ def test_recent_episodes_and_outputs_are_those_of_the_file(tmp_path):
     assert load_zip(path).tensorboard_log is None
 
 
+@exhaustive
 def test_hostile_files_end_soon_in_little_memory_and_run_nothing(tmp_path):
     """A sample of them."""
     ran = tmp_path / "ran"

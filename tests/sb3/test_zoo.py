@@ -31,6 +31,8 @@ from tests.torch_files import (
     zipped,
 )
 
+pytestmark = pytest.mark.usefixtures("learners_are_shared")
+
 FOLDER = Path(__file__).parents[1] / "data" / "sb3"
 ZOO = Path(__file__).parents[2].parent / "shared" / "data" / "zoo"
 """Eighteen folders of RL Zoo's public collection."""

@@ -78,7 +78,7 @@ def record(n: int) -> tuple[Recorded, np.ndarray]:
 
 def make_state(states: np.ndarray) -> parking.State:
     """Returns states of the environment in JAX."""
-    goal, time = states[:, 8].astype(np.int32), np.zeros(len(states), np.int32)
+    goal, time = states[:, 8].astype(np.int32), np.arange(len(states), dtype=np.int32) % 500
     flags = states[:, [4, 7]].astype(bool).T
     return parking.State(states[:, :2], states[:, 2], states[:, 3], flags[0], states[:, 5:7], flags[1], goal, time)
 
@@ -133,7 +133,8 @@ def compare(recorded: Recorded, success: np.ndarray, x64: bool) -> Comparison:
         env = parking.Parking()
         state = jax.tree.map(jnp.asarray, make_state(recorded.state))
         step = jax.jit(jax.vmap(env.step, in_axes=(None, 0, 0)))
-        after, obs, reward, terminated, _ = step(jax.random.key(0), state, jnp.asarray(recorded.action))
+        after, obs, reward, terminated, truncated = step(jax.random.key(0), state, jnp.asarray(recorded.action))
+        assert truncated.tolist() == [time % 500 == 499 for time in range(len(truncated))]
         ours = jax.device_get((after, flat(obs), reward, terminated, jax.vmap(env.success)(after)))
     after, obs, reward, terminated, succeeded = ours
     return Comparison(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import sys
 from pathlib import Path
 from typing import Any
@@ -64,79 +63,51 @@ def counts_itself(x, env=Walk()):  # noqa: B008 - never changed
     return x, x, ZERO, NO, NO
 
 
-@pytest.mark.parametrize(
-    ("wrong", "said"),
-    [
-        (if_on_a_value, r"Walk.step cannot be compiled \(TracerBoolConversionError.*jnp.where instead of if"),
-        (lambda x: (x, x, float(x[0]), NO, NO), "Walk.step cannot be compiled"),
-        (lambda x: (x, x, math.sin(x[0]), NO, NO), "Walk.step cannot be compiled"),
-        (lambda x: (x, np.clip(np.asarray(x), 0, 1), ZERO, NO, NO), r"cannot be compiled \(TracerArrayConversionError"),
-        (lambda x: (x, x, x[np.nonzero(x)[0]].sum(), NO, NO), "Walk.step cannot be compiled"),
-        (lambda x: (x, x[x > 0], ZERO, NO, NO), r"cannot be compiled \(NonConcreteBooleanIndexError"),
-        (write_in_place, r"Walk.step cannot be compiled \(TypeError: .*immutable.*: return new arrays"),
-        (counts_itself, r"Walk.step cannot be compiled \(FrozenInstanceError.*time.*: return new arrays"),
-        (lambda x: (x, x + jnp.zeros(3)[:2] * jnp.zeros(3), ZERO, NO, NO), r"cannot be compiled \(TypeError: "),
-        (lambda x: ("far", x, ZERO, NO, NO), r"cannot be compiled \(TypeError: "),
-        (lambda x: (x, x, ZERO, NO), r"returned 4 values, expected \(state, obs, reward"),
-        (lambda x: x, r"Walk.step returned one array, expected \(state, obs, reward"),
-        (lambda x: [x, x, ZERO, NO, NO], r"Walk.step returned one list, expected \(state, obs, reward"),
-        (lambda x: (x, x, ZERO, NO, NO, {}), r"returned 6 values, expected \(state, obs, reward"),
-        (
-            lambda x: (x, jnp.append(x, x), ZERO, NO, NO),
-            r"the observation as float32\[2\], expected float32\[1\] as in",
-        ),
-        (lambda x: (x, (x,), ZERO, NO, NO), r"Walk.step returned the observation \(\*,\), expected one array as in"),
+WRONG: dict[str, list[tuple[Any, str]]] = {
+    "wrong": [
+        (if_on_a_value, r"step cannot be compiled \(TracerBoolConversionError.*jnp.where instead of if"),
+        (lambda x: (x, x, float(x[0]), NO, NO), "step cannot be compiled"),
+        (lambda x: (x, np.clip(np.asarray(x), 0, 1), ZERO, NO, NO), "step cannot be compiled .TracerArrayConversion"),
+        (lambda x: (x, x[x > 0], ZERO, NO, NO), "step cannot be compiled .NonConcreteBooleanIndex"),
+        (write_in_place, "step cannot be compiled .*immutable.*: return new arrays"),
+        (counts_itself, "step cannot be compiled .*FrozenInstance.*: return new arrays"),
+        (lambda x: ("far", x, ZERO, NO, NO), "cannot be compiled .TypeError"),
+        (lambda x: (x, x, ZERO, NO), r"4 values, expected \(state, obs, reward"),
+        (lambda x: x, "step returned one array, expected"),
+        (lambda x: [x, x, ZERO, NO, NO], "step returned one list, expected"),
+        (lambda x: (x, jnp.append(x, x), ZERO, NO, NO), r"observation as float32\[2\], expected float32\[1\]"),
+        (lambda x: (x, (x,), ZERO, NO, NO), "observation .*, expected one array"),
         (lambda x: (x, x.astype(int), ZERO, NO, NO), r"as int32\[1\], expected float32\[1\] .*\.astype"),
-        (lambda x: (jnp.append(x, x), x, ZERO, NO, NO), r"the state as float32\[2\], expected float32\[1\] as from"),
-        (lambda x: (x.astype(int), x, ZERO, NO, NO), r"the state as int32\[1\], expected float32\[1\] as from"),
-        (lambda x: ((x, x), x, ZERO, NO, NO), r"returned the state \(\*, \*\), expected one array as from reset"),
-        (lambda x: (x, x, x, NO, NO), r"returned reward as float32\[1\], expected a float"),
-        (lambda x: (x, x, jnp.int32(1), NO, NO), r"returned reward as int32\[\], expected a float"),
-        (lambda x: (x, x, None, NO, NO), r"returned reward as None, expected a float"),
-        (lambda x: (x, x, ZERO, ZERO, NO), r"returned terminated as float32\[\], expected a bool"),
-        (lambda x: (x, x, ZERO, NO, None), "returned truncated as None, expected a bool"),
+        (lambda x: (jnp.append(x, x), x, ZERO, NO, NO), r"state as float32\[2\], expected float32\[1\]"),
+        (lambda x: (x.astype(int), x, ZERO, NO, NO), r"state as int32\[1\], expected float32\[1\]"),
+        (lambda x: ((x, x), x, ZERO, NO, NO), "state .*, expected one array"),
+        (lambda x: (x, x, x, NO, NO), r"reward as float32\[1\], expected a float"),
+        (lambda x: (x, x, jnp.int32(1), NO, NO), r"reward as int32\[\], expected a float"),
+        (lambda x: (x, x, None, NO, NO), "reward as None, expected a float"),
+        (lambda x: (x, x, ZERO, ZERO, NO), r"terminated as float32\[\], expected a bool"),
+        (lambda x: (x, x, ZERO, NO, None), "truncated as None, expected a bool"),
     ],
-)
-def test_a_wrong_step_is_named(wrong, said):
-    with pytest.raises(BadEnvironmentError, match=said) as raised:
-        rejeu.make_vector(Walk(wrong=wrong))
-    assert "\n" not in str(raised.value)
-
-
-@pytest.mark.parametrize(
-    ("begin", "said"),
-    [
-        (lambda: jnp.zeros(1), r"Walk.reset returned one array, expected \(state, obs\)"),
-        (lambda: (jnp.zeros(1), jnp.zeros(1), {}), r"Walk.reset returned 3 values, expected \(state, obs\)"),
-        (lambda: (jnp.zeros(1), {}), r"Walk.reset returned the observation \{\}, expected one array"),
-        (
-            lambda: (jnp.zeros(1), jnp.zeros(())),
-            r"Walk.reset returned the observation as float32\[\], expected float32\[1\]",
-        ),
+    "begin": [
+        (lambda: jnp.zeros(1), r"reset returned one array, expected \(state, obs\)"),
+        (lambda: (jnp.zeros(1), jnp.zeros(1), {}), "reset returned 3 values"),
+        (lambda: (jnp.zeros(1), {}), r"observation \{\}, expected one array"),
+        (lambda: (jnp.zeros(1), jnp.zeros(())), r"observation as float32\[\], expected float32\[1\]"),
         (lambda: (jnp.zeros(1), jnp.zeros(1, bool)), r"as bool\[1\], expected float32\[1\]"),
-        (lambda: (jnp.zeros(1), np.random.default_rng(None)), r"Walk.reset cannot be compiled \(TypeError"),
+        (lambda: (jnp.zeros(1), np.random.default_rng(None)), "reset cannot be compiled .TypeError"),
     ],
-)
-def test_a_wrong_reset_is_named(begin, said):
-    with pytest.raises(BadEnvironmentError, match=said) as raised:
-        rejeu.make_vector(Walk(begin=begin))
+    "mask": [
+        (lambda x: jnp.ones(3) if x[0] > 0 else None, "action_mask cannot be compiled"),
+        (lambda x: jnp.ones((2, 1), bool), r"mask as bool\[2, 1\], expected a bool for each"),
+        (lambda x: jnp.ones(3), r"mask as float32\[3\], expected a bool for each"),
+    ],
+}
+
+
+@pytest.mark.parametrize(("part", "function", "said"), [(part, *case) for part in WRONG for case in WRONG[part]])
+def test_a_wrong_step_reset_or_mask_is_named(part, function, said):
+    with pytest.raises(BadEnvironmentError, match=f"Walk.*{said}") as raised:
+        rejeu.make_vector(Walk(**{part: function}))
     assert "\n" not in str(raised.value)
-
-
-@pytest.mark.parametrize(
-    ("mask", "said"),
-    [
-        (lambda x: jnp.ones(3) if x[0] > 0 else None, "Walk.action_mask cannot be compiled"),
-        (
-            lambda x: jnp.ones((2, 1), bool),
-            r"Walk.action_mask returned the mask as bool\[2, 1\], expected a bool for each",
-        ),
-        (lambda x: jnp.ones(3), r"Walk.action_mask returned the mask as float32\[3\], expected a bool for each"),
-    ],
-)
-def test_a_wrong_mask_is_named(mask, said):
-    with pytest.raises(BadEnvironmentError, match=said):
-        rejeu.make_vector(Walk(mask=mask))
 
 
 class Reach(GoalEnv):
@@ -170,28 +141,24 @@ class Reach(GoalEnv):
 
 
 FUNCTIONS = [
-    (lambda a, d: np.linalg.norm(a - d), r"cannot be compiled \(TracerArrayConversionError.*jnp instead of np"),
+    (lambda a, d: np.linalg.norm(a - d), "cannot be compiled .TracerArrayConversion.*jnp instead of np"),
     (lambda a, d: np.float32(0) if (a == d).all() else np.float32(-1), "cannot be compiled.*jnp.where instead of if"),
     (lambda a, d: float(a[0, 0]), r"cannot be compiled .*no float\(\)"),
-    (lambda a, d: a @ d, r"cannot be compiled \(TypeError"),
     (lambda a, d: jnp.linalg.norm(a - d), r"of 3 goals returned the shape \(\), expected the shape \(3,\)"),
-    (lambda a, d: a - d, r"of 3 goals returned the shape \(3, 2\), expected the shape \(3,\)"),
-    (lambda a, d: (a, d), r"of 3 goals returned \(ShapeDtypeStruct.*, expected the shape \(3,\)"),
+    (lambda a, d: a - d, r"of 3 goals returned the shape \(3, 2\), expected"),
+    (lambda a, d: (a, d), r"of 3 goals returned \(ShapeDtypeStruct.*, expected"),
 ]
+NAMES = {"rewarded": "compute_reward", "judged": "compute_terminated"}
 
 
-@pytest.mark.parametrize(("function", "said"), FUNCTIONS)
-@pytest.mark.parametrize("name", ["compute_reward", "compute_terminated"])
-def test_a_wrong_function_of_goals_is_named(name, function, said):
-    field = {"compute_reward": "rewarded", "compute_terminated": "judged"}[name]
-    with pytest.raises(BadEnvironmentError, match=f"Reach.{name} {said}") as raised:
+@pytest.mark.parametrize(("field", "function", "said"), [
+    *(("rewarded", *case) for case in [*FUNCTIONS, (lambda a, d: None, "of 3 goals returned None, expected")]),
+    *(("judged", *case) for case in FUNCTIONS[3:]),
+])  # fmt: skip
+def test_a_wrong_function_of_goals_is_named(field, function, said):
+    with pytest.raises(BadEnvironmentError, match=f"Reach.{NAMES[field]} {said}") as raised:
         rejeu.make_vector(Reach(**{field: function}))
     assert "\n" not in str(raised.value)
-
-
-def test_a_reward_function_that_returns_nothing_is_named():
-    with pytest.raises(BadEnvironmentError, match=r"Reach.compute_reward of 3 goals returned None, expected the shape"):
-        rejeu.make_vector(Reach(rewarded=lambda a, d: None))
 
 
 class NearlyReach(Walk):
@@ -212,12 +179,14 @@ def test_right_environments_pass():
     check(Walk())
     check(Walk(mask=lambda state: jnp.ones(3, bool)))
     check(Walk(begin=lambda: (np.zeros(1, np.float32), np.zeros(1, np.float32))))
+    check(Walk(begin=lambda: (0.0, jnp.zeros(1)), wrong=lambda x: (x.sum(), x.reshape(1), ZERO, NO, NO)))
     check(Reach())
     check(Reach(judged=lambda a, d: (a == d).all(axis=-1)))
     for env_id in REGISTRY:
         check(make(env_id))
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("begin", [lambda: (0.0, jnp.zeros(1)), lambda: (np.float32(0), np.zeros(1, np.float32))])
 def test_numbers_of_python_and_numpy_may_begin_a_state_that_trains_on_the_device(begin):
     agent = rejeu.PPO(
@@ -232,6 +201,7 @@ def test_numbers_of_python_and_numpy_may_begin_a_state_that_trains_on_the_device
     assert agent.learn(16).num_timesteps == 16
 
 
+@pytest.mark.exhaustive
 def test_observations_far_outside_of_their_bounds_are_reported_on_the_device():
     env = Walk(wrong=lambda x: (x, x + 1e6, ZERO, NO, NO))
     agent = rejeu.SAC("MlpPolicy", rejeu.make_vector(env), policy_kwargs={"net_arch": [8]}, seed=0)

@@ -12,8 +12,11 @@ import pytest
 import rejeu
 from rejeu.envs.functional import make, vector
 from rejeu.envs.functional.vector import JaxVector, VectorState, reset_all, reset_done, step_all
+from tests.tiers import exhaustive
 
 CART_POLE = make("jax/CartPole-v1")
+step_cart_poles = jax.jit(partial(step_all, CART_POLE))
+reset_cart_poles = jax.jit(partial(reset_done, CART_POLE))
 
 
 def play(env, key, actions, n):
@@ -28,6 +31,7 @@ def play(env, key, actions, n):
     return jax.jit(lambda state: jax.lax.scan(turn, state, actions))(state)[1]
 
 
+@exhaustive
 def test_many_environments_equal_single_ones():
     key, n = jax.random.key(3), 4
     actions = jax.random.randint(jax.random.key(1), (60, n), 0, 2)
@@ -43,7 +47,7 @@ def test_an_environment_is_the_single_one_of_its_stream():
     key, actions = jax.random.key(3), jax.random.randint(jax.random.key(1), (40, 3), 0, 2)
     together = reset_all(CART_POLE, key, 3)
     alone = vector.reset_streams(CART_POLE, vector.streams(key, 3)[1:2])
-    step, again = jax.jit(partial(step_all, CART_POLE)), jax.jit(partial(reset_done, CART_POLE))
+    step, again = step_cart_poles, reset_cart_poles
     for action in actions:
         together, _, _, terminated, *_ = step(together, action)
         alone, obs, _, terminated_alone, *_ = step(alone, action[1:2])
@@ -53,20 +57,20 @@ def test_an_environment_is_the_single_one_of_its_stream():
 
 
 def test_a_step_returns_the_true_successor_and_resets_nothing():
-    state = reset_all(CART_POLE, jax.random.key(0), 2)
-    falling = state.env._replace(physics=jnp.array([[0.0, 0.0, 0.2, 3.0], [0.0, 0.0, 0.0, 0.0]]))
+    state = reset_all(CART_POLE, jax.random.key(0), 3)
+    falling = state.env._replace(physics=jnp.zeros((3, 4)).at[0].set(jnp.array([0.0, 0.0, 0.2, 3.0])))
     state = VectorState(state.keys, state.counts, falling, falling.physics)
-    state, obs, reward, terminated, truncated, success = step_all(CART_POLE, state, jnp.array([1, 1]))
-    assert terminated.tolist() == [True, False]
+    state, obs, reward, terminated, truncated, success = step_cart_poles(state, jnp.array([1, 1, 1]))
+    assert terminated.tolist() == [True, False, False]
     assert not truncated.any()
-    assert reward.tolist() == [1.0, 1.0]
+    assert reward.tolist() == [1.0] * 3
     assert success is None
     np.testing.assert_allclose(obs[0, 2], 0.26, atol=1e-6)
     np.testing.assert_array_equal(state.obs, obs)
-    after, first = reset_done(CART_POLE, state, terminated | truncated)
+    after, first = reset_cart_poles(state, terminated | truncated)
     assert (jnp.abs(first[0]) <= 0.05).all()
-    np.testing.assert_array_equal(first[1], obs[1])
-    assert after.env.time.tolist() == [0, 1]
+    np.testing.assert_array_equal(first[1:], obs[1:])
+    assert after.env.time.tolist() == [0, 1, 1]
 
 
 def test_the_time_limit_truncates_and_does_not_terminate():
@@ -88,13 +92,13 @@ def test_a_vector_is_the_pure_functions_for_the_key_of_its_seed():
     for _ in range(40):
         action = rng.integers(0, 2, 3)
         step = env.step(action)
-        state, obs, reward, terminated, *_ = step_all(CART_POLE, state, jnp.asarray(action, jnp.int32))
+        state, obs, reward, terminated, *_ = step_cart_poles(state, jnp.asarray(action, jnp.int32))
         np.testing.assert_allclose(step.obs, obs, atol=1e-6)
         np.testing.assert_array_equal(step.terminated, terminated)
         np.testing.assert_array_equal(step.reward, reward)
         done = step.terminated | step.truncated
         if done.any():
-            state, first = reset_done(CART_POLE, state, jnp.asarray(done))
+            state, first = reset_cart_poles(state, jnp.asarray(done))
             np.testing.assert_allclose(env.reset_done(done), first, atol=1e-6)
     assert np.isnan(env.success(step, 0))
     assert env.goals() is None
