@@ -127,7 +127,7 @@ def test_an_empty_replay_buffer_does_not_replace_a_file(tmp_path, kind):
     model.save(tmp_path / "m")
     model.learn(5).save_replay_buffer(tmp_path / "replay")
     for loaded in (kind.load(tmp_path / "m"), kind.load(tmp_path / "m", env=gym.make("Pendulum-v1"))):
-        with pytest.raises(ValueError, match="replay buffer of this SAC is empty"):
+        with pytest.raises(ValueError, match="replay buffer"):
             loaded.save_replay_buffer(tmp_path / "replay")
     loaded.load_replay_buffer(tmp_path / "replay")
     assert loaded.replay_buffer.size() == 5
