@@ -253,112 +253,42 @@ def test_a_disk_that_is_full_at_the_end_keeps_the_episodes(tmp_path: Path, monke
     assert len(demonstrations.read(data).episodes) == 2
 
 
-def replaced(data: Path, key: str = "rewards") -> Any:
-    """Opens the main file, with an array of the first episode removed, and returns its episode."""
-    file = h5py.File(data / dataset.MAIN, "r+")
-    del file["episode_0"][key]
-    return file["episode_0"]
-
-
-def hostile_sparse(data: Path) -> None:
-    replaced(data).create_dataset("rewards", (500_000_000,), "f8").file.close()
-
-
-def hostile_hole(data: Path) -> None:
-    episode = replaced(data)
-    episode.create_dataset("rewards", (500_000_000,), "f8")[-1] = 1.0
-    episode.file.close()
-
-
-def hostile_compressed(data: Path) -> None:
-    episode = replaced(data)
+def compressed(data: Path, episode: Any) -> None:
     array = episode.create_dataset("rewards", (50_000_000,), "f8", compression="gzip", chunks=(1_000_000,))
     array[:1_000_000] = 0
-    episode.file.close()
 
 
-def hostile_same(data: Path) -> None:
-    episode = replaced(data)
+def same_episode(data: Path, episode: Any) -> None:
     episode["rewards"] = np.zeros(20_000)
     for i in range(1000):
         episode.file[f"episode_{i + 10}"] = episode
-    episode.file.close()
 
 
-def hostile_storage(data: Path) -> None:
+def storage(data: Path, episode: Any) -> None:
     (data / "secret").write_bytes(bytes(range(24)))
-    episode = replaced(data)
-    episode.create_dataset("rewards", (3,), "f8", external=[(str(data / "secret"), 0, 24)]).file.close()
+    episode.create_dataset("rewards", (3,), "f8", external=[(str(data / "secret"), 0, 24)])
 
 
-def hostile_external(data: Path) -> None:
-    shutil.copy(data / dataset.MAIN, data / "other.h5")
-    episode = replaced(data)
-    episode["rewards"] = h5py.ExternalLink("other.h5", "episode_0/rewards")
-    episode.file.close()
-
-
-def hostile_soft(data: Path) -> None:
-    episode = replaced(data)
-    episode["rewards"] = h5py.SoftLink("/episode_1/rewards")
-    episode.file.close()
-
-
-def hostile_group(data: Path) -> None:
-    shutil.copy(data / dataset.MAIN, data / "other.h5")
-    with h5py.File(data / dataset.MAIN, "r+") as file:
-        file["episode_7"] = h5py.ExternalLink("other.h5", "episode_0")
-
-
-def hostile_virtual(data: Path) -> None:
-    shutil.copy(data / dataset.MAIN, data / "other.h5")
-    episode = replaced(data)
+def virtual(data: Path, episode: Any) -> None:
     layout = h5py.VirtualLayout((3,), "f8")
     layout[:] = h5py.VirtualSource("other.h5", "episode_0/rewards", (3,))
     episode.create_virtual_dataset("rewards", layout)
-    episode.file.close()
 
 
-def hostile_text(data: Path) -> None:
-    episode = replaced(data)
-    episode["rewards"] = ["a", "b", "c"]
-    episode.file.close()
-
-
-def hostile_scalar(data: Path) -> None:
-    episode = replaced(data)
-    episode["rewards"] = 3.0
-    episode.file.close()
-
-
-def hostile_array(data: Path) -> None:
-    with h5py.File(data / dataset.MAIN, "r+") as file:
-        file["episode_7"] = np.zeros(3)
-
-
-def hostile_pairs(data: Path) -> None:
-    episode = replaced(data)
-    episode["rewards"] = np.zeros(3, [("a", "f8"), ("b", "f8")])
-    episode.file.close()
-
-
-def hostile_missing(data: Path) -> None:
-    replaced(data, "terminations").file.close()
-
-
-def hostile_picture(data: Path) -> None:
+def picture(data: Path, episode: Any) -> None:
     """JPEG images of another size than that of the space, in a row of one byte each."""
     change_metadata(data, lambda m: m.update(jpeg_encoding=True, observation_space=json.dumps(LARGE)))
-    episode = replaced(data, "observations")
     episode.create_dataset("observations", (4,), h5py.vlen_dtype(np.uint8))[:] = [np.zeros(1, np.uint8)] * 4
-    episode.file.close()
 
 
-def hostile_pictures(data: Path) -> None:
+def pictures(data: Path, episode: Any) -> None:
     """A million images without a byte."""
     change_metadata(data, lambda m: m.update(jpeg_encoding=True, observation_space=json.dumps(LARGE)))
-    episode = replaced(data, "observations")
-    episode.create_dataset("observations", (1_000_000,), h5py.vlen_dtype(np.uint8)).file.close()
+    episode.create_dataset("observations", (1_000_000,), h5py.vlen_dtype(np.uint8))
+
+
+def holding(value: Any) -> tuple[str, Any]:
+    return "rewards", lambda data, episode: episode.update(rewards=value)
 
 
 LARGE = {"type": "Box", "dtype": "uint8", "shape": [500, 500, 3], "low": 0, "high": 255}
@@ -376,13 +306,43 @@ METADATA: dict[str, dict[str, Any]] = {
     "an id that is none": {"env_spec": json.dumps({"id": "\n"})},
     "a negative shape": {"observation_space": json.dumps({**LARGE, "shape": [-1]})},
 }
-FILES = {name.removeprefix("hostile_"): one for name, one in globals().items() if name.startswith("hostile_")}
+FILES: dict[str, tuple[str | None, Any]] = {
+    "sparse": ("rewards", lambda data, episode: episode.create_dataset("rewards", (500_000_000,), "f8")),
+    "hole": ("rewards", lambda data, episode: episode.create_dataset("rewards", (500_000_000,), "f8").write_direct(
+        np.ones(1), dest_sel=np.s_[-1:]
+    )),
+    "compressed": ("rewards", compressed),
+    "the same episode": ("rewards", same_episode),
+    "storage": ("rewards", storage),
+    "virtual": ("rewards", virtual),
+    "external": holding(h5py.ExternalLink("other.h5", "episode_0/rewards")),
+    "soft": holding(h5py.SoftLink("/episode_1/rewards")),
+    "text": holding(["a", "b", "c"]),
+    "scalar": holding(3.0),
+    "pairs": holding(np.zeros(3, [("a", "f8"), ("b", "f8")])),
+    "missing": ("terminations", lambda data, episode: None),
+    "group": (None, lambda data, episode: episode.file.update(episode_7=h5py.ExternalLink("other.h5", "episode_0"))),
+    "array": (None, lambda data, episode: episode.file.update(episode_7=np.zeros(3))),
+    "picture": ("observations", picture),
+    "pictures": ("observations", pictures),
+}  # fmt: skip
+"""What is removed from the first episode, and what is done to it then."""
+
+
+def damage(data: Path, name: str) -> None:
+    """Damages a dataset, beside which there is a copy of its file."""
+    shutil.copy(data / dataset.MAIN, data / "other.h5")
+    removed, change = FILES[name]
+    with h5py.File(data / dataset.MAIN, "r+") as file:
+        if removed is not None:
+            del file["episode_0"][removed]
+        change(data, file["episode_0"])
 
 
 @pytest.mark.parametrize("name", [*FILES, *METADATA])
 def test_a_hostile_dataset_is_refused_on_one_line_in_little_time_and_memory(name: str, tmp_path: Path) -> None:
     data = plain(tmp_path)
-    FILES[name](data) if name in FILES else change_metadata(data, lambda m: m.update(METADATA[name]))
+    damage(data, name) if name in FILES else change_metadata(data, lambda m: m.update(METADATA[name]))
     tracemalloc.start()
     began = time.perf_counter()
     try:
