@@ -226,6 +226,7 @@ def test_evaluate_prints_the_result_repeats_itself_with_a_seed_and_writes_nothin
     first, second = capsys.readouterr().out.split("Pendulum-v1 on gymnasium")[1:]
     assert first.strip() == second.strip()
     assert "2 episodes" in first
+    assert str(run / "best.safetensors") in first
     assert main(["evaluate", str(run), "--minutes", "1e-6", "--backend", "gymnasium", "--which", "last"]) == 0
     assert main(["evaluate", str(run / "agent.safetensors"), "--episodes", "1"]) == 0
     text = capsys.readouterr().out
@@ -343,7 +344,7 @@ def test_set_may_be_given_more_than_once(tmp_path):
         (["train", "Pendulum-v1", "CartPole-v1"], "does not expect 'CartPole-v1'"),
         (["train", "Pendulum-v1", "--step", "5"], "no option --step; did you mean --steps?"),
         (["train", "Pendulum-v1", "--steps"], "--steps needs a value"),
-        (["train", "Pendulum-v1", "--steps", "9e18"], "--steps=9000000000000000000 must be"),
+        (["evaluate", "run", "--episodes", "9e18"], "--episodes=9000000000000000000 must be"),
         (["train", "Pendulum-v1", "--json=false"], "--json takes no value, got 'false'"),
         (["train", "Pendulum-v1", "--algo", "-x"], "--algo needs a value, got '-x'"),
         (["train", "--env", "Pendulum-v1"], "the environment is given without an option: rejeu train ENV"),
@@ -369,16 +370,12 @@ def test_what_is_wrong_is_one_line_that_names_the_fix(capsys, monkeypatch, tmp_p
 
 @pytest.mark.filterwarnings("ignore:.*HalfCheetah-v3 is out of date:DeprecationWarning")
 def test_an_old_version_that_gymnasium_lists_and_cannot_make_names_the_new_one(capsys):
-    assert "HalfCheetah-v3 is an old version that cannot be made any more" in error_of(
-        capsys, "check", "HalfCheetah-v3"
-    )
+    text = error_of(capsys, "check", "HalfCheetah-v3")
+    assert "HalfCheetah-v3 is an old version that cannot be made any more" in text
 
 
-def test_a_folder_that_is_no_run_is_an_error(capsys, tmp_path):
+def test_a_folder_that_is_no_run_is_an_error_and_a_run_is_never_overwritten(capsys, run, tmp_path):
     assert "is a folder without a model" in error_of(capsys, "evaluate", str(tmp_path))
-
-
-def test_a_run_folder_is_never_overwritten(capsys, run):
     before = (run / "config.json").read_text()
     assert "not an empty folder" in error_of(capsys, "train", "Pendulum-v1", "--steps", "5", "--out", str(run))
     assert (run / "config.json").read_text() == before

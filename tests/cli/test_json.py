@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import re
 import signal
@@ -12,7 +13,7 @@ from types import SimpleNamespace
 import gymnasium as gym
 import pytest
 
-from rejeu import cli
+from rejeu import cli, presets
 from rejeu.cli import main, runs
 from rejeu.cli.commands import COMMANDS
 from rejeu.interrupt import Stopped
@@ -90,7 +91,16 @@ def test_train_prints_its_summary(capsys, tmp_path):
 def test_resume_prints_its_summary_and_continues_the_logs(run, capsys):
     result, messages = document(capsys, "resume", str(run), "--steps", "50", *FEWER_FILES)
     assert result.keys() == documented_keys("resume")
-    assert result["steps"] == 250
+    assert (result["steps"], result["seed"], result["algorithm"], result["env_id"]) == (250, 3, "SAC", PENDULUM)
+    table = list(csv.DictReader((run / "episodes.csv").read_text(encoding="utf-8").splitlines()))
+    trained, found = result["training"], [float(row["return"]) for row in table]
+    assert (result["episodes"], trained["episodes"], trained["mean_length"]) == (1, 1, 200)
+    assert (trained["mean_return"], trained["std_return"]) == (pytest.approx(found[0]), 0)
+    evaluated = list(csv.DictReader((run / "evaluations.csv").read_text(encoding="utf-8").splitlines()))
+    best = max(evaluated, key=lambda row: float(row["mean_return"]))
+    assert result["best"]["step"] == int(best["step"])
+    assert result["best"]["mean_return"] == pytest.approx(float(best["mean_return"]))
+    assert 0 <= result["compile_seconds"] <= result["seconds"]
     assert "checkpoint    resumed at step 200" in messages
     rows = [json.loads(line) for line in (run / "metrics.json").read_text(encoding="utf-8").splitlines()]
     steps = [row["step"] for row in rows]
@@ -120,7 +130,11 @@ def test_list_prints_algorithms_and_presets(capsys):
     assert result.keys() == documented_keys("list")
     assert "SAC" in result["algorithms"]
     (parking,) = [one for one in result["presets"] if (one["env_id"], one["algorithm"]) == ("parking-v0", "SAC")]
-    assert parking["result"]["measure"] == "success rate"
+    known, preset = presets.find_result("parking-v0", "SAC"), presets.find("parking-v0", "SAC")
+    shown = {key: parking["result"][key] for key in ("measure", "mean", "low", "high", "seeds")}
+    assert shown == {key: getattr(known, key) for key in shown}
+    for key in ("n_envs", "total_steps", "evaluate_every", "evaluate_episodes"):
+        assert parking[key] == getattr(preset, key)
     assert messages == ""
 
 

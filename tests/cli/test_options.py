@@ -236,6 +236,7 @@ def test_train(sessions, tmp_path):
     assert (session.has_report, session.has_video, session.is_new) == (False, False, True)
     agent = session.agent
     assert (agent.seed, agent.device, agent.success_threshold, agent.n_envs) == (5, "cpu", 3.0, 2)
+    assert (session.evaluation_env.n_envs, session.evaluation_env.backend, session.log_interval) == (6, "gymnasium", 8)
     evaluate, callbacks = session.callbacks(Interrupt())
     assert (evaluate.every, evaluate.episodes, evaluate.best_path) == (40, 6, session.folder.best)
     video, checkpoint = callbacks[-2:]
@@ -384,3 +385,8 @@ def test_a_plan_of_a_study_keeps_every_option():
     plan = study_plan.make("Pendulum-v1", "SAC", **given)
     assert {key: getattr(plan, key) for key in given} == given
     assert (plan.column, plan.run.env_kwargs, plan.run.wrappers) == ("success_rate", {"g": 9.8}, ("a:B",))
+    assert plan.run.env_argument == "my_env.py"
+    of_preset = {"env_id": "Pendulum-v1", "algorithm": "SAC", "hyperparameters": {"gamma": 0.5}, "source": "a test"}
+    of_preset |= {"total_steps": 50, "n_envs": 3, "evaluate_every": 10, "evaluate_episodes": 6, "backend": "gymnasium"}
+    preset = plan.preset({"gamma": 0.5}, "a test")
+    assert {key: getattr(preset, key) for key in of_preset} == of_preset

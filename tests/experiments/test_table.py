@@ -1,5 +1,7 @@
 """The table of a sweep."""
 
+import math
+
 from rich.progress import Progress, TextColumn
 
 from rejeu.experiments import sweep
@@ -28,6 +30,10 @@ def make(tmp_path):
 
 def test_a_terminal_shows_bars_and_another_output_lines(tmp_path):
     coordinator = make(tmp_path)
+    done, _, running, waiting = (task.progress() for task in coordinator.tasks)
+    assert (done.step, done.best) == (1000, 101.0)
+    assert running[:3] == (500, 10.0, 30.0)
+    assert (waiting.step, math.isnan(waiting.mean_return)) == (0, True)
     with Progress(TextColumn("{task.description} {task.fields[text]}")) as bars:
         sweep.draw(bars, sweep.rows(coordinator))
         everything, one = bars.tasks

@@ -89,6 +89,10 @@ def set_to(value, *keys):
 
 
 ANYWHERE = {
+    "an episode without a step": (  # of which nothing could be listed or drawn
+        lambda header, values, arrays: arrays.update({"run.history": np.full((1, 6), np.nan)}),
+        "column 'step' of a history must be finite",
+    ),
     "an unknown environment": (set_to("Nowhere-v0", "env_id"), "cannot be made again .*Nowhere"),
     "an environment of other spaces": (set_to("MountainCar-v0", "env_id"), "MountainCar-v0 as it is here has"),
     "steps that were never taken": (set_to(10**9, "run", "steps_since_update"), "at most 24"),
@@ -193,17 +197,6 @@ def test_no_array_is_read_that_the_run_does_not_have(run, tmp_path, monkeypatch)
                 continue
             assert replaced(run, tmp_path / "run", path, one.content, one.size) == "refused", one.name
     assert max(sizes) < 2**20
-
-
-@pytest.mark.parametrize("run", ["replay"], indirect=True)
-def test_a_run_without_an_episode_has_no_history_to_damage(run, tmp_path):
-    """Of an episode without a step or a length nothing could be listed or drawn."""
-
-    def spoil(header, values, arrays):
-        arrays["run.history"] = np.full((1, 6), np.nan)
-
-    with pytest.raises(CheckpointError, match="column 'step' of a history must be finite"):
-        resumed(run, tmp_path, spoil)
 
 
 def test_environments_that_were_made_for_a_refused_run_are_closed(tmp_path):

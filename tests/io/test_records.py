@@ -63,9 +63,6 @@ def test_an_error_says_what_was_received_and_expected(change, message):
     with pytest.raises(CheckpointError) as caught:
         convert({**good, **change}, Record)
     assert str(caught.value) == message
-
-
-def test_a_missing_field_of_the_record_itself_is_named():
     with pytest.raises(CheckpointError, match=r"^object missing required field `inner`$"):
         convert({}, Record)
 

@@ -153,14 +153,14 @@ def test_own_keys_are_given_on_the_command_line_and_a_space_bar_that_is_bound_do
 
 def test_restart_begins_the_same_start_anew_and_the_episode_does_not_count():
     def script(window, game):
+        player = game.players[0]
         down("d")
         yield
         yield
-        assert game.players[0].score == 4
+        assert player.score == 4
         up("d")
         tap("r")
         yield
-        player = game.players[0]
         assert (player.score, player.steps, player.scores, game.phase) == (0, 0, [], "ready")
         assert lever(game).seeds == [7, 7]
 

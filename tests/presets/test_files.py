@@ -29,15 +29,12 @@ def test_what_is_written_is_read(tmp_path):
         assert json.dumps(dict(found.hyperparameters)) == json.dumps(dict(preset.hyperparameters))
 
 
-def test_a_preset_needs_no_source(tmp_path):
+def test_a_preset_needs_no_source_and_more_than_json_is_not_written(tmp_path):
     path = presets.write(SMALL, tmp_path / "preset.json")
     content = json.loads(path.read_text(encoding="utf-8"))
     del content["source"]
     path.write_text(json.dumps(content), encoding="utf-8")
     assert presets.read(path).source == ""
-
-
-def test_a_preset_of_more_than_json_is_not_written(tmp_path):
     own = dataclasses.replace(SMALL, hyperparameters={"learning_rate": lambda progress: progress})
     with pytest.raises(TypeError, match="hyperparameters that a file cannot hold"):
         presets.write(own, tmp_path / "a.json")
