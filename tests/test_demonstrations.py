@@ -126,6 +126,7 @@ def test_target_networks_follow_a_clone() -> None:
     assert eqx.tree_equal(state.actor, state.target_actor)
 
 
+@exhaustive
 @pytest.mark.parametrize(
     ("name", "normalize"), only_tuples([("SAC", True)], [("SAC", True), ("TD3", False), ("TQC", False)])
 )
@@ -267,6 +268,11 @@ def by_hand(n: int, terminated: bool, first: float = 0.0) -> Episode:
     return Episode(obs, np.full((n, 2), 2.0, np.float32), np.arange(n, dtype=np.float32), terminated)
 
 
+def test_every_recorded_episode_has_a_seed_of_its_own() -> None:
+    begins = [episode.observations[0].tolist() for episode in shown("Box", 3)[1].episodes]
+    assert begins[0] != begins[1] != begins[2]
+
+
 def test_a_replay_buffer_holds_the_steps() -> None:
     env = Target()
     agent = rejeu.SAC("MlpPolicy", env, gamma=0.5, **SMALL)
@@ -341,6 +347,7 @@ class Anywhere:
         return self.space.sample(), None
 
 
+@exhaustive
 def test_offline_learning_improves_on_what_was_shown() -> None:
     """Random actions are recorded; cloning them would keep their mean, but their rewards say which were better."""
     env = Target()

@@ -21,10 +21,12 @@ from rejeu.loops.learner import Learner, Readings
 from tests.every_agent import KINDS, Kind
 from tests.sharing import shared_learners
 from tests.test_demonstrations import SMALL, Anywhere, Target, by_hand, shown
+from tests.tiers import exhaustive
 
 pytestmark = pytest.mark.usefixtures("learners_are_shared")
 
 
+@exhaustive
 @pytest.mark.parametrize("name", ["TD3BC", "ReBRAC"])
 def test_offline_relatives_of_td3_improve_on_what_was_shown(name: str) -> None:
     env = Target()

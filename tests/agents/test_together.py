@@ -77,6 +77,7 @@ def test_each_run_equals_the_one_trained_alone(
         assert_same_runs(agent, train_alone(kind, env, 120, 2, agent.seed, {**settings, **values}))
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("env", ["jax/CartPole-v1", pytest.param("CartPole-v1", marks=pytest.mark.exhaustive)])
 def test_runs_have_callbacks_of_their_own_and_can_be_saved(tmp_path: Any, env: str) -> None:
     evaluations: dict[int, Evaluate] = {}

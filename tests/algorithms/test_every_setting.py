@@ -574,7 +574,7 @@ def the_search_begins_at_zero_and_perturbs_by_its_deviation(case: Case) -> None:
             jax.tree.map(lambda p, e: np.testing.assert_allclose(p[0], e, atol=1e-6), playing.network, expected)
 
 
-@shows("n_delta", "n_top", "n_eval_episodes", "alive_bonus_offset", by="ARS")
+@shows("n_delta", "n_top", "n_eval_episodes", "alive_bonus_offset", by="")
 def returns_of_whole_episodes_weigh_the_directions(case: Case) -> None:
     """Eight episodes in the rollout: 2 of 2 steps in each of 2 environments, twice."""
     made, four = case.make(), case.update(n_delta=4)

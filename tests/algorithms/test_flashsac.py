@@ -112,6 +112,7 @@ def test_an_update_uses_the_equations_in_the_documented_order(name):
     np.testing.assert_allclose(after.target_critics.head.bias, old + config.tau * (mean[1] - old), atol=1e-6)
 
 
+@exhaustive
 @pytest.mark.parametrize("name", only(["XQC"], MODULES))
 def test_the_target_has_no_gradient_and_the_critics_follow_theirs(name):
     """Finite differences of the cross-entropy in the head's bias and in one weight before a normalization."""

@@ -22,7 +22,7 @@ from rejeu.spaces import leaves
 from tests import numpy_actor_critic as by_hand
 from tests.environments import Sampled
 from tests.numpy_networks import assert_equal_layers, gradient
-from tests.tiers import only
+from tests.tiers import only, only_tuples
 
 pytestmark = pytest.mark.usefixtures("learners_are_shared")
 
@@ -227,7 +227,9 @@ def test_updates_are_counted_as_they_were_taken_where_the_divergence_stops_them(
 
 
 @pytest.mark.parametrize(
-    ("n", "n_valid"), [(1, 1), (12, 1), (12, 7), (12, 12), (2**14, 9000), (2**14 + 1, 2**14)], ids=str
+    ("n", "n_valid"),
+    only_tuples([(12, 7), (2**14 + 1, 2**14)], [(1, 1), (12, 1), (12, 7), (12, 12), (2**14, 9000), (2**14 + 1, 2**14)]),
+    ids=str,
 )
 def test_an_order_holds_every_step_once_the_valid_ones_first(n, n_valid):
     """Few steps are sorted as single words, more than 2^14 as pairs."""
@@ -323,7 +325,10 @@ OBS = np.random.default_rng(0).normal(size=(5, OBS_DIM)).astype(np.float32)
 PIXELS = np.random.default_rng(0).integers(256, size=(5, 8, 8, 3), dtype=np.uint8)
 
 
-@pytest.mark.parametrize("shape", [{}, {"share_layers": True}, {"share_features_extractor": False}])
+SHARING = [{}, {"share_layers": True}, {"share_features_extractor": False}]
+
+
+@pytest.mark.parametrize("shape", only(SHARING[1:2], SHARING))
 def test_policy_and_value_at_once_are_what_each_is_alone(shape):
     network = bold(build(IMAGES, **shape))
     (policy, value), policy_alone, value_alone = jax.jit(lambda n: (n.both(PIXELS), n.policy(PIXELS), n.value(PIXELS)))(
@@ -428,9 +433,7 @@ SPACES = {
 }
 
 
-@pytest.mark.parametrize(
-    "name", only(["bounds of its own", "no bounds", "a choice from 3 on", "choices of two axes", "bits"], SPACES)
-)
+@pytest.mark.parametrize("name", only(["bounds of its own", "choices of two axes"], SPACES))
 def test_actions_have_the_spaces_range_shape_and_dtype_in_training_and_after(name):
     space = SPACES[name]
     agent = play(env := Noisy(space))

@@ -21,6 +21,7 @@ from tests.algorithms.test_gae import random_steps
 from tests.algorithms.test_ppo import LAST_STEP_MISSING, OBS_SPACE, random_rollout
 from tests.numpy_networks import gradient
 from tests.sharing import shared_learners
+from tests.tiers import exhaustive, only_tuples
 
 pytestmark = pytest.mark.usefixtures("learners_are_shared")
 
@@ -269,7 +270,7 @@ def test_the_values_for_many_environments_are_those_of_the_authors():
     assert {key: getattr(config, key) for key in theirs} == theirs
 
 
-@pytest.mark.parametrize(("n_envs", "settings"), [(9, {}), (8, pqn.FOR_MANY)])
+@pytest.mark.parametrize(("n_envs", "settings"), only_tuples([(9, {})], [(9, {}), (8, pqn.FOR_MANY)]))
 def test_values_for_another_number_of_environments_are_warned_of(n_envs, settings):
     agent = rejeu.PQN("MlpPolicy", rejeu.make_vector("jax/CartPole-v1", n_envs), seed=0, **settings)
     with pytest.warns(UserWarning, match=f"environments, and there are {n_envs}"):
@@ -287,6 +288,7 @@ def test_the_defaults_learn_with_few_environments_on_every_seed(n_envs):
 # In one program.
 
 
+@exhaustive
 def test_seeds_in_one_program_are_the_runs_alone():
     settings = {
         "n_steps": 8,

@@ -387,6 +387,7 @@ def recalling(algorithm, **policy):
     return agent, agent.evaluate(60, env=InProcess([Recall() for _ in range(4)], seed=1))
 
 
+@exhaustive
 @LSTM
 def test_a_policy_that_remembers_solves_what_only_memory_can(kind, tmp_path):
     agent, evaluation = recalling(rejeu.RecurrentPPO, cell=kind, lstm_hidden_size=8)
@@ -511,6 +512,7 @@ def test_a_memory_of_another_size_is_refused_in_one_line(bold, state):
 IMAGES = gym.spaces.Box(0, 255, (8, 8, 3), np.uint8)
 
 
+@exhaustive
 def test_policy_and_value_may_read_images_through_convolutions_of_their_own():
     """What one encoder sees moves its own cell's memory, and nothing of the other's."""
     shape = RecurrentConfig(lstm_hidden_size=SIZE, net_arch=(5,), share_features_extractor=False)
@@ -534,11 +536,13 @@ def test_policy_and_value_may_read_images_through_convolutions_of_their_own():
     assert not np.array_equal(network.value_encoder.images[0].linear.weight, weights[0])
 
 
+@exhaustive
 def test_learning_is_determined_by_the_seed(agent):
     assert_same_parameters(agent, small().learn(12))
     assert not same_parameters(agent, small(seed=1).learn(12))
 
 
+@exhaustive
 @LSTM
 def test_a_file_keeps_all_of_it(kind, tmp_path):
     agent = small(policy_kwargs={**SMALL["policy_kwargs"], "cell": kind, "shared_lstm": True}).learn(6)

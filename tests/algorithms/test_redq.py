@@ -92,6 +92,7 @@ def test_every_pass_of_an_update_drops_units_of_the_critics():
     )
 
 
+@exhaustive
 @pytest.mark.parametrize("agent", only([rejeu.SAC], [rejeu.SAC, rejeu.TQC]))
 def test_droq_learns_resumes_equal_and_acts_without_dropout(agent, tmp_path):
     settings = {**DROQ, "gradient_steps": 4, "policy_delay": 4, "learning_starts": 10, "batch_size": 8, "seed": 0}
