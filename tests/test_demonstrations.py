@@ -347,17 +347,6 @@ class Anywhere:
         return self.space.sample(), None
 
 
-@exhaustive
-def test_offline_learning_improves_on_what_was_shown() -> None:
-    """Random actions are recorded; cloning them would keep their mean, but their rewards say which were better."""
-    env = Target()
-    mixed = record(Anywhere(env), env, 400, seed=0)
-    agent = rejeu.IQL("MlpPolicy", env, inverse_temperature=3.0, learning_rate=3e-3, gamma=0.0, **SMALL)
-    metrics = learn_offline(agent, mixed, 1500)
-    assert set(metrics) == {"critic_loss", "actor_loss", "value_loss", "q_value"}
-    assert agent.evaluate(20, env=Target(), seed=0).mean_return > 0.4 * mixed.mean_return
-
-
 def test_losses_of_iql() -> None:
     """Equation 5 by hand."""
     observed, recorded = jnp.zeros((2, 1)), jnp.array([3.0, -1.0])

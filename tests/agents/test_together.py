@@ -43,6 +43,7 @@ def train_alone(kind: Any, env: Any, n_steps: int, n_envs: int, seed: int, setti
     [
         (rejeu.DQN, "jax/CartPole-v1", SMALL, {"learning_rate": [1e-4, 1e-3]}),
         pytest.param(rejeu.PPO, "jax/CartPole-v1", ON_POLICY, {}, marks=pytest.mark.exhaustive),
+        pytest.param(rejeu.PQN, "jax/CartPole-v1", ON_POLICY, {}, marks=pytest.mark.exhaustive),
         pytest.param(rejeu.MaskablePPO, Forbidden(), ON_POLICY, {}, marks=pytest.mark.exhaustive),
         pytest.param(rejeu.DQN, "jax/CartPole-v1", {**SMALL, "priorities": {}}, {}, marks=pytest.mark.exhaustive),
         pytest.param(

@@ -66,15 +66,6 @@ def test_what_is_forbidden_is_never_done_and_nothing_becomes_infinite(name):
     assert max(np.abs(value).max() for value in floats) < 1e6
 
 
-@exhaustive
-@pytest.mark.parametrize(("name", "on_device"), PLACES)
-def test_on_the_device_too(name, on_device):
-    agent = KINDS[name]("MlpPolicy", rejeu.make_vector(Forbidden(), 2, seed=0))
-    agent.on_device = on_device
-    agent.learn(120)
-    assert set(agent.history["return"]) == {0.0}
-
-
 class Lenient(Forbidden):
     """Allows everything."""
 

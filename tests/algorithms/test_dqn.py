@@ -16,7 +16,7 @@ from rejeu.algorithms import dqn
 from rejeu.core import TD_ERROR, Clock, Transition, clip
 from rejeu.schedules import at
 from tests.bit_flipping import BitFlipping
-from tests.tiers import exhaustive, only
+from tests.tiers import only
 
 pytestmark = pytest.mark.usefixtures("learners_are_shared")
 
@@ -314,18 +314,8 @@ def bit_flipping_success(seed, hindsight):
     return np.mean(agent.ep_success_buffer)
 
 
-@exhaustive
-def test_bits_are_flipped_to_the_goal_with_hindsight():
-    assert bit_flipping_success(0, hindsight=True) > 0.9
-
-
-@exhaustive
-def test_bits_are_not_flipped_to_the_goal_without_hindsight():
-    assert bit_flipping_success(0, hindsight=False) < 0.1
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [1, 2, 3, 4])
+@pytest.mark.parametrize("seed", [0, 1, 2, 3, 4])
 def test_hindsight_makes_the_difference_for_every_seed(seed):
     assert bit_flipping_success(seed, hindsight=True) > 0.9
     assert bit_flipping_success(seed, hindsight=False) < 0.1

@@ -174,21 +174,6 @@ AGENT = {
 
 @exhaustive
 @pytest.mark.parametrize("kind", [rejeu.FlashSAC, rejeu.XQC])
-def test_a_run_resumes_equal_and_its_file_acts_equal(kind, tmp_path):
-    whole = kind("MlpPolicy", "Pendulum-v1", **AGENT).learn(60)
-    half = kind("MlpPolicy", "Pendulum-v1", **AGENT)
-    half.learn(35, rejeu.callbacks.Checkpoint(tmp_path / "checkpoints", every=35))
-    again = kind.resume(tmp_path / "checkpoints", "Pendulum-v1").learn(25, reset_num_timesteps=False)
-    for one, two in zip(jax.tree.leaves(whole.run.state), jax.tree.leaves(again.run.state), strict=True):
-        np.testing.assert_array_equal(one, two)
-    loaded = rejeu.load(whole.save(tmp_path / "agent"))
-    obs = whole.observation_space.sample()
-    np.testing.assert_array_equal(loaded.predict(obs)[0], whole.predict(obs)[0])
-    assert whole.q_values(obs, whole.predict(obs)[0]).shape == ()
-
-
-@exhaustive
-@pytest.mark.parametrize("kind", [rejeu.FlashSAC, rejeu.XQC])
 def test_it_learns_from_hindsight_from_priorities_and_on_the_device(kind):
     her = kind("MultiInputPolicy", Reach(), replay_buffer_class="HerReplayBuffer", **AGENT).learn(60)
     first = kind("MlpPolicy", "Pendulum-v1", priorities={}, n_steps=3, **AGENT).learn(60)

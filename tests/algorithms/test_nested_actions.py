@@ -106,12 +106,6 @@ def test_on_every_backend(backend):
         vector.close()
 
 
-@exhaustive
-def test_a_vector_environment_of_gymnasium_is_given_a_batch():
-    vector = gym.vector.SyncVectorEnv([functools.partial(Strict, "nested")] * 2)
-    rejeu.PPO("MlpPolicy", vector, **ON).learn(64)
-
-
 class Functional(FunctionalEnv):
     """Pays for the gear 2, and for steering to the right."""
 

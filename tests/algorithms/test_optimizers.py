@@ -12,7 +12,6 @@ import numpy as np
 import optax
 import pytest
 
-import rejeu
 from rejeu.algorithms import a2c, crossq, optimizers, sac
 from rejeu.algorithms.config import rebuild, to_json
 from rejeu.core import descend
@@ -90,18 +89,6 @@ def test_a_file_mentions_an_optimizer_of_the_users_own(optimizer):
     with pytest.raises(CheckpointError, match="its optimizer is your own"):
         rebuild(sac.Config, saved, {})
     assert rebuild(sac.Config, saved, {"optimizer": optimizer}) == config
-
-
-@exhaustive
-def test_an_agent_learns_and_loads_with_another_optimizer(tmp_path):
-    learning_rate = rejeu.Linear(1e-2, 1e-3)
-    agent = rejeu.SAC("MlpPolicy", "Pendulum-v1", optimizer=OWN[2], learning_rate=learning_rate, **SETTINGS).learn(32)
-    path = agent.save(tmp_path / "model")
-    with pytest.raises(CheckpointError, match=r"load\(path, optimizer=GradientTransformation"):
-        rejeu.load(path)
-    loaded = rejeu.load(path, optimizer=OWN[2])
-    for key, value in agent.get_parameters().items():
-        np.testing.assert_array_equal(loaded.get_parameters()[key], value)
 
 
 SCRIPT = """

@@ -20,8 +20,7 @@ from rejeu.spaces import leaves
 from tests.algorithms.test_gae import random_steps
 from tests.algorithms.test_ppo import LAST_STEP_MISSING, OBS_SPACE, random_rollout
 from tests.numpy_networks import gradient
-from tests.sharing import shared_learners
-from tests.tiers import exhaustive, only_tuples
+from tests.tiers import only_tuples
 
 pytestmark = pytest.mark.usefixtures("learners_are_shared")
 
@@ -283,25 +282,3 @@ def test_values_for_another_number_of_environments_are_warned_of(n_envs, setting
 def test_the_defaults_learn_with_few_environments_on_every_seed(n_envs):
     agents = rejeu.train_seeds(rejeu.PQN, "MlpPolicy", "jax/CartPole-v1", 100_000, seeds=range(100, 106), n_envs=n_envs)
     assert min(agent.evaluate(20, seed=1).mean_return for agent in agents) > 475
-
-
-# In one program.
-
-
-@exhaustive
-def test_seeds_in_one_program_are_the_runs_alone():
-    settings = {
-        "n_steps": 8,
-        "batch_size": 8,
-        "n_epochs": 2,
-        "policy_kwargs": {"net_arch": [8]},
-        "exploration_fraction": 0.5,
-    }
-    agents = rejeu.train_seeds(rejeu.PQN, "MlpPolicy", "jax/CartPole-v1", 64, seeds=[3, 5], n_envs=2, **settings)
-    for agent in agents:
-        with shared_learners():
-            alone = rejeu.PQN("MlpPolicy", rejeu.make_vector("jax/CartPole-v1", 2), seed=agent.seed, **settings)
-        alone.learn(64)
-        for name, value in alone.get_parameters().items():
-            np.testing.assert_allclose(agent.get_parameters()[name], value, rtol=1e-3, atol=1e-4, err_msg=name)
-        assert agent.n_updates == alone.n_updates == 2 * 64 // 8

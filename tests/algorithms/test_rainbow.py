@@ -15,7 +15,6 @@ import pytest
 import rejeu
 from rejeu.algorithms import dqn, iqn, qrdqn
 from rejeu.algorithms.quantile_loss import quantile_huber_loss
-from rejeu.callbacks import Checkpoint
 from rejeu.core import TD_ERROR, Masked
 from rejeu.export import check
 from tests.algorithms.test_categorical import by_loops
@@ -335,22 +334,6 @@ def test_all_parts_together_learn_save_and_load(kind, place, tmp_path):
     obs = np.random.default_rng(0).normal(size=(30, 4)).astype(np.float32)
     np.testing.assert_array_equal(rejeu.load(tmp_path / "model").predict(obs)[0], agent.predict(obs)[0])
     assert agent.evaluate(2).mean_return >= 8.0
-
-
-@exhaustive
-@pytest.mark.parametrize("kind", ["C51", "IQN"])
-def test_a_run_of_all_parts_that_is_cut_off_goes_on_exactly(kind, tmp_path):
-    cls = rejeu.IQN if kind == "IQN" else rejeu.DQN
-    run = {"learning_starts": 20, "batch_size": 8, "train_freq": 2, "target_update_interval": 10, "seed": 0}
-    settings = {**run, "policy_kwargs": {"net_arch": [8]}, "priorities": {}, "n_steps": 3, **AGENTS[kind], **EVERY}
-    whole = cls("MlpPolicy", "CartPole-v1", **settings).learn(100)
-    stops = [Checkpoint(tmp_path, every=20), lambda agent, turn: turn.step < 50]
-    cls("MlpPolicy", "CartPole-v1", **settings).learn(100, stops)
-    again = cls.resume(tmp_path, rejeu.make_vector("CartPole-v1", 1, "gymnasium"))
-    assert again.resumed.exact
-    again.learn()
-    for name, value in whole.get_parameters().items():
-        np.testing.assert_array_equal(again.get_parameters()[name], value, err_msg=name)
 
 
 @exhaustive

@@ -12,7 +12,6 @@ from rejeu.algorithms import sac
 from rejeu.core import TD_ERROR
 from rejeu.networks import action_values, with_dropout
 from tests.algorithms.batches import BOX, CLOCK, OBS_SPACE, box_batch, noise_of
-from tests.bit_flipping import BitFlipping
 from tests.numpy_networks import squashed_sample
 from tests.tiers import exhaustive, only
 
@@ -107,24 +106,6 @@ def test_droq_learns_resumes_equal_and_acts_without_dropout(agent, tmp_path):
     obs, action = np.zeros((2, 3), np.float32), np.zeros((2, 1), np.float32)
     np.testing.assert_array_equal(whole.q_values(obs, action), loaded.q_values(obs, action))
     assert whole.q_values(obs, action).shape == (2,)
-
-
-@exhaustive
-def test_redq_learns_from_hindsight_and_with_memory():
-    settings = {
-        "n_critics": 3,
-        "target_subset": 2,
-        "policy_delay": 2,
-        "learning_starts": 20,
-        "batch_size": 16,
-        "seed": 0,
-    }
-    her = {"replay_buffer_class": "HerReplayBuffer", "policy_kwargs": {"net_arch": [8], "dropout": 0.1}}
-    agent = rejeu.SAC("MultiInputPolicy", BitFlipping(3), **settings, **her).learn(40)
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(agent.run.state))
-    memory = {"net_arch": [8], "lstm_hidden_size": 4, "sequence_length": 4, "burn_in": 2, "dropout": 0.1}
-    agent = rejeu.SAC("MlpPolicy", "Pendulum-v1", **settings, policy_kwargs=memory).learn(60)
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(agent.run.state))
 
 
 def test_settings_that_cannot_be_are_refused():

@@ -27,7 +27,6 @@ from rejeu.reporting.history import History
 from rejeu.reporting.logging import Logger
 from tests.environments import Counter
 from tests.helpers import small_sac
-from tests.tiers import exhaustive
 
 pytestmark = pytest.mark.usefixtures("learners_are_shared")
 
@@ -270,48 +269,6 @@ def test_a_progress_bar_that_never_began_closes_silently():
     console = Console(file=io.StringIO(), force_terminal=True)
     ProgressBar(10, None, console).close()
     assert console.file.getvalue() == ""
-
-
-class Turning(gym.Env):
-    """Wants the action 1, and after ``turn`` steps the action -1: what was learnt first is then unlearnt."""
-
-    observation_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
-    action_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
-
-    def __init__(self, turn=math.inf):
-        self.turn, self.taken = turn, 0
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        return np.zeros(1, np.float32), {}
-
-    def step(self, action):
-        self.taken += 1
-        wanted = 1.0 if self.taken <= self.turn else -1.0
-        return np.zeros(1, np.float32), -float((action[0] - wanted) ** 2), True, False, {}
-
-
-@exhaustive
-def test_an_agent_that_improves_and_then_cracks_is_restored_to_its_best():
-    evaluate = Evaluate(Turning, every=100, episodes=1, seed=0)
-    agent = rejeu.SAC(
-        "MlpPolicy",
-        Turning(turn=600),
-        policy_kwargs={"net_arch": [16]},
-        learning_rate=1e-2,
-        batch_size=32,
-        buffer_size=200,
-        learning_starts=50,
-        ent_coef=0.01,
-        seed=0,
-    ).learn(1500, callback=evaluate)
-    score = lambda: agent.evaluate(1, env=Turning()).mean_return  # noqa: E731
-    best, cracked = max(result.evaluation.mean_return for result in evaluate.results), score()
-    assert best > -0.1
-    assert cracked < -2.0
-    agent.restore_best()
-    assert score() == pytest.approx(best, abs=1e-6)
-    assert agent.best.step == evaluate.best.step <= 700
 
 
 def test_videos_by_steps_do_not_change_training(tmp_path):

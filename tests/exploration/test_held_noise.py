@@ -9,13 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import rejeu
 from rejeu.algorithms import crossq, flashsac, sac, tqc, xqc
 from rejeu.algorithms.sac import continuous
 from rejeu.core import Clock
 from rejeu.exploration.held_noise import spells
 from tests.algorithms.batches import BOX, DISCRETE, OBS_DIM, OBS_SPACE
-from tests.tiers import exhaustive, only
+from tests.tiers import only
 
 CLOCK = Clock(np.uint32(0), np.uint32(0), np.float32(0.5))
 
@@ -66,18 +65,6 @@ def test_noise_is_drawn_anew_where_an_episode_begins_and_else_after_its_spell(mo
     _, after = algorithm.explorer.act(carry, actor, obs, ended, jax.random.PRNGKey(2), CLOCK)
     assert (np.asarray(after.noise != carry.noise).any(axis=1) == [True, False, True]).all()
     assert int(after.left[1]) == 4
-
-
-@exhaustive
-def test_an_agent_with_it_learns_and_resumes_equal(tmp_path):
-    settings = {"noise_repeat": 8, "target_entropy": "std_0.2", "learning_starts": 10, "batch_size": 8, "seed": 0}
-    settings["policy_kwargs"] = {"net_arch": [8]}
-    whole = rejeu.SAC("MlpPolicy", "Pendulum-v1", **settings).learn(40)
-    half = rejeu.SAC("MlpPolicy", "Pendulum-v1", **settings)
-    half.learn(25, rejeu.callbacks.Checkpoint(tmp_path / "checkpoints", every=25))
-    again = rejeu.SAC.resume(tmp_path / "checkpoints", "Pendulum-v1").learn(15, reset_num_timesteps=False)
-    for one, two in zip(jax.tree.leaves(whole.run.state), jax.tree.leaves(again.run.state), strict=True):
-        np.testing.assert_array_equal(one, two)
 
 
 def test_the_entropy_of_a_standard_deviation_is_that_of_a_normal_distribution():

@@ -19,7 +19,6 @@ from rejeu.buffers.ring import Ring, check_memory
 from rejeu.buffers.uniform import ReplayBuffer
 from rejeu.envs.goals import GoalFunctions
 from rejeu.spaces import leaves, structure
-from tests.tiers import exhaustive
 
 SIZE = (2, 3)
 
@@ -216,19 +215,6 @@ def test_hindsight_finds_the_stacks_too():
         place = int(batch.obs["achieved_goal"][i, 0])
         np.testing.assert_array_equal(batch.obs["observation"][i], frames[place])
         np.testing.assert_array_equal(batch.next_obs["observation"][i], frames[place + 1])
-
-
-@exhaustive
-def test_the_convolutional_policy_learns_from_stored_frames():
-    env = FrameStackObservation(Film(shape=(8, 8)), 4)
-    agent = rejeu.SAC("CnnPolicy", env, frame_stack=4, **{**SMALL, "learning_starts": 20})
-    before = agent.get_parameters()
-    agent.learn(60)
-    after = agent.get_parameters()
-    assert agent.n_updates == 40
-    names = [name for name in after if name.startswith(("actor.encoder", "critics.encoder"))]
-    assert len(names) == 12  # two convolutions and a linear layer, each with weight and bias, twice
-    assert all(not np.array_equal(after[name], before[name]) for name in names)
 
 
 def test_saved_stacks_come_back(tmp_path):
