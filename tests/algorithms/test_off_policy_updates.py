@@ -105,7 +105,7 @@ CASES = {
 }
 
 
-VARIANTS = ("TQC, nothing dropped", "TQC, REDQ", "SAC, Discrete, REDQ", "TD3, every update")
+VARIANTS = ("TQC, nothing dropped", "TQC, REDQ", "SAC, Discrete, REDQ", "TD3, every update", "DDPG, Discrete")
 """Exhaustive: others have the same settings one by one."""
 
 

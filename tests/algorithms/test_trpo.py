@@ -129,7 +129,8 @@ def test_without_advantage_no_step_is_taken():
     config, algorithm = make("box", normalize_advantage=False)
     state = begin(algorithm)
     data = samples(state.network, random_rollout(ACTIONS["box"][0]), config.gae_lambda)
-    network, step = trpo.policy_step(state.network, data._replace(advantage=0.0 * data.advantage), config)
+    data = data._replace(advantage=0.0 * data.advantage)
+    network, step = jax.jit(lambda n, d: trpo.policy_step(n, d, config))(state.network, data)
     assert float(step.accepted) == 0.0
     for one, two in zip(jax.tree.leaves(network), jax.tree.leaves(state.network), strict=True):
         np.testing.assert_array_equal(one, two)

@@ -67,7 +67,7 @@ def assert_same_priorities(one: Any, two: Any, tolerance: float) -> None:
 @pytest.mark.parametrize(
     ("n_envs", "settings"),
     [
-        (1, {}),
+        pytest.param(1, {}, marks=pytest.mark.exhaustive),
         pytest.param(3, {"train_freq": 4, "gradient_steps": 2, "n_steps": 2}, marks=pytest.mark.exhaustive),
         pytest.param(2, {"train_freq": (2, "episode"), "gradient_steps": 3}, marks=pytest.mark.exhaustive),
         pytest.param(2, {"overlap": False, "gradient_steps": -1}, marks=pytest.mark.exhaustive),
@@ -182,6 +182,7 @@ def test_unsupported_settings_train_on_the_host_with_a_warning() -> None:
         agent.learn(30)
 
 
+@pytest.mark.exhaustive
 def test_priorities_continue_from_the_loop_of_the_host_and_back() -> None:
     """Also with the TD errors of several gradient steps that are still to set priorities."""
     agent = make(rejeu.DQN, "jax/CartPole-v1", priorities={}, gradient_steps=4)
@@ -214,6 +215,7 @@ def test_a_chunk_that_is_interrupted_is_undone(monkeypatch: pytest.MonkeyPatch) 
     assert_same_runs(interrupted, other.learn(600), 0)
 
 
+@pytest.mark.exhaustive
 def test_steps_are_copied_to_the_host_when_they_are_read() -> None:
     sizes: list[int] = []
 
