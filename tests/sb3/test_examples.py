@@ -8,7 +8,7 @@ import pytest
 
 from tests.sb3.examples import EXAMPLES
 
-QUICK = ("train_save_load_and_evaluate", "log_values")
+QUICK = ("train_save_load_and_evaluate",)
 """Those that run without ``--slow``."""
 
 

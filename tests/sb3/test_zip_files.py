@@ -58,7 +58,7 @@ def test_actions_values_and_log_probabilities_are_those_of_the_original(name):
     assert agent.notes == []
 
 
-@pytest.mark.parametrize("name", ["dqn-mlp", "ddpg-mlp"])
+@pytest.mark.parametrize("name", only(["dqn-mlp"], ["dqn-mlp", "ddpg-mlp"]))
 def test_the_next_gradient_step_is_the_one_of_the_original(name):
     """Of weights, target networks and moments of Adam."""
     agent, data = loaded(FOLDER / name), dict(np.load(FOLDER / f"{name}.npz"))

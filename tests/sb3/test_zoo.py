@@ -20,6 +20,7 @@ from rejeu.sb3.common.env_util import make_vec_env
 from rejeu.sb3.common.vec_env import VecNormalize
 from rejeu.sb3.pickled import parse, tensors_of
 from rejeu.sb3.zoo import model_in, notes_beside, read_yaml, statistics_beside
+from tests.tiers import exhaustive
 from tests.torch_files import (
     Tensor,
     changed,
@@ -312,6 +313,7 @@ def test_a_missing_time_feature_is_named(tmp_path):
         load_zip(write(tmp_path / "model.zip", content), env="Pendulum-v1")
 
 
+@exhaustive
 def test_a_policy_in_which_large_numbers_cancel_is_exported(tmp_path):
     """Products of 5,000 in float32 that cancel differ by 1e-3 in another order, which is no fault of the file."""
     pytest.importorskip("onnxruntime")
