@@ -341,6 +341,7 @@ NO_ENVIRONMENTS = {
     Simulator: "got Simulator, as dm_control's; wrap it: shimmy",
     OldEnvironment: "got OldEnvironment; .*of the old package gym .*: rejeu.OldEnvironment",
     Spaceless: "Spaceless has no observation_space and no action_space; set it in __init__",
+    (lambda: gym.Wrapper(Spaceless())): "Spaceless has no observation_space",
     (lambda: None): "got NoneType; derive its class",
     (lambda: "CartPole-v1"): r"got str; make it: gymnasium.make\('CartPole-v1'\)",
     (lambda: SyncVectorEnv([Good])): "got SyncVectorEnv, several environments as one; give a single one",

@@ -374,6 +374,14 @@ def test_the_checker_states_the_difference():
         env_checker.check_env(env)
 
 
+def test_the_checker_renders_if_it_is_asked_to():
+    env, rendered = envs.IdentityEnvBox(), []
+    env.render_mode, env.render = "rgb_array", lambda: rendered.append(1)
+    for skips in (True, False):
+        env_checker.check_env(env, skip_render_check=skips)
+    assert rendered == [1]
+
+
 def test_contrib_modules_and_masks():
     from rejeu.sb3_contrib import MaskablePPO
     from rejeu.sb3_contrib.common.maskable.evaluation import evaluate_policy

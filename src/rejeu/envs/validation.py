@@ -263,7 +263,8 @@ def environment_fault(env: Any, expected: str = "a gymnasium.Env") -> str | None
     """Describes why an object is not a Gymnasium environment."""
     if isinstance(env, gym.Env):
         missing = [name for name in ("observation_space", "action_space") if not hasattr(env, name)]
-        return f"{type(env).__name__} has no {' and no '.join(missing)}; set it in __init__" if missing else None
+        name = type(env.unwrapped).__name__
+        return f"{name} has no {' and no '.join(missing)}; set it in __init__" if missing else None
     name, fix = type(env).__name__, "derive its class from gymnasium.Env"
     if callable(env):
         name, fix = (

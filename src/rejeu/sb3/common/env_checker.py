@@ -33,7 +33,7 @@ def check_env(env: gym.Env, warn: bool = True, skip_render_check: bool = True) -
     Args:
         env: a Gymnasium environment.
         warn: warn of what is allowed and makes learning harder, or is not supported.
-        skip_render_check: do not check the render modes.
+        skip_render_check: False renders once too, and warns of an environment without render mode that has some.
 
     Raises:
         AssertionError: if it does not follow Gymnasium's interface.
@@ -60,7 +60,9 @@ def check_env(env: gym.Env, warn: bool = True, skip_render_check: bool = True) -
     if unsupported or isinstance(action_space, spaces.Dict | spaces.Tuple):
         return
     _check_returned(env, observation_space, action_space)
-    if not skip_render_check and warn and env.render_mode is None and env.metadata.get("render_modes"):
+    if not skip_render_check and env.render_mode is not None:
+        env.render()
+    elif not skip_render_check and warn and env.metadata.get("render_modes"):
         warnings.warn(
             "the environment was made without render_mode, so that it is not rendered", UserWarning, stacklevel=2
         )
