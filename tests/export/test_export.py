@@ -70,7 +70,7 @@ CASES = [
     ),
     *(
         pytest.param(*kind, {"observation": observation, "normalize": normalize}, FORMATS, marks=exhaustive)
-        for kind in [*KINDS, ("PQN", "Discrete")]
+        for kind in KINDS
         for observation, normalize in FORMS
     ),
     pytest.param("PPO", "Box", {"use_sde": True}, FORMATS, marks=exhaustive),
