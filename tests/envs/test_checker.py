@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from rejeu import spaces
+from rejeu.envs import masks
 from rejeu.envs.checker import advice_on_observations, check_env, findings
 from rejeu.errors import BadEnvironmentError
 from rejeu.export import contract
@@ -104,3 +105,34 @@ def test_advice_on_observations(space, said):
     assert len(found) == len(said)
     for line, part in zip(found, said, strict=True):
         assert part in line
+
+
+class Picky(Sampled):
+    """Raises for actions that its mask forbids: those of the parity of the time."""
+
+    def __init__(self, space, in_info):
+        super().__init__(gym.spaces.Box(-1.0, 1.0, (2,)), space)
+        self.in_info, self.allowed = in_info, np.arange(masks.n_choices(space, "")) % 2
+
+    def reset(self, **given):
+        obs, info = super().reset(**given)
+        return obs, {"action_mask": self.allowed} if self.in_info else info
+
+    def step(self, action):
+        space = self.action_space
+        sizes = np.cumsum([0, *space.nvec[:-1]]) if isinstance(space, gym.spaces.MultiDiscrete) else 0
+        chosen = np.flatnonzero(action) if isinstance(space, gym.spaces.MultiBinary) else np.ravel(action) + sizes
+        assert self.allowed[chosen].all(), "that is not allowed"
+        *answer, info = super().step(action)
+        return *answer, {"action_mask": self.allowed} if self.in_info else info
+
+    def action_masks(self):
+        if self.in_info:
+            raise AssertionError("the info has it")
+        return self.allowed
+
+
+@pytest.mark.parametrize("in_info", [False, True])
+@pytest.mark.parametrize("space", [gym.spaces.Discrete(4), gym.spaces.MultiDiscrete([2, 4]), gym.spaces.MultiBinary(4)])
+def test_actions_are_checked_that_the_mask_allows(space, in_info):
+    assert not [one for one in findings(Picky(space, in_info)) if "allowed" in one.text or one.level == "error"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 import webbrowser
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import closing
@@ -29,6 +30,9 @@ EXIT = {"running": 0, "finished": 0, "unknown": 0, "interrupted": 3, "crashed": 
 """Exit status of ``rejeu status`` by the state of a run."""
 WIDE = 10_000
 """Columns of a table that is not written to a terminal, so that no cell is folded."""
+
+WAIT_SECONDS = 0.5
+"""Time between two looks for a run folder that is not there yet."""
 
 
 def run_runs(arguments: Runs) -> tuple[int, dict[str, Any]]:
@@ -287,8 +291,18 @@ def replay(path: Path, arguments: Report) -> None:
 
 
 def follow(arguments: Report) -> None:
-    """Serves the page until Ctrl-C or SIGTERM ends the process."""
-    server, address = make_server(arguments.runs)
+    """Serves the page until Ctrl-C or SIGTERM ends the process; waits for the folders of runs that are about to begin."""
+    said = ""
+    while True:
+        try:
+            server, address = make_server(arguments.runs)
+            break
+        except FileNotFoundError as error:
+            if any(path.is_file() for path in arguments.runs):
+                raise
+            if said != (said := str(error)):
+                print(f"{error}; waiting for it (Ctrl-C ends it)", flush=True)
+            time.sleep(WAIT_SECONDS)
     print(f"{address} (Ctrl-C ends it)", flush=True)
     if arguments.open:
         webbrowser.open(address)

@@ -16,7 +16,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env as check_gymnasium_env
 
-from rejeu.envs import validation
+from rejeu.envs import masks, validation
 from rejeu.envs.base import SEEDS_END
 from rejeu.envs.goals import attribute
 from rejeu.errors import BadEnvironmentError
@@ -154,7 +154,7 @@ def _play(env: gym.Env, found: dict[str, Finding], effort: Effort) -> list[Seen]
     except BadEnvironmentError as error:
         found["seed"] = Finding("error", str(error))
         env = env.unwrapped if validation.arguments_fault(env) else env  # wrappers pass a seed on
-    if _reset(env, found) is None:
+    if (begun := _reset(env, found)) is None:
         with suppress(Exception):  # whatever step raises after a wrong reset
             _check_step(env.step(env.action_space.sample()), space, found)
         return None
@@ -163,11 +163,17 @@ def _play(env: gym.Env, found: dict[str, Finding], effort: Effort) -> list[Seen]
     lengths: list[int] = []
     at_limit: list[bool] = []
     until = time.monotonic() + effort.seconds
+    info = begun[1]
     while len(seen) < effort.most_steps and not (len(seen) >= effort.enough_steps and len(lengths) >= ENOUGH_EPISODES):
         is_endless = effort.is_patient and not lengths and limit is None
         if len(seen) >= effort.enough_steps and time.monotonic() > until and not is_endless:
             break
-        answer = env.step(env.action_space.sample())
+        try:
+            action = masks.sampled(env, info)
+        except BadEnvironmentError as error:
+            found["mask"] = Finding("warning", f"{error}; it cannot be trained with action masks")
+            action = env.action_space.sample()
+        answer = env.step(action)
         if not _check_step(answer, space, found):
             return None
         obs, reward, terminated, truncated, info = validation.convert_step(answer)
@@ -179,8 +185,9 @@ def _play(env: gym.Env, found: dict[str, Finding], effort: Effort) -> list[Seen]
             if length == limit:
                 at_limit.append(terminated)
             length = 0
-            if _reset(env, found) is None:
+            if (begun := _reset(env, found)) is None:
                 return None
+            info = begun[1]
     if len(at_limit) >= ENOUGH_EPISODES and all(at_limit):
         text = (
             f"every one of {len(at_limit)} episodes that came so far terminated at its time limit of {limit} steps; if "
@@ -197,8 +204,8 @@ def _play(env: gym.Env, found: dict[str, Finding], effort: Effort) -> list[Seen]
     return seen
 
 
-def _reset(env: gym.Env, found: dict[str, Finding]) -> Any:
-    """Resets the environment and checks its observation, which is returned; None if it is unusable."""
+def _reset(env: gym.Env, found: dict[str, Finding]) -> tuple[Any, dict[str, Any]] | None:
+    """Resets the environment and checks its observation, which is returned with the info; None if it is unusable."""
     space = env.observation_space
     answer = env.reset()
     if (fault := validation.reset_fault(answer, space)) is not None:
@@ -208,7 +215,7 @@ def _reset(env: gym.Env, found: dict[str, Finding]) -> Any:
     if validation.observation_fault(space, obs) is not None:
         return None
     _check_observation(obs, space, found, "reset")
-    return obs
+    return obs, answer[1] if has_info else {}
 
 
 def _check_step(answer: Any, space: gym.Space, found: dict[str, Finding]) -> bool:
@@ -264,8 +271,8 @@ def _gymnasium_messages(env: gym.Env, skip_render_check: bool) -> list[str]:
         refused = []
         try:
             check_gymnasium_env(env, skip_render_check=skip_render_check)
-        except Exception as error:  # whatever it refuses by
-            refused = [f"{error}"]
+        except Exception as error:  # whatever it refuses by, such as its own mask, which that checker does not ask for
+            refused = [] if masks.has_masks(env) else [f"{error}"]
     said = [re.sub(r"\x1b\[[\d;]*m|WARN: ", "", str(one.message)) for one in caught] + refused
     return [
         f"gymnasium.utils.env_checker: {' '.join(one.split())}"

@@ -23,7 +23,7 @@ from rejeu.envs import functional, snapshot
 from rejeu.envs.base import Seed
 from rejeu.envs.functional.protocol import FunctionalEnv
 from rejeu.envs.functional.vector import JaxVector, goal_functions
-from rejeu.envs.goals import GoalFunctions
+from rejeu.envs.goals import GoalFunctions, attribute
 from rejeu.envs.make import (
     Backend,
     EnvPool,
@@ -109,6 +109,31 @@ def flat_mask(given: Any, space: spaces.Space, env_id: str, over: bool) -> np.nd
     if not (over or is_some_allowed or isinstance(space, spaces.MultiBinary)):
         raise BadEnvironmentError(f"{env_id} allows no action: its mask is {mask.tolist()}")
     return mask
+
+
+def has_masks(env: gym.Env) -> bool:
+    """Returns whether an environment says which actions it allows; it may be reset for that."""
+    return callable(attribute(env, METHOD)) or MASK in env.reset()[1]
+
+
+def sampled(env: gym.Env, info: Any) -> Any:
+    """Returns a random action, among those that the environment allows if ``info`` or ``action_masks()`` says so.
+
+    Raises:
+        BadEnvironmentError: if its mask is invalid.
+    """
+    space, method = env.action_space, attribute(env, METHOD)
+    given = info[MASK] if isinstance(info, dict) and MASK in info else method() if callable(method) else None
+    if given is None or not isinstance(space, spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary):
+        return space.sample()
+    mask = flat_mask(given, space, id_of(env), over=False)
+    if isinstance(space, spaces.Discrete):
+        return space.sample(mask=mask)
+    if isinstance(space, spaces.MultiBinary):
+        return space.sample() * mask.reshape(space.shape)
+    allowed = np.split(mask, np.cumsum(space.nvec.ravel())[:-1])
+    chosen = [space.np_random.choice(np.flatnonzero(one)) for one in allowed]
+    return (np.reshape(chosen, space.shape) + space.start).astype(space.dtype)
 
 
 snapshot.REMEMBERED[MaskInObservation] = {}

@@ -9,6 +9,8 @@ import time
 
 import pytest
 
+from rejeu.cli import runs
+from rejeu.cli.commands import Report
 from rejeu.reporting.report import make_server, page
 from tests.reporting.report.folders import write
 
@@ -85,3 +87,17 @@ def test_page_that_is_closed_while_it_is_sent_prints_nothing(server, capsys, mon
 @pytest.mark.parametrize("host", ["evil.example", "evil.example:80", "127.0.0.1", "127.0.0.1:1"])
 def test_other_host_names_are_refused(server, host):
     assert get(server, "/", host)[0] == 403
+
+
+def test_a_run_that_is_about_to_begin_is_waited_for(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(runs.time, "sleep", lambda seconds: write(tmp_path / "run"))
+
+    def stop(self):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("socketserver.BaseServer.serve_forever", stop)
+    with pytest.raises(KeyboardInterrupt):
+        runs.follow(Report(runs=(tmp_path / "run",), live=True))
+    waiting, address = capsys.readouterr().out.splitlines()
+    assert "run; waiting for it" in waiting
+    assert address.startswith("http://127.0.0.1")

@@ -279,3 +279,13 @@ def test_missing_jinja2_is_named(tmp_path, monkeypatch):
         monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(MissingExtra, match=r"jinja2.*rejeu\[report\]"):
         page.render("report.html", {})
+
+
+def test_the_interval_of_mean_lengths_stays_between_them():
+    length = np.array([50.0, 50, 4, 50, 50, 50, 3, 50])
+    episodes = Episodes(np.arange(8.0), *[np.zeros(8)] * 2, length, *[np.zeros(8)] * 2)
+    band = next(
+        one for one in charts.episode_chart(episodes, EMPTY, "length")["series"] if one["name"] == "95 % interval"
+    )
+    assert max(high for high in band["high"] if high is not None) == 50
+    assert min(low for low in band["low"] if low is not None) >= 3
