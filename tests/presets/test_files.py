@@ -2,12 +2,17 @@
 
 import dataclasses
 import json
+import sys
 
 import pytest
 
-from rejeu import cli, presets
+import rejeu
+from rejeu import cli, hub, presets
+from rejeu.agents import exporting, find_preset
 from rejeu.cli.session import Session
 from rejeu.errors import CheckpointError
+from tests import hostile_files
+from tests.io.test_schemas import FILES
 
 SMALL = presets.Preset(
     env_id="CartPole-v1",
@@ -104,3 +109,23 @@ def test_a_preset_of_another_environment_is_used_with_a_warning(tmp_path, capsys
     command = ["train", "CartPole-v1", "--preset", str(path), "--out", str(tmp_path / "run"), "--steps", "32"]
     assert cli.main([*command, "--no-video", "--no-report"]) == 0
     assert "was made for Acrobot-v1" in capsys.readouterr().err
+
+
+def test_the_id_of_a_file_imports_nothing(tmp_path, monkeypatch):
+    """Gymnasium imports what an id names before a colon."""
+    (tmp_path / "imported_by_a_file.py").write_text("raise AssertionError('imported')")
+    monkeypatch.syspath_prepend(tmp_path)
+    own = dataclasses.replace(SMALL, env_id="imported_by_a_file:Walk-v0")
+    path = presets.write(own, tmp_path / "preset.json")
+    with pytest.warns(UserWarning, match="was made for imported_by_a_file"):
+        assert find_preset("CartPole-v1", None, str(path)).env_id == own.env_id
+    named = {"env_id": own.env_id, "made_from": {"env_id": own.env_id, "env_kwargs": {}}}
+    recorded = (FILES / "sac.safetensors").read_bytes()
+    content = hostile_files.changed(recorded, lambda header, arrays: header.update(named))
+    (tmp_path / "model.safetensors").write_bytes(content)
+    agent = rejeu.load(tmp_path / "model.safetensors")
+    assert own.env_id not in hub.card(agent, "me/model", tmp_path / "model.safetensors", set())
+    exporting.environment(agent, None)
+    with pytest.raises(ValueError, match="environment"):
+        agent.evaluate(1)
+    assert "imported_by_a_file" not in sys.modules
