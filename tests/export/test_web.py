@@ -158,7 +158,7 @@ def test_what_a_page_cannot_contain_is_one_line(tmp_path):
     assert not [*tmp_path.iterdir()]
     for env_id, kwargs, message in (
         ("Acrobot-v1", {}, "cannot contain Acrobot-v1; it can contain CartPole-v1"),
-        (None, {}, "given as an object; name it by agent.set_env"),
+        (None, {}, "given as an object .name it: agent.set_env"),
         ("rejeu/Ball-v0", {"dimension": 3}, "in two dimensions"),
         ("CartPole-v1", {"speed": 3}, "CartPole-v1 with the arguments speed"),
     ):

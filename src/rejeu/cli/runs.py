@@ -292,17 +292,12 @@ def replay(path: Path, arguments: Report) -> None:
 
 def follow(arguments: Report) -> None:
     """Serves the page until Ctrl-C or SIGTERM ends the process; waits for the folders of runs that are about to begin."""
-    said = ""
-    while True:
-        try:
-            server, address = make_server(arguments.runs)
-            break
-        except FileNotFoundError as error:
-            if any(path.is_file() for path in arguments.runs):
-                raise
-            if said != (said := str(error)):
-                print(f"{error}; waiting for it (Ctrl-C ends it)", flush=True)
-            time.sleep(WAIT_SECONDS)
+    awaited = [path for path in arguments.runs if not path.exists()]
+    if awaited:
+        print(f"there is no run folder {awaited[0]} yet; waiting for it (Ctrl-C ends it)", flush=True)
+    while not all(RunFolder(path).config.is_file() for path in awaited):
+        time.sleep(WAIT_SECONDS)
+    server, address = make_server(arguments.runs)
     print(f"{address} (Ctrl-C ends it)", flush=True)
     if arguments.open:
         webbrowser.open(address)

@@ -168,11 +168,9 @@ def _play(env: gym.Env, found: dict[str, Finding], effort: Effort) -> list[Seen]
         is_endless = effort.is_patient and not lengths and limit is None
         if len(seen) >= effort.enough_steps and time.monotonic() > until and not is_endless:
             break
-        try:
+        action = env.action_space.sample()
+        with suppress(BadEnvironmentError):  # of a mask that is none
             action = masks.sampled(env, info)
-        except BadEnvironmentError as error:
-            found["mask"] = Finding("warning", f"{error}; it cannot be trained with action masks")
-            action = env.action_space.sample()
         answer = env.step(action)
         if not _check_step(answer, space, found):
             return None

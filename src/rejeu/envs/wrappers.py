@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -53,35 +53,25 @@ class FlatGoals(gym.ObservationWrapper, gym.utils.RecordConstructorArgs):
     def __init__(self, env: gym.Env) -> None:
         gym.utils.RecordConstructorArgs.__init__(self)
         gym.ObservationWrapper.__init__(self, env)
-        check_goal_space(env.observation_space, nested=True)
-        assert isinstance(env.observation_space, gym.spaces.Dict)
-        self._goal = env.observation_space["achieved_goal"]
+        space: Any = env.observation_space
+        check_goal_space(space, nested=True)
+        self._goal = space["achieved_goal"]
         leaves(self._goal)
         flat: Any = gym.spaces.flatten_space(self._goal)
         flat = gym.spaces.Box(flat.low.astype(np.float32), flat.high.astype(np.float32), dtype=np.float32)
         goals = dict.fromkeys(("achieved_goal", "desired_goal"), flat)
-        self.observation_space = gym.spaces.Dict({**env.observation_space.spaces, **goals})
+        self.observation_space = gym.spaces.Dict({**space.spaces, **goals})
+        for name in ("compute_reward", "compute_terminated"):
+            if attribute(env, name) is not None:
+                setattr(self, name, partial(self._of_parts, name))
 
     def observation(self, observation: Any) -> dict[str, Any]:
         """Returns an observation with flat goals."""
         flat = {key: gym.spaces.flatten(self._goal, observation[key]) for key in ("achieved_goal", "desired_goal")}
         return {**observation, **{key: np.asarray(goal, np.float32) for key, goal in flat.items()}}
 
-    @property
-    def compute_reward(self) -> Callable[..., Any]:
-        """The environment's function of this name, for flat goals."""
-        return self._of_flat("compute_reward")
-
-    @property
-    def compute_terminated(self) -> Callable[..., Any]:
-        """The environment's function of this name, for flat goals."""
-        return self._of_flat("compute_terminated")
-
-    def _of_flat(self, name: str) -> Callable[..., Any]:
-        function = attribute(self.env, name)
-        if function is None:
-            raise AttributeError(f"the environment has no {name}")
-        return lambda achieved, desired, info: function(*(unflat(self._goal, x) for x in (achieved, desired)), info)
+    def _of_parts(self, name: str, achieved: np.ndarray, desired: np.ndarray, info: Any) -> Any:
+        return self.env.get_wrapper_attr(name)(unflat(self._goal, achieved), unflat(self._goal, desired), info)
 
 
 def unflat(space: gym.Space, flat: np.ndarray) -> Any:

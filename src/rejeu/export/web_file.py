@@ -45,11 +45,9 @@ def environment(env_id: str | None, kwargs: Mapping[str, Any]) -> FunctionalEnv:
     """
     name = env_id if env_id in ENVIRONMENTS.values() else ENVIRONMENTS.get(env_id or "")
     if name is None or kwargs.get("dimension", 2) != 2:
-        fix = "; name it by agent.set_env(ID) or --env ID"
-        said = f"{env_id}{dict(kwargs) or ''}" if env_id else "an environment that was given as an object"
-        raise ValueError(
-            f"a page cannot contain {said}{'' if env_id else fix}; it can contain {', '.join(ENVIRONMENTS)} in two dimensions"
-        )
+        unnamed = "an environment that was given as an object (name it: agent.set_env(ID), --env ID)"
+        said = f"{env_id}{dict(kwargs) or ''}" if env_id else unnamed
+        raise ValueError(f"a page cannot contain {said}; it can contain {', '.join(ENVIRONMENTS)} in two dimensions")
     try:
         return functional.make(name, **kwargs)
     except TypeError:

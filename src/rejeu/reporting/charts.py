@@ -158,8 +158,8 @@ def episode_chart(episodes: Episodes, evaluations: Table, column: str, window: i
     if n:
         curve = smooth(episodes, values, is_rate, window)
         if column == "length":  # whose mean lies between them
-            ends = values[known].min(), values[known].max()
-            curve = curve._replace(low=np.clip(curve.low, *ends), high=np.clip(curve.high, *ends))
+            low, high = np.maximum(curve.low, values[known].min()), np.minimum(curve.high, values[known].max())
+            curve = curve._replace(low=low, high=high)
         at = curve.step, curve.minutes
         if curve.spread is not None and not is_rate:
             low, high = curve.spread

@@ -513,7 +513,6 @@ def load_zip(
     with explained(path):
         check_depths(cls.algorithm.Config(**settings))
     config: Any = build(cls.algorithm.Config, settings | changes)
-    check_depths(config)
     name = spaces.POLICIES[1] if keys else spaces.POLICIES[2 if policy.leaves[0].kind == "image" else 0]
     agent.configure(name, config, **own)
     agent.set_outputs(**outputs)

@@ -99,5 +99,5 @@ def test_a_run_that_is_about_to_begin_is_waited_for(tmp_path, monkeypatch, capsy
     with pytest.raises(KeyboardInterrupt):
         runs.follow(Report(runs=(tmp_path / "run",), live=True))
     waiting, address = capsys.readouterr().out.splitlines()
-    assert "run; waiting for it" in waiting
+    assert "run yet; waiting for it" in waiting
     assert address.startswith("http://127.0.0.1")
