@@ -167,6 +167,6 @@ def test_settings_without_meaning_are_unknown():
 
 
 def test_a_factor_that_leaves_environments_out_is_warned_of():
-    with pytest.warns(UserWarning, match="from 2 of the 4 environments only"):
+    with pytest.warns(UserWarning, match="takes 2 of 4 environments only"):
         trpo.warn_of_unused(2, 4)
     trpo.warn_of_unused(3, 4)

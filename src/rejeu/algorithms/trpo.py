@@ -178,9 +178,8 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
 def warn_of_unused(factor: int, n_envs: int) -> None:
     """Warns if every ``factor``-th step is always one of the same environments, as they are side by side in a rollout."""
     if (shared := math.gcd(factor, n_envs)) > 1:
-        fix = f"take a factor without a divisor in common with {n_envs}"
-        used = f"from {n_envs // shared} of the {n_envs} environments only"
-        warnings.warn(f"with sub_sampling_factor={factor} the policy learns {used}; {fix}", UserWarning, stacklevel=2)
+        text = f"sub_sampling_factor={factor} takes {n_envs // shared} of {n_envs} environments only"
+        warnings.warn(text, UserWarning, stacklevel=2)
 
 
 def policy_step(network: ActorCritic, data: Samples, config: Config) -> tuple[ActorCritic, Step]:

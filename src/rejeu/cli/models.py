@@ -71,8 +71,9 @@ def run_export(arguments: Export) -> tuple[int, dict[str, Any]]:
     agent, make_env = load(model), None if made is None else made.make
     if arguments.env is not None and made is not None and not made.wrappers:
         agent.trained_on = made.env_id, made.kwargs
-    settings = (arguments.noise, arguments.batch, make_env, str(arguments.run), arguments.frame_stack)
-    found = export(agent, out, to, *settings)
+    found = export(
+        agent, out, to, arguments.noise, arguments.batch, make_env, str(arguments.run), arguments.frame_stack
+    )
     echo(found)
     return 0, found.to_dict()
 

@@ -31,9 +31,6 @@ EXIT = {"running": 0, "finished": 0, "unknown": 0, "interrupted": 3, "crashed": 
 WIDE = 10_000
 """Columns of a table that is not written to a terminal, so that no cell is folded."""
 
-WAIT_SECONDS = 0.5
-"""Time between two looks for a run folder that is not there yet."""
-
 
 def run_runs(arguments: Runs) -> tuple[int, dict[str, Any]]:
     """Prints a table of the runs in a folder."""
@@ -293,10 +290,10 @@ def replay(path: Path, arguments: Report) -> None:
 def follow(arguments: Report) -> None:
     """Serves the page until Ctrl-C or SIGTERM ends the process; waits for the folders of runs that are about to begin."""
     awaited = [path for path in arguments.runs if not path.exists()]
-    if awaited:
-        print(f"there is no run folder {awaited[0]} yet; waiting for it (Ctrl-C ends it)", flush=True)
+    for path in awaited:
+        print(f"there is no run folder {path} yet; waiting for it (Ctrl-C ends it)", flush=True)
     while not all(RunFolder(path).config.is_file() for path in awaited):
-        time.sleep(WAIT_SECONDS)
+        time.sleep(0.5)
     server, address = make_server(arguments.runs)
     print(f"{address} (Ctrl-C ends it)", flush=True)
     if arguments.open:

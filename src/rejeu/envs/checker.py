@@ -270,7 +270,7 @@ def _gymnasium_messages(env: gym.Env, skip_render_check: bool) -> list[str]:
         try:
             check_gymnasium_env(env, skip_render_check=skip_render_check)
         except Exception as error:  # whatever it refuses by, such as its own mask, which that checker does not ask for
-            refused = [] if masks.has_masks(env) else [f"{error}"]
+            refused = [] if attribute(env, masks.METHOD) or masks.MASK in env.reset()[1] else [f"{error}"]
     said = [re.sub(r"\x1b\[[\d;]*m|WARN: ", "", str(one.message)) for one in caught] + refused
     return [
         f"gymnasium.utils.env_checker: {' '.join(one.split())}"

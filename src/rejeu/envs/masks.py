@@ -111,11 +111,6 @@ def flat_mask(given: Any, space: spaces.Space, env_id: str, over: bool) -> np.nd
     return mask
 
 
-def has_masks(env: gym.Env) -> bool:
-    """Returns whether an environment says which actions it allows; it may be reset for that."""
-    return callable(attribute(env, METHOD)) or MASK in env.reset()[1]
-
-
 def sampled(env: gym.Env, info: Any) -> Any:
     """Returns a random action, among those that the environment allows if ``info`` or ``action_masks()`` says so.
 
@@ -131,9 +126,9 @@ def sampled(env: gym.Env, info: Any) -> Any:
         return space.sample(mask=mask)
     if isinstance(space, spaces.MultiBinary):
         return space.sample() * mask.reshape(space.shape)
-    allowed = np.split(mask, np.cumsum(space.nvec.ravel())[:-1])
-    chosen = [space.np_random.choice(np.flatnonzero(one)) for one in allowed]
-    return (np.reshape(chosen, space.shape) + space.start).astype(space.dtype)
+    masks = np.split(mask, np.cumsum(space.nvec.ravel())[:-1])
+    chosen = np.reshape([space.np_random.choice(np.flatnonzero(one)) for one in masks], space.shape)
+    return (chosen + space.start).astype(space.dtype)
 
 
 snapshot.REMEMBERED[MaskInObservation] = {}

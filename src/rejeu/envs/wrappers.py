@@ -58,9 +58,8 @@ class FlatGoals(gym.ObservationWrapper, gym.utils.RecordConstructorArgs):
         self._goal = space["achieved_goal"]
         leaves(self._goal)
         flat: Any = gym.spaces.flatten_space(self._goal)
-        flat = gym.spaces.Box(flat.low.astype(np.float32), flat.high.astype(np.float32), dtype=np.float32)
-        goals = dict.fromkeys(("achieved_goal", "desired_goal"), flat)
-        self.observation_space = gym.spaces.Dict({**space.spaces, **goals})
+        box = gym.spaces.Box(flat.low.astype(np.float32), flat.high.astype(np.float32))
+        self.observation_space = gym.spaces.Dict({**space.spaces, "achieved_goal": box, "desired_goal": box})
         for name in ("compute_reward", "compute_terminated"):
             if attribute(env, name) is not None:
                 setattr(self, name, partial(self._of_parts, name))
