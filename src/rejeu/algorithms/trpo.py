@@ -178,8 +178,9 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
 def warn_of_unused(factor: int, n_envs: int) -> None:
     """Warns if every ``factor``-th step is always one of the same environments, as they are side by side in a rollout."""
     if (shared := math.gcd(factor, n_envs)) > 1:
-        text = f"sub_sampling_factor={factor} takes {n_envs // shared} of {n_envs} environments only"
-        warnings.warn(text, UserWarning, stacklevel=2)
+        warnings.warn(
+            f"sub_sampling_factor={factor} takes {n_envs // shared} of {n_envs} environments only", stacklevel=2
+        )
 
 
 def policy_step(network: ActorCritic, data: Samples, config: Config) -> tuple[ActorCritic, Step]:

@@ -122,10 +122,8 @@ def sampled(env: gym.Env, info: Any) -> Any:
     if given is None or not isinstance(space, spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary):
         return space.sample()
     mask = flat_mask(given, space, id_of(env), over=False)
-    if isinstance(space, spaces.Discrete):
-        return space.sample(mask=mask)
-    if isinstance(space, spaces.MultiBinary):
-        return space.sample() * mask.reshape(space.shape)
+    if not isinstance(space, spaces.MultiDiscrete):
+        return space.sample() * mask.reshape(space.shape) if space.shape else space.sample(mask=mask)  # type: ignore[arg-type]
     masks = np.split(mask, np.cumsum(space.nvec.ravel())[:-1])
     chosen = np.reshape([space.np_random.choice(np.flatnonzero(one)) for one in masks], space.shape)
     return (chosen + space.start).astype(space.dtype)

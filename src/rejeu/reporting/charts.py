@@ -157,9 +157,8 @@ def episode_chart(episodes: Episodes, evaluations: Table, column: str, window: i
     found: list[Series] = []
     if n:
         curve = smooth(episodes, values, is_rate, window)
-        if column == "length":  # whose mean lies between them
-            low, high = np.maximum(curve.low, values[known].min()), np.minimum(curve.high, values[known].max())
-            curve = curve._replace(low=low, high=high)
+        ends = (values[known].min(), values[known].max()) if column == "length" else (-HUGE, HUGE)
+        curve = curve._replace(low=np.clip(curve.low, *ends), high=np.clip(curve.high, *ends))
         at = curve.step, curve.minutes
         if curve.spread is not None and not is_rate:
             low, high = curve.spread
