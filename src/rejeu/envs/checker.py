@@ -162,8 +162,7 @@ def _play(env: gym.Env, found: dict[str, Finding], effort: Effort) -> list[Seen]
     limit, length = known_limit(env), 0
     lengths: list[int] = []
     at_limit: list[bool] = []
-    until = time.monotonic() + effort.seconds
-    info = begun[1]
+    until, info = time.monotonic() + effort.seconds, begun[1]
     while len(seen) < effort.most_steps and not (len(seen) >= effort.enough_steps and len(lengths) >= ENOUGH_EPISODES):
         is_endless = effort.is_patient and not lengths and limit is None
         if len(seen) >= effort.enough_steps and time.monotonic() > until and not is_endless:

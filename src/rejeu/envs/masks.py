@@ -123,7 +123,7 @@ def sampled(env: gym.Env, info: Any) -> Any:
         return space.sample()
     mask = flat_mask(given, space, id_of(env), over=False)
     if not isinstance(space, spaces.MultiDiscrete):
-        return space.sample() * mask.reshape(space.shape) if space.shape else space.sample(mask=mask)  # type: ignore[arg-type]
+        return space.sample() * mask.reshape(space.shape) if space.shape else space.sample(mask=mask)
     masks = np.split(mask, np.cumsum(space.nvec.ravel())[:-1])
     chosen = np.reshape([space.np_random.choice(np.flatnonzero(one)) for one in masks], space.shape)
     return (chosen + space.start).astype(space.dtype)

@@ -7,7 +7,6 @@ hyperparameters ``config.yml`` and the command line ``args.yml``. On the hub all
 from __future__ import annotations
 
 import re
-from collections.abc import Collection
 from pathlib import Path
 from typing import Any, Literal
 
@@ -58,7 +57,7 @@ def statistics_beside(path: Path) -> Path | None:
     return next((place for place in places if place.is_file()), None)
 
 
-def notes_beside(path: Path, used: Any, given: Collection[str] = ()) -> list[str]:
+def notes_beside(path: Path, used: Any, given: Any = ()) -> list[str]:
     """Returns what the files beside a zip file say that rejeu does not do by itself, and which of them are not read.
 
     Args:
