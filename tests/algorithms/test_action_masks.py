@@ -22,7 +22,7 @@ from rejeu.sb3 import DQN
 from rejeu.sb3_contrib import MaskablePPO, MaskableRecurrentPPO
 from tests.helpers import assert_same_parameters
 from tests.jax_environments import Forbidden
-from tests.tiers import exhaustive, only, only_tuples
+from tests.tiers import exhaustive, only
 from tests.worker_environments import Rules
 
 pytestmark = pytest.mark.usefixtures("learners_are_shared")
@@ -73,7 +73,8 @@ class Lenient(Forbidden):
         return jnp.ones(3, bool)
 
 
-@pytest.mark.parametrize(("name", "on_device"), only_tuples([("DQN", True)], PLACES))
+@exhaustive
+@pytest.mark.parametrize(("name", "on_device"), PLACES)
 def test_masks_that_allow_everything_change_nothing(name, on_device):
     agents = []
     for masks in (True, False):
