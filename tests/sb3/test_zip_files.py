@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 import rejeu
+from rejeu import spaces
 from rejeu.cli import main
 from rejeu.core import Clock, Transition
 from rejeu.errors import CheckpointError
@@ -249,6 +250,13 @@ def test_recent_episodes_and_outputs_are_those_of_the_file(tmp_path):
 
 
 @exhaustive
+def test_images_are_what_convolutions_read():
+    leaf = spaces.leaves(gym.spaces.Box(0.0, 1.0, (1, 36, 36), np.float32))[0]
+    weights = {"features_extractor.cnn.0.weight": np.zeros(1), "features_extractor.linear.0.bias": np.zeros(16)}
+    features = [Policy(one, (leaf,), [], gym.spaces.Discrete(2), False).n_features(leaf) for one in (weights, {})]
+    assert features == [16, 36 * 36]
+
+
 def test_hostile_files_end_soon_in_little_memory_and_run_nothing(tmp_path):
     """A sample of them."""
     ran = tmp_path / "ran"

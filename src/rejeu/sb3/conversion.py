@@ -15,7 +15,6 @@ import numpy as np
 from gymnasium import spaces
 
 from rejeu.io.records import Malformed
-from rejeu.networks import convolutions
 from rejeu.spaces import Leaf, bounded
 
 EXTRACTORS = ("NatureCNN", "FlattenExtractor", "CombinedExtractor")
@@ -95,9 +94,13 @@ class Policy(NamedTuple):
         index = [starts[path] + i for path, size in sizes.items() for i in range(size)]
         return np.array(index + [len(index) + i for i in range(extra)])
 
+    def is_image(self, leaf: Leaf) -> bool:
+        """Returns whether convolutions read a leaf, which may be of floats without ``normalize_images``."""
+        return any((f"extractors.{leaf.path}.cnn." if leaf.path else "extractor.cnn.") in key for key in self.weights)
+
     def n_features(self, leaf: Leaf) -> int:
         """Returns the features of a leaf."""
-        if convolutions(leaf) is None:
+        if not self.is_image(leaf):
             return leaf.n_features
         end = f"extractors.{leaf.path}.linear.0.bias" if leaf.path else "features_extractor.linear.0.bias"
         return next((value.size for key, value in self.weights.items() if key.endswith(end)), 0)
@@ -148,7 +151,7 @@ def mlp(names: Sequence[str], order: Any) -> Network:
 def encoder(policy: Policy, prefix: str) -> Network:
     """Returns the CNNs of all images."""
     made: Network = {}
-    images = [leaf for leaf in policy.leaves if convolutions(leaf) is not None]
+    images = [leaf for leaf in policy.leaves if policy.is_image(leaf)]
     for i, leaf in enumerate(images):
         base = f"{prefix}.extractors.{leaf.path}" if leaf.path else prefix
         for j in range(3):

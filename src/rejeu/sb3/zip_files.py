@@ -337,7 +337,7 @@ def policy_settings(model: Model, policy: Policy, algorithm: str) -> dict[str, A
         shape["activation_fn"] = activation.name.lower() if isinstance(activation, Name) else "of another kind"
         if shape["activation_fn"] == "gelu":
             raise Malformed("its activation_fn is GELU, of which JAX has an approximation; the outputs would differ")
-    dims = {policy.n_features(leaf) for leaf in policy.leaves if leaf.kind == "image"}
+    dims = {policy.n_features(leaf) for leaf in policy.leaves if policy.is_image(leaf)}
     if len(dims) > 1:
         raise Malformed(f"its images have {sorted(dims)} features, expected one number")
     shape |= {"cnn_features": dims.pop()} if dims else {}
@@ -513,7 +513,7 @@ def load_zip(
     with explained(path):
         check_depths(cls.algorithm.Config(**settings))
     config: Any = build(cls.algorithm.Config, settings | changes)
-    name = spaces.POLICIES[1] if keys else spaces.POLICIES[2 if policy.leaves[0].kind == "image" else 0]
+    name = spaces.POLICIES[1] if keys else spaces.POLICIES[2 if policy.is_image(policy.leaves[0]) else 0]
     agent.configure(name, config, **own)
     agent.set_outputs(**outputs)
     vector = None if env is None else agent.make_envs(env, 1, seed=agent.seed)
