@@ -77,7 +77,7 @@ def unflat(space: gym.Space, flat: np.ndarray) -> Any:
     """Returns the elements of ``space`` whose flat arrays ``(..., n)`` are given, each leaf with the same leading axes.
 
     >>> space = gym.spaces.Dict(at=gym.spaces.Box(-1.0, 1.0, (2,)), open=gym.spaces.Discrete(2))
-    >>> unflat(space, np.eye(2, 4))["at"].shape
+    >>> unflat(space, np.eye(2, 4, 2))["at"].shape
     (2, 2)
     """
     if isinstance(space, gym.spaces.Dict | gym.spaces.Tuple):
