@@ -1761,7 +1761,6 @@ DIFFERENT: dict[str, str] = {
     "PPO_Box_policy_kwargs3": "files with use_expln are not read, so the weights cannot be the same",
     "SAC_Box_policy_kwargs5": "as PPO_Box_policy_kwargs3",
     "first_candidates": "zero_policy of ARS counts for a policy without hidden layers, there for each; vectors of parameters have log_std too",
-    "images": "files with images of floats were not read, which is mended",
     "checker": "skip_render_check=False did not render, which is mended",
     "noise_types": "noise is float32 in any case, as the actions that it is added to",
     "atari_wrapper": "the last frame of an episode is the maximum of its frames; there a frame of the action before may be in it",
