@@ -18,6 +18,7 @@ else:
     importlib.import_module("rejeu.envs")  # registers rejeu's environments
 
 if TYPE_CHECKING:
+    import rejeu.sb3.common.vec_env.adapters  # noqa: F401
     from rejeu.agents import (
         A2C as A2C,
         AGENTS as AGENTS,

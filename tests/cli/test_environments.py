@@ -21,7 +21,8 @@ from rejeu.cli.commands import Train
 from rejeu.cli.environment import Environment
 from rejeu.errors import WorkerError
 from rejeu.experiments.folder import Job, again
-from rejeu.runs.config import RunConfig, quoted
+from rejeu.reporting.formatting import quoted
+from rejeu.runs.config import RunConfig
 from tests.cli.test_cli import FEWER_FILES, TINY, error_of
 
 pytestmark = pytest.mark.usefixtures("learners_are_shared")

@@ -297,7 +297,7 @@ def test_resume(spy, sessions, monkeypatch, tmp_path):
     agent = mock.Mock(training_call=mock.Mock(last_step=100, **{"is_over.return_value": False}))
     agent.run.step = 30
     kind = mock.Mock(**{"resume.return_value": agent})
-    spy(resume, "read_config", decided(wait_for=1, hyperparameters={"policy_kwargs": {"net_arch": [4]}}))
+    spy(resume, "read_folder", decided(wait_for=1, hyperparameters={"policy_kwargs": {"net_arch": [4]}}))
     spy(resume, "agent_of_file", kind)
     written, made = spy(resume.configs_of_runs, "write"), spy(Environment, "vector", mock.Mock())
     monkeypatch.setattr(resume.configs, "to_json", lambda config: {"gamma": 0.5})

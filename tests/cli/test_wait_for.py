@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from rejeu import cli
-from rejeu.runs import folder as run_folder
+from rejeu.runs.config import read_folder
 from rejeu.runs.folder import RunFolder
 from tests.tiers import exhaustive
 
@@ -17,5 +17,5 @@ SHORT = [
 def test_a_run_that_waits_for_some_environments_is_resumed(tmp_path):
     out = tmp_path / "run"
     assert cli.main(["train", "Pendulum-v1", "--steps=30", f"--out={out}", "--wait-for=2", *SHORT]) == 0
-    assert run_folder.read_config(RunFolder(out)).wait_for == 2
+    assert read_folder(RunFolder(out)).wait_for == 2
     assert cli.main(["resume", str(out), "--steps=10", "--no-report", "--no-video"]) == 0

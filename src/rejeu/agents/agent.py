@@ -185,10 +185,9 @@ class Agent(BaseAgent):
         Raises:
             MissingExtra: if plotly or jinja2 is not installed.
         """
-        from rejeu.reporting.report import write_page  # here and in export: what few programs use
+        import rejeu  # whose wings the library does not import
 
-        path = Path(path)
-        return write_page([training.record(self, path, [*evaluations])], path)
+        return rejeu.write_report(self, path, evaluations)
 
     def save(self, path: str | Path) -> Path:
         """Writes the model to one safetensors file, without the replay buffer, and returns its path.
@@ -303,9 +302,9 @@ class Agent(BaseAgent):
         if not self.is_learning:
             self.abandon_episodes()
         if env.venv is None:
-            from rejeu.sb3.common.vec_env.adapters import to_vec_env  # only who asks for it needs the package
+            import rejeu  # whose wings the library does not import
 
-            env.venv = to_vec_env(env)
+            env.venv = rejeu.sb3.common.vec_env.adapters.to_vec_env(env)
         return env.venv
 
     def set_logger(self, logger: Logger) -> None:

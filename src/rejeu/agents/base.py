@@ -553,3 +553,11 @@ class Signature:
             for key, default in validation.field_defaults(config).items()
         ]
         return inspect.Signature([*list(self.common.parameters.values())[1:-1], *hyperparameters])
+
+
+def fill_windows(agent: BaseAgent) -> None:
+    """Fills the buffers of recent episodes from the history."""
+    episodes = agent.history.last(agent.stats_window_size)
+    agent.ep_info_buffer.extend({"r": e.episode_return, "l": e.length, "t": e.seconds} for e in episodes)
+    successes = agent.history["success"]
+    agent.ep_success_buffer.extend(successes[~np.isnan(successes)][-agent.stats_window_size :].tolist())

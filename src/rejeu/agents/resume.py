@@ -16,9 +16,8 @@ from jax import Array
 
 from rejeu import devices, spaces, xla
 from rejeu.agents import model_files
-from rejeu.agents.base import BaseAgent, Best, Resumed
+from rejeu.agents.base import BaseAgent, Best, Resumed, fill_windows
 from rejeu.agents.run_files import PER_ENV, SCALARS, RowFiles, RunHeader, SavedBest, SavedRun, run_folder, versions
-from rejeu.agents.training import fill_windows
 from rejeu.buffers import ring_io
 from rejeu.buffers.prioritized import Draw, Priorities
 from rejeu.buffers.rollout import RolloutBuffer

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -24,10 +22,7 @@ from rejeu.interrupt import Interrupt
 from rejeu.loops import finite
 from rejeu.loops.finite import NonFiniteUpdate
 from rejeu.loops.run import Episode, Progress, TrainingCall, checked_limits, time_shares
-from rejeu.reporting.evaluation import Evaluation
 from rejeu.reporting.logging import Console, RetryingSink, Sink, guarded, next_folder, open_log
-from rejeu.reporting.runs import Episodes, Run, evaluation_table
-from rejeu.reporting.tables import Table
 
 TABLE_SECONDS = 2.0
 """Least time between two tables that ``verbose=1`` prints; other outputs get every row."""
@@ -112,34 +107,6 @@ def statistics_row(agent: BaseAgent) -> dict[str, float]:
     for key, value in (run.metrics or {}).items():
         numbers[LOGGED_AS.get(key, f"train/{key}")] = float(value)
     return numbers
-
-
-def record(agent: BaseAgent, path: Path, evaluations: Sequence[tuple[int, Evaluation]]) -> Run:
-    """Returns the training of an agent so far as a run; ``path`` is only for its name."""
-    env = agent.run.env
-    history = agent.history
-    return Run(
-        path=path.absolute(),
-        name=path.stem,
-        algorithm=agent.name,
-        env_id="" if env is None else env.env_id,
-        seed=agent.seed,
-        n_envs=None if env is None else env.n_envs,
-        hyperparameters=configs.to_json(given_config(agent)),
-        state="running" if agent.is_learning else "finished",
-        steps=agent.run.step,
-        seconds=agent.seconds["total"],
-        episodes=Episodes.of(Table(history.to_dict())),
-        evaluations=evaluation_table(evaluations),
-    )
-
-
-def given_config(agent: BaseAgent) -> Any:
-    """Returns the configuration of an agent without the widths of layers that follow from its observations."""
-    config = agent.config
-    default = type(config)()
-    is_default = config.policy_kwargs == configs.with_widths(default, agent.obs_leaves).policy_kwargs
-    return dataclasses.replace(config, policy_kwargs=default.policy_kwargs) if is_default else config
 
 
 STEPS_OF_A_ROW = 250
@@ -367,11 +334,3 @@ def record_episode(agent: BaseAgent, episode: Episode) -> None:
     agent.ep_info_buffer.append({"r": episode.episode_return, "l": episode.length, "t": episode.seconds})
     if not math.isnan(episode.success):
         agent.ep_success_buffer.append(episode.success)
-
-
-def fill_windows(agent: BaseAgent) -> None:
-    """Fills the buffers of recent episodes from the history."""
-    episodes = agent.history.last(agent.stats_window_size)
-    agent.ep_info_buffer.extend({"r": e.episode_return, "l": e.length, "t": e.seconds} for e in episodes)
-    successes = agent.history["success"]
-    agent.ep_success_buffer.extend(successes[~np.isnan(successes)][-agent.stats_window_size :].tolist())

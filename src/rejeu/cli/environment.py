@@ -26,8 +26,8 @@ from rejeu.envs.registry import are_plain, is_plain_id, maker, register
 from rejeu.envs.rendering import make_rendering_env
 from rejeu.errors import CheckpointError
 from rejeu.io import checkpoint
-from rejeu.runs.config import EnvironmentOptions, RunConfig, merged
-from rejeu.runs.folder import RunFolder, read_config
+from rejeu.runs.config import EnvironmentOptions, RunConfig, merged, read_folder
+from rejeu.runs.folder import RunFolder
 
 
 def imports(typed: str) -> bool:
@@ -283,7 +283,7 @@ def environment_of(model: Path, given: RunOptions) -> Environment:
         return from_arguments(given.env, given)
     env_id, folder = recorded_id(model), RunFolder(model.parent)
     if model in (folder.best, folder.agent) and folder.config.is_file():
-        config = read_config(folder)
+        config = read_folder(folder)
         if config.env == env_id:
             return from_run(config, folder.path, given)
     return from_run(RunConfig(env=env_id), model, given)

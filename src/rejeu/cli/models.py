@@ -13,9 +13,9 @@ from rejeu.cli import environment
 from rejeu.cli.commands import Evaluate, Export, Import, Play, Pull, Push, Record, Watch
 from rejeu.cli.output import echo
 from rejeu.errors import CheckpointError
-from rejeu.reporting.formatting import counted
+from rejeu.reporting.formatting import counted, quoted
 from rejeu.reporting.video import record_video
-from rejeu.runs.config import quoted, value
+from rejeu.runs.config import value
 from rejeu.runs.folder import RunFolder, find_model
 
 if TYPE_CHECKING:

@@ -19,9 +19,9 @@ from rejeu.callbacks import Evaluate, Evaluated
 from rejeu.cli.environment import Environment
 from rejeu.interrupt import NAMES
 from rejeu.io import atomic
-from rejeu.reporting.formatting import counted
+from rejeu.reporting.formatting import counted, quoted
 from rejeu.reporting.logging import Sink
-from rejeu.runs.config import DecidedRun, quoted
+from rejeu.runs.config import DecidedRun
 from rejeu.runs.folder import RunFolder
 
 echo = partial(print, flush=True)

@@ -19,11 +19,12 @@ from rejeu.envs.make import WorkerOptions
 from rejeu.experiments.folder import is_sweep
 from rejeu.experiments.study import StudyFolder
 from rejeu.interrupt import Interrupt
+from rejeu.reporting.formatting import quoted
 from rejeu.reporting.logging import require
 from rejeu.reporting.tables import read_table
 from rejeu.runs import config as configs_of_runs
-from rejeu.runs.config import DecidedRun, merged, quoted
-from rejeu.runs.folder import RunFolder, read_config
+from rejeu.runs.config import DecidedRun, merged, read_folder
+from rejeu.runs.folder import RunFolder
 
 
 def run_resume(arguments: Resume) -> tuple[int, dict[str, Any]]:
@@ -45,7 +46,7 @@ def resume(arguments: Resume) -> tuple[int, dict[str, Any]]:
     """Trains; returns the exit status and the result."""
     stopwatch = Stopwatch()
     folder = RunFolder(arguments.run)
-    config = read_config(folder)
+    config = read_folder(folder)
     if config.backend != "ray" and (arguments.ray is not None or arguments.env_cpus is not None):
         raise ValueError(f"{folder.path} is no sweep and no run with --backend ray; --ray and --env-cpus are for these")
     require(config.log)

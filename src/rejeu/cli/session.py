@@ -24,11 +24,11 @@ from rejeu.envs.make import VectorEnv
 from rejeu.interrupt import Interrupt, leaving
 from rejeu.loops.run import Progress
 from rejeu.reporting import plots, report, video
-from rejeu.reporting.formatting import counted
+from rejeu.reporting.formatting import counted, quoted
 from rejeu.reporting.history import EpisodeTable
 from rejeu.reporting.logging import CsvFile, RetryingSink, Sink, check_logs, guarded, open_log, require
 from rejeu.reporting.video import ffmpeg
-from rejeu.runs.config import DecidedRun, quoted
+from rejeu.runs.config import DecidedRun
 from rejeu.runs.folder import RunFolder
 
 VIDEO_EPISODES = 3

@@ -29,8 +29,9 @@ from rejeu.experiments.scheduler import Launcher
 from rejeu.experiments.sweep import Coordinator, Outcome, SweepResult, closing_lines, make_launcher, prepare, shown
 from rejeu.interrupt import NAMES, Interrupt
 from rejeu.reporting.comparison import By, Comparison, compare
+from rejeu.reporting.formatting import quoted
 from rejeu.runs import config as configs
-from rejeu.runs.config import RunConfig, quoted
+from rejeu.runs.config import RunConfig
 from rejeu.runs.folder import RunFolder, check_free
 from rejeu.validation import choice
 

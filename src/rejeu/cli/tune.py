@@ -20,8 +20,8 @@ from rejeu.experiments.study_plan import Plan
 from rejeu.experiments.sweep import Row, bars
 from rejeu.interrupt import NAMES, Interrupt
 from rejeu.reporting import formatting
-from rejeu.reporting.formatting import counted, number
-from rejeu.runs.config import RunConfig, apply, quoted
+from rejeu.reporting.formatting import counted, number, quoted
+from rejeu.runs.config import RunConfig, apply
 
 
 def run_tune(arguments: Tune) -> tuple[int, dict[str, Any]]:

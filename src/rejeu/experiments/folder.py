@@ -33,9 +33,10 @@ from rejeu.experiments.process import LOST
 from rejeu.experiments.scheduler import Work
 from rejeu.io import atomic
 from rejeu.io.records import Malformed, convert, json_text, read_json, shown
+from rejeu.reporting.formatting import quoted
 from rejeu.reporting.runs import EVALUATIONS, METRICS, is_locked
 from rejeu.reporting.tables import read_bytes, read_table
-from rejeu.runs.config import RunConfig, Task, quoted, written
+from rejeu.runs.config import RunConfig, Task, written
 from rejeu.runs.folder import newest_step
 from rejeu.validation import assign
 

@@ -34,8 +34,8 @@ from rejeu.experiments.process import LocalLauncher, default_workers, threads_of
 from rejeu.experiments.scheduler import Launcher, Scheduler
 from rejeu.interrupt import Interrupt
 from rejeu.reporting import formatting
-from rejeu.reporting.formatting import counted
-from rejeu.runs.config import RunConfig, quoted
+from rejeu.reporting.formatting import counted, quoted
+from rejeu.runs.config import RunConfig
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -14,8 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rejeu.reporting import statistics
-from rejeu.reporting.runs import HUGE, Episodes
-from rejeu.reporting.tables import Table
+from rejeu.reporting.tables import HUGE, Episodes, Table
 
 MAX_DOTS = 1500
 """Most episodes that are drawn one by one; of more their quantiles are drawn."""

@@ -6,6 +6,9 @@ import csv
 import html
 import io
 import math
+import os
+import shlex
+import subprocess
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
@@ -17,6 +20,9 @@ if TYPE_CHECKING:
 
 FORMULA = ("=", "+", "-", "@")
 """Characters with which a spreadsheet begins a formula."""
+
+LOGS = ("csv", "json", "tensorboard", "wandb", "mlflow", "trackio")
+"""What the argument ``log`` takes."""
 
 
 def counted(n: int, noun: str) -> str:
@@ -108,3 +114,12 @@ class Display:
             self._handle = display(data, raw=True, display_id=True)
         else:
             self._handle.update(data, raw=True)
+
+
+def quoted(word: object) -> str:
+    """Returns a word of a command line as it is typed: in quotes where the shell needs them.
+
+    >>> quoted("runs/first")
+    'runs/first'
+    """
+    return subprocess.list2cmdline([str(word)]) if os.name == "nt" else shlex.quote(str(word))

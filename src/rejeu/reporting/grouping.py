@@ -15,7 +15,8 @@ from typing import Any, Literal
 import numpy as np
 
 from rejeu.io.records import shown
-from rejeu.reporting.runs import HUGE, Run, flat
+from rejeu.reporting.runs import Run
+from rejeu.reporting.tables import HUGE, flat
 
 By = Literal["algorithm", "setting", "env"]
 MAX_LABEL = 200

@@ -27,12 +27,10 @@ from rejeu.errors import MissingExtra
 from rejeu.io import atomic
 from rejeu.io.failed_writes import MAX_ROWS, RETRY_SECONDS, FailedWrites
 from rejeu.reporting import trackers
-from rejeu.reporting.formatting import Display
+from rejeu.reporting.formatting import LOGS, Display
 from rejeu.reporting.history import csv_lines
-from rejeu.reporting.runs import flat
-from rejeu.reporting.tables import read_bytes
+from rejeu.reporting.tables import flat, read_bytes
 from rejeu.reporting.trackers import MLflow, Tracker, Trackio, WandB
-from rejeu.runs.config import LOGS
 
 TRACKERS = ("wandb", "mlflow", "trackio")
 CLOSE_SECONDS = 60.0

@@ -19,19 +19,8 @@ import numpy as np
 from rejeu.errors import MissingExtra
 from rejeu.io.records import Malformed, parse_json, shown
 from rejeu.reporting.formatting import counted
-from rejeu.reporting.runs import (
-    CONFIG,
-    EPISODES,
-    MAX_NAME,
-    MAX_STEP,
-    METRICS,
-    Episodes,
-    Run,
-    is_file,
-    ordered,
-    read_run,
-)
-from rejeu.reporting.tables import EMPTY, MAX_COLUMNS, Table, read_bytes, read_table
+from rejeu.reporting.runs import CONFIG, EPISODES, MAX_NAME, MAX_STEP, METRICS, Run, is_file, ordered, read_run
+from rejeu.reporting.tables import EMPTY, MAX_COLUMNS, Episodes, Table, read_bytes, read_table
 
 MAX_DEPTH = 4
 """Levels of folders that are searched for runs."""

@@ -10,7 +10,7 @@ import math
 import os
 import stat
 import time
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -23,8 +23,9 @@ from filelock import FileLock, Timeout
 from rejeu import presets
 from rejeu.errors import CheckpointError
 from rejeu.io.records import Malformed, convert, is_deep, parse_json, shown
-from rejeu.reporting.tables import EMPTY, Table, read_bytes, read_table
-from rejeu.runs.config import MAX_BYTES, RunConfig, quoted
+from rejeu.reporting.formatting import quoted
+from rejeu.reporting.tables import EMPTY, NO_EPISODES, Episodes, Table, flat, read_bytes, read_table
+from rejeu.runs.config import MAX_BYTES, RunConfig
 from rejeu.runs.folder import RunFolder, newest_inside, newest_step
 
 CONFIG, EPISODES, METRICS, EVALUATIONS = "config.json", "episodes.csv", "metrics.csv", "evaluations.csv"
@@ -40,39 +41,10 @@ MAX_WORD = 10_000
 """Upper limit on the length of a word of the command that repeats a run, in characters."""
 MAX_STEP = 2**53
 """Upper limit on environment steps; larger numbers are damage."""
-HUGE = 1e100
-"""Magnitude from which a return is taken for damage."""
 RECENT = 60.0
 """Seconds since the last write up to which a run without a lock counts as running."""
 
 State = Literal["running", "finished", "interrupted", "crashed", "unknown"]
-
-
-@dataclass(frozen=True, eq=False)
-class Episodes:
-    """Episodes of training, in the order in which they ended; arrays ``float64 (n_episodes,)``."""
-
-    step: np.ndarray
-    """Environment steps, over all environments, at the end of the episode; never decreases."""
-    env: np.ndarray
-    returns: np.ndarray
-    """NaN where the file had no finite number."""
-    length: np.ndarray
-    success: np.ndarray
-    """1 for a success, 0 for none, NaN where unknown."""
-    seconds: np.ndarray
-    """Training time at the end of the episode."""
-
-    def __len__(self) -> int:
-        return len(self.step)
-
-    @classmethod
-    def of(cls, table: Table) -> Episodes:
-        """Returns the episodes of a table with the columns of ``episodes.csv``."""
-        return cls(*(table.column(name) for name in ("step", "env", "return", "length", "success", "seconds")))
-
-
-NO_EPISODES = Episodes(*[np.zeros(0)] * 6)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -210,24 +182,6 @@ def read_run(path: str | Path, columns: Collection[str] | None = None) -> Run:
             minutes_asked=config.minutes,
         )
     return replace(run, state=state_of(run))
-
-
-def evaluation_table(evaluations: Iterable[tuple[int, Any]], episodes: Episodes = NO_EPISODES) -> Table:
-    """Returns evaluations as the table of a run, at the times that training episodes ended at.
-
-    Args:
-        evaluations: steps and :class:`rejeu.Evaluation`.
-        episodes: of training; without any the times are unknown.
-    """
-    pairs = list(evaluations)
-    steps = np.array([step for step, _ in pairs], np.float64)
-    results = [result for _, result in pairs]
-    names = ("success_rate", "mean_return", "std_return", "mean_length")
-    columns = {name: np.array([getattr(one, name) for one in results], np.float64) for name in names}
-    columns["episodes"] = np.array([len(one.returns) for one in results], np.float64)
-    if len(episodes):
-        columns["seconds"] = np.interp(steps, episodes.step, episodes.seconds)
-    return Table({"step": steps, **columns})
 
 
 def best_row(evaluations: Table) -> int | None:
@@ -383,12 +337,3 @@ def default_hyperparameters(algorithm: str, given: Mapping[str, Any] = MappingPr
     modules: Any = (*from_replay, a2c, ars, maskable_ppo, ppo, pqn, recurrent_ppo, trpo)
     kinds = {module.Config.name: module.Config for module in modules} | config.registered
     return config.to_json(kinds[algorithm](**given)) if algorithm in kinds else {}
-
-
-def flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yields the values of nested mappings by dotted name. A schedule is one value."""
-    for name, value in values.items():
-        if isinstance(value, Mapping) and value and not {"schedule", "noise"} & value.keys():
-            yield from flat(value, f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}", value

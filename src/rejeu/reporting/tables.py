@@ -6,10 +6,11 @@ import csv
 import io
 import os
 import stat
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -19,6 +20,8 @@ from rejeu.reporting.formatting import counted
 MAX_BYTES = 2**28
 """Upper limit on what is read of one table, in bytes; four million episodes fit."""
 MAX_COLUMNS = 512
+HUGE = 1e100
+"""Magnitude from which a return is taken for damage."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +42,60 @@ class Table:
 
 
 EMPTY = Table({})
+
+
+@dataclass(frozen=True, eq=False)
+class Episodes:
+    """Episodes of training, in the order in which they ended; arrays ``float64 (n_episodes,)``."""
+
+    step: np.ndarray
+    """Environment steps, over all environments, at the end of the episode; never decreases."""
+    env: np.ndarray
+    returns: np.ndarray
+    """NaN where the file had no finite number."""
+    length: np.ndarray
+    success: np.ndarray
+    """1 for a success, 0 for none, NaN where unknown."""
+    seconds: np.ndarray
+    """Training time at the end of the episode."""
+
+    def __len__(self) -> int:
+        return len(self.step)
+
+    @classmethod
+    def of(cls, table: Table) -> Episodes:
+        """Returns the episodes of a table with the columns of ``episodes.csv``."""
+        return cls(*(table.column(name) for name in ("step", "env", "return", "length", "success", "seconds")))
+
+
+NO_EPISODES = Episodes(*[np.zeros(0)] * 6)
+
+
+def evaluation_table(evaluations: Iterable[tuple[int, Any]], episodes: Episodes = NO_EPISODES) -> Table:
+    """Returns evaluations as the table of a run, at the times that training episodes ended at.
+
+    Args:
+        evaluations: steps and :class:`rejeu.Evaluation`.
+        episodes: of training; without any the times are unknown.
+    """
+    pairs = list(evaluations)
+    steps = np.array([step for step, _ in pairs], np.float64)
+    results = [result for _, result in pairs]
+    names = ("success_rate", "mean_return", "std_return", "mean_length")
+    columns = {name: np.array([getattr(one, name) for one in results], np.float64) for name in names}
+    columns["episodes"] = np.array([len(one.returns) for one in results], np.float64)
+    if len(episodes):
+        columns["seconds"] = np.interp(steps, episodes.step, episodes.seconds)
+    return Table({"step": steps, **columns})
+
+
+def flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yields the values of nested mappings by dotted name. A schedule is one value."""
+    for name, value in values.items():
+        if isinstance(value, Mapping) and value and not {"schedule", "noise"} & value.keys():
+            yield from flat(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value
 
 
 def read_bytes(path: Path, limit: int) -> bytes:

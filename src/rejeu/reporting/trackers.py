@@ -11,7 +11,7 @@ from types import MappingProxyType
 from typing import Any, Protocol, runtime_checkable
 
 from rejeu.errors import MissingExtra
-from rejeu.reporting.runs import flat
+from rejeu.reporting.tables import flat
 
 PROJECT = "rejeu"
 """Project or experiment where the environment variable of the tracker names none."""

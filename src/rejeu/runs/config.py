@@ -10,10 +10,7 @@ from __future__ import annotations
 import ast
 import dataclasses
 import json
-import os
 import platform
-import shlex
-import subprocess
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from importlib import metadata
@@ -27,6 +24,8 @@ from msgspec import Meta
 from rejeu.errors import CheckpointError
 from rejeu.io import atomic
 from rejeu.io.records import Duration, EnvCount, Malformed, Positive, Seed, convert, json_text, read_json, shown
+from rejeu.reporting.formatting import LOGS, quoted
+from rejeu.runs.folder import RunFolder, newest_inside
 from rejeu.validation import with_value
 
 
@@ -105,20 +104,9 @@ def written(what: Any) -> str:
     return what if isinstance(what, str) and value(what) == what else json.dumps(what, default=str)
 
 
-def quoted(word: object) -> str:
-    """Returns a word of a command line as it is typed: in quotes where the shell needs them.
-
-    >>> quoted("runs/first")
-    'runs/first'
-    """
-    return subprocess.list2cmdline([str(word)]) if os.name == "nt" else shlex.quote(str(word))
-
-
 R = TypeVar("R", bound="RunConfig")
 MAX_BYTES = 2**20
 """Upper limit on the size of a ``config.json``, and of the file of a task."""
-LOGS = ("csv", "json", "tensorboard", "wandb", "mlflow", "trackio")
-"""What the argument ``log`` takes."""
 MAX_EPISODES = 10_000
 """Upper limit on the episodes of an evaluation while training."""
 
@@ -366,6 +354,20 @@ def read(path: Path) -> DecidedRun:
         return convert(read_json(path, MAX_BYTES), DecidedRun)
     except (Malformed, CheckpointError) as error:
         raise CheckpointError(f"{path} is damaged: {shown(error, 1000)}") from None
+
+
+def read_folder(folder: RunFolder) -> DecidedRun:
+    """Returns what the ``config.json`` of a run says.
+
+    Raises:
+        FileNotFoundError: if it is not a run folder.
+        CheckpointError: if the file is damaged.
+    """
+    if not folder.config.is_file():
+        raise FileNotFoundError(
+            f"{folder.path} is no run folder: it holds no {folder.config.name}{newest_inside(folder.path)}"
+        )
+    return read(folder.config)
 
 
 def write(path: Path, config: DecidedRun) -> None:

@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from rejeu.io import checkpoint
-from rejeu.runs import config
-from rejeu.runs.config import DecidedRun, quoted
+from rejeu.reporting.formatting import quoted
 
 RUN_FILE = re.compile(r"run_(\d{12})\.safetensors")
 """Name of a checkpoint, with its environment step."""
@@ -62,20 +61,6 @@ class RunFolder:
 
     videos = File("videos")
     """Folder of videos of the policy during training."""
-
-
-def read_config(folder: RunFolder) -> DecidedRun:
-    """Returns what the ``config.json`` of a run says.
-
-    Raises:
-        FileNotFoundError: if it is not a run folder.
-        CheckpointError: if the file is damaged.
-    """
-    if not folder.config.is_file():
-        raise FileNotFoundError(
-            f"{folder.path} is no run folder: it holds no {folder.config.name}{newest_inside(folder.path)}"
-        )
-    return config.read(folder.config)
 
 
 def newest_inside(folder: Path) -> str:

@@ -18,8 +18,7 @@ from rejeu.loops.run import Episode
 from rejeu.reporting import charts, runs
 from rejeu.reporting.evaluation import Evaluation
 from rejeu.reporting.report import page, sections, write_report
-from rejeu.reporting.runs import Episodes
-from rejeu.reporting.tables import EMPTY, Table
+from rejeu.reporting.tables import EMPTY, Episodes, Table
 from tests.reporting.report.folders import CONFIG, EVIL, MP4, write, write_hostile
 
 

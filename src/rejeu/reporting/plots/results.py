@@ -13,8 +13,7 @@ from numpy.typing import ArrayLike
 
 from rejeu.reporting import charts
 from rejeu.reporting.plots import drawing
-from rejeu.reporting.runs import Episodes, evaluation_table
-from rejeu.reporting.tables import Table
+from rejeu.reporting.tables import Episodes, Table, evaluation_table
 from rejeu.validation import whole
 
 if TYPE_CHECKING:

@@ -7,36 +7,49 @@ computer only follows runs while they train.
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from threading import Lock
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
+from rejeu.agents.agent import Agent
+from rejeu.algorithms import config as configs
 from rejeu.io import atomic
+from rejeu.reporting.evaluation import Evaluation
 from rejeu.reporting.report import page, sections
 from rejeu.reporting.runs import CONFIG, EPISODES, EVALUATIONS, METRICS, WARNINGS, Run, read_run
+from rejeu.reporting.tables import Episodes, Table, evaluation_table
 
 MAX_RUNS = 50
 """Most runs of a page."""
 
 
-def write_report(runs: str | Path | Sequence[str | Path], out: str | Path | None = None) -> Path:
+def write_report(
+    runs: str | Path | Agent | Sequence[str | Path],
+    out: str | Path | None = None,
+    evaluations: Iterable[tuple[int, Evaluation]] = (),
+) -> Path:
     """Writes the report of one or several runs as one HTML page, and returns its path.
 
     Args:
-        runs: run folders.
+        runs: run folders, or an agent, whose training so far is shown.
         out: file to write; None for ``report.html`` in the folder of a single run, or in the current folder.
+        evaluations: of an agent: ``(step, Evaluation)`` pairs, such as ``Evaluate.results``.
 
     Raises:
         FileNotFoundError: if a folder does not exist, or holds nothing of a run.
         MissingExtra: if plotly or jinja2 is not installed.
         ValueError: for no run, or more than ``MAX_RUNS``.
     """
+    if isinstance(runs, Agent):
+        out = Path("report.html" if out is None else out)
+        return write_page([record(runs, out, [*evaluations])], out)
     paths = [Path(runs)] if isinstance(runs, str | Path) else [Path(run) for run in runs]
     if not 1 <= len(paths) <= MAX_RUNS:
         raise ValueError(f"a report shows 1 to {MAX_RUNS} runs, got {len(paths)}")
@@ -44,6 +57,34 @@ def write_report(runs: str | Path | Sequence[str | Path], out: str | Path | None
     if out is None:
         out = read[0].path / "report.html" if len(read) == 1 else Path("report.html")
     return write_page(read, Path(out))
+
+
+def record(agent: Agent, path: Path, evaluations: Sequence[tuple[int, Evaluation]]) -> Run:
+    """Returns the training of an agent so far as a run; ``path`` is only for its name."""
+    env = agent.run.env
+    history = agent.history
+    return Run(
+        path=path.absolute(),
+        name=path.stem,
+        algorithm=agent.name,
+        env_id="" if env is None else env.env_id,
+        seed=agent.seed,
+        n_envs=None if env is None else env.n_envs,
+        hyperparameters=configs.to_json(given_config(agent)),
+        state="running" if agent.is_learning else "finished",
+        steps=agent.run.step,
+        seconds=agent.seconds["total"],
+        episodes=Episodes.of(Table(history.to_dict())),
+        evaluations=evaluation_table(evaluations),
+    )
+
+
+def given_config(agent: Agent) -> Any:
+    """Returns the configuration of an agent without the widths of layers that follow from its observations."""
+    config = agent.config
+    default = type(config)()
+    is_default = config.policy_kwargs == configs.with_widths(default, agent.obs_leaves).policy_kwargs
+    return dataclasses.replace(config, policy_kwargs=default.policy_kwargs) if is_default else config
 
 
 def write_page(runs: Sequence[Run], out: Path) -> Path:

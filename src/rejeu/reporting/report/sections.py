@@ -20,10 +20,10 @@ import numpy as np
 
 from rejeu.io.records import shown
 from rejeu.reporting import charts as chart_data
-from rejeu.reporting.formatting import counted
-from rejeu.reporting.runs import MAX_WORD, Run, best_row, flat
-from rejeu.reporting.tables import read_bytes
-from rejeu.runs.config import RunConfig, quoted
+from rejeu.reporting.formatting import counted, quoted
+from rejeu.reporting.runs import MAX_WORD, Run, best_row
+from rejeu.reporting.tables import flat, read_bytes
+from rejeu.runs.config import RunConfig
 
 LAST = 100
 """Training episodes that stand in for a final evaluation."""

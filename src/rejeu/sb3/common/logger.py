@@ -23,8 +23,8 @@ from typing import Any, TextIO
 import numpy as np
 
 from rejeu.reporting import logging
+from rejeu.reporting.formatting import LOGS
 from rejeu.reporting.logging import TensorBoard, add_text, open_log
-from rejeu.runs.config import LOGS
 
 __all__ = [
     "DEBUG",
