@@ -11,13 +11,12 @@ import numpy as np
 import pytest
 
 import rejeu
-from rejeu.agents.training import record
 from rejeu.cli import main
 from rejeu.errors import MissingExtra
 from rejeu.loops.run import Episode
 from rejeu.reporting import charts, runs
 from rejeu.reporting.evaluation import Evaluation
-from rejeu.reporting.report import page, sections, write_report
+from rejeu.reporting.report import page, record, sections, write_report
 from rejeu.reporting.tables import EMPTY, Episodes, Table
 from tests.reporting.report.folders import CONFIG, EVIL, MP4, write, write_hostile
 
