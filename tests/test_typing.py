@@ -1,12 +1,17 @@
 """A script that uses the package type-checks: the package has ``py.typed``, and its lazy names are visible."""
 
+import ast
 import subprocess
 import sys
 import tempfile
 from importlib import resources
 from pathlib import Path
 
+from rejeu.agents import named
+from rejeu.algorithms.catalog import CATALOG
 from tests.tiers import exhaustive
+
+STUB = Path(named.__file__).with_suffix(".pyi")
 
 SCRIPT = """
 import gymnasium as gym
@@ -70,3 +75,10 @@ def test_a_script_type_checks_and_its_mistakes_are_found(tmp_path):
     assert 'Module has no attribute "SACC"' in errors[0]
     assert '"SAC" has no attribute "lern"' in errors[1]
     assert 'Revealed type is "rejeu.agents.off_policy.SAC"' in done.stdout
+
+
+def test_the_stub_of_the_named_agents_is_the_catalog():
+    classes = [one for one in ast.parse(STUB.read_text(encoding="utf-8")).body if isinstance(one, ast.ClassDef)]
+    stated = {one.name: (one.bases[0].id, ast.get_docstring(one)) for one in classes}
+    bases = {"replay": "OffPolicyAgent", "offline": "OffPolicyAgent", "rollout": "OnPolicyAgent"}
+    assert stated == {name: (bases[entry.kind], entry.summary) for name, entry in CATALOG.items()}

@@ -11,6 +11,7 @@ import importlib.util
 from typing import TYPE_CHECKING, Any
 
 from rejeu import interrupt
+from rejeu.algorithms.catalog import CATALOG
 
 if interrupt.is_command():  # which imports them when it makes an environment, and ends with one line until then
     interrupt.install(lambda number, frame: interrupt.leave(number))
@@ -20,32 +21,13 @@ else:
 if TYPE_CHECKING:
     import rejeu.sb3.common.vec_env.adapters  # noqa: F401
     from rejeu.agents import (
-        A2C as A2C,
         AGENTS as AGENTS,
-        ARS as ARS,
-        DDPG as DDPG,
-        DQN as DQN,
-        IQL as IQL,
-        IQN as IQN,
-        PPO as PPO,
-        PQN as PQN,
-        QRDQN as QRDQN,
-        SAC as SAC,
-        TD3 as TD3,
-        TD3BC as TD3BC,
-        TQC as TQC,
-        TRPO as TRPO,
-        XQC as XQC,
-        CrossQ as CrossQ,
-        FlashSAC as FlashSAC,
-        MaskablePPO as MaskablePPO,
         OffPolicyAgent as OffPolicyAgent,
         OnPolicyAgent as OnPolicyAgent,
-        ReBRAC as ReBRAC,
-        RecurrentPPO as RecurrentPPO,
         load as load,
         register as register,
     )
+    from rejeu.agents.named import *  # noqa: F403
     from rejeu.agents.together import train_seeds as train_seeds
     from rejeu.buffers.hindsight import (
         GoalSelectionStrategy as GoalSelectionStrategy,
@@ -89,8 +71,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _MODULES = {
-    "rejeu.agents": "A2C AGENTS ARS DDPG DQN IQL IQN PPO PQN QRDQN SAC TD3 TD3BC TQC TRPO XQC CrossQ FlashSAC MaskablePPO "
-    "OffPolicyAgent OnPolicyAgent ReBRAC RecurrentPPO load register",
+    "rejeu.agents": f"AGENTS OffPolicyAgent OnPolicyAgent load register {' '.join(CATALOG)}",
     "rejeu.agents.together": "train_seeds",
     "rejeu.buffers.hindsight": "GoalSelectionStrategy HerReplayBuffer",
     "rejeu.buffers.replay_memory": "ReplayMemory",

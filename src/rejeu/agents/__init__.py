@@ -15,23 +15,10 @@ import gymnasium as gym
 
 from rejeu import presets as all_presets
 from rejeu.agents.agent import Agent
-from rejeu.agents.off_policy import (
-    DDPG,
-    DQN,
-    IQL,
-    IQN,
-    QRDQN,
-    SAC,
-    TD3,
-    TD3BC,
-    TQC,
-    XQC,
-    CrossQ,
-    FlashSAC,
-    OffPolicyAgent,
-    ReBRAC,
-)
-from rejeu.agents.on_policy import A2C, ARS, PPO, PQN, TRPO, MaskablePPO, OnPolicyAgent, RecurrentPPO
+from rejeu.agents.named import *  # noqa: F403
+from rejeu.agents.named import BUILT_IN
+from rejeu.agents.off_policy import OffPolicyAgent
+from rejeu.agents.on_policy import OnPolicyAgent
 from rejeu.algorithms import config as configs
 from rejeu.callbacks.base import Callback
 from rejeu.errors import CheckpointError
@@ -42,31 +29,11 @@ from rejeu.runs.folder import find_model
 from rejeu.validation import whole_seed
 
 __all__ = [
-    "A2C",
     "AGENTS",
-    "ARS",
-    "DDPG",
-    "DQN",
-    "IQL",
-    "IQN",
-    "PPO",
-    "PQN",
-    "QRDQN",
-    "SAC",
-    "TD3",
-    "TD3BC",
-    "TQC",
-    "TRPO",
-    "XQC",
     "Agent",
     "Callback",
-    "CrossQ",
-    "FlashSAC",
-    "MaskablePPO",
     "OffPolicyAgent",
     "OnPolicyAgent",
-    "ReBRAC",
-    "RecurrentPPO",
     "agent_of_file",
     "find_agent",
     "load",
@@ -75,32 +42,7 @@ __all__ = [
     "whole_seed",
 ]
 
-
 A = TypeVar("A", bound=type[Agent])
-
-KINDS = (
-    SAC,
-    DDPG,
-    TD3,
-    DQN,
-    QRDQN,
-    IQN,
-    TQC,
-    CrossQ,
-    FlashSAC,
-    XQC,
-    PPO,
-    A2C,
-    RecurrentPPO,
-    MaskablePPO,
-    PQN,
-    TRPO,
-    ARS,
-    IQL,
-    TD3BC,
-    ReBRAC,
-)
-BUILT_IN: dict[str, type[Agent]] = {agent.algorithm.Config.name: agent for agent in KINDS}
 
 AGENTS: dict[str, type[Agent]] = dict(BUILT_IN)
 """Every agent by the name of its algorithm; :func:`register` adds to it."""

@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 class Agent(BaseAgent):
     """The base class of all agents. Abstract: use SAC, PPO or another algorithm."""
 
+    q_values = policy.q_values
+
     def learn(
         self,
         total_timesteps: int | None = None,

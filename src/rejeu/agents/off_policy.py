@@ -1,19 +1,17 @@
-"""Agents that learn from a replay buffer: SAC, DDPG, TD3, DQN, QR-DQN, TQC, CrossQ, FlashSAC, XQC, IQL, TD3+BC and ReBRAC."""
+"""What agents have in common that learn from a replay buffer."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import ModuleType
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
 
 from rejeu import spaces
-from rejeu.agents import model_files, policy
+from rejeu.agents import model_files
 from rejeu.agents.agent import Agent
-from rejeu.algorithms import crossq, ddpg, dqn, flashsac, iql, iqn, qrdqn, rebrac, sac, td3, td3_bc, tqc, xqc
 from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.buffers import ring_io
 from rejeu.buffers.hindsight import HerReplayBuffer, counters
@@ -98,8 +96,6 @@ class OffPolicyAgent(Agent):
     def _require_replay(self) -> None:
         if self.run.replay is None:
             raise ValueError("this agent has no environment and so no replay buffer; give one to load(path, env=...)")
-
-    q_values = policy.q_values
 
     def make_envs(
         self, env: Any, n_envs: int = 1, backend: Backend = "auto", seed: int | None = None, wait_for: int | None = None
@@ -223,81 +219,3 @@ class OffPolicyAgent(Agent):
                 f"{env.env_id} has none; add it, or use replay_buffer_class=None"
             )
         return goals
-
-
-class SAC(OffPolicyAgent):
-    """Soft actor-critic (Haarnoja et al. 2018), for Box and Discrete actions, and Dict and Tuple of any kind."""
-
-    algorithm: ClassVar[ModuleType] = sac
-
-
-class DDPG(OffPolicyAgent):
-    """Deep deterministic policy gradient (Lillicrap et al. 2015), for continuous and Discrete actions."""
-
-    algorithm: ClassVar[ModuleType] = ddpg
-
-
-class TD3(OffPolicyAgent):
-    """Twin delayed DDPG (Fujimoto et al. 2018), for continuous actions."""
-
-    algorithm: ClassVar[ModuleType] = td3
-
-
-class DQN(OffPolicyAgent):
-    """Deep Q-learning (Mnih et al. 2015), for Discrete actions; with the parts of Rainbow, C51 among them, by option."""
-
-    algorithm: ClassVar[ModuleType] = dqn
-
-
-class QRDQN(OffPolicyAgent):
-    """Quantile regression DQN (Dabney et al. 2018), for Discrete actions."""
-
-    algorithm: ClassVar[ModuleType] = qrdqn
-
-
-class IQN(OffPolicyAgent):
-    """Implicit quantile networks (Dabney et al. 2018), for Discrete actions."""
-
-    algorithm: ClassVar[ModuleType] = iqn
-
-
-class TQC(OffPolicyAgent):
-    """Truncated quantile critics (Kuznetsov et al. 2020), for continuous actions."""
-
-    algorithm: ClassVar[ModuleType] = tqc
-
-
-class CrossQ(OffPolicyAgent):
-    """SAC with batch renormalization instead of target networks (Bhatt et al. 2024), for continuous actions."""
-
-    algorithm: ClassVar[ModuleType] = crossq
-
-
-class FlashSAC(OffPolicyAgent):
-    """SAC through normalized, projected networks and categorical critics (Kim et al. 2026), for continuous actions."""
-
-    algorithm: ClassVar[ModuleType] = flashsac
-
-
-class XQC(OffPolicyAgent):
-    """SAC through batch-normalized, projected layers and categorical critics (Palenicek et al. 2026), likewise."""
-
-    algorithm: ClassVar[ModuleType] = xqc
-
-
-class IQL(OffPolicyAgent):
-    """Implicit Q-learning from recorded episodes (Kostrikov et al. 2022), for continuous actions."""
-
-    algorithm: ClassVar[ModuleType] = iql
-
-
-class TD3BC(OffPolicyAgent):
-    """TD3 with behavior cloning, from recorded episodes (Fujimoto & Gu 2021), for continuous actions."""
-
-    algorithm: ClassVar[ModuleType] = td3_bc
-
-
-class ReBRAC(OffPolicyAgent):
-    """TD3 with penalties on actor and critic, from recorded episodes (Tarasov et al. 2023), for continuous actions."""
-
-    algorithm: ClassVar[ModuleType] = rebrac

@@ -1,10 +1,9 @@
-"""Agents that learn from rollouts of their current policy: PPO, RecurrentPPO, MaskablePPO, TRPO, A2C, PQN and ARS."""
+"""What agents have in common that learn from rollouts of their current policy."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from types import ModuleType
-from typing import Any, ClassVar
+from typing import Any
 
 import jax
 import numpy as np
@@ -12,7 +11,6 @@ import numpy as np
 from rejeu import devices, spaces
 from rejeu.agents import policy
 from rejeu.agents.agent import Agent
-from rejeu.algorithms import a2c, ars, maskable_ppo, ppo, pqn, recurrent_ppo, trpo
 from rejeu.algorithms.rollout_config import RolloutConfig
 from rejeu.buffers.rollout import RolloutBuffer
 from rejeu.envs.make import Backend, VectorEnv, make_vector
@@ -114,47 +112,3 @@ class OnPolicyAgent(Agent):
         if run.replay is not None and run.replay.length:
             run.replay.length = 0
             run.obs = run.action = None
-
-
-class PPO(OnPolicyAgent):
-    """Proximal policy optimization (Schulman et al. 2017), for Box, Discrete, MultiDiscrete and MultiBinary actions."""
-
-    algorithm: ClassVar[ModuleType] = ppo
-
-
-class A2C(OnPolicyAgent):
-    """Advantage actor-critic (Mnih et al. 2016), for Box, Discrete, MultiDiscrete and MultiBinary actions."""
-
-    algorithm: ClassVar[ModuleType] = a2c
-
-
-class TRPO(OnPolicyAgent):
-    """Trust region policy optimization (Schulman et al. 2015), for Box, Discrete, MultiDiscrete and MultiBinary actions."""
-
-    algorithm: ClassVar[ModuleType] = trpo
-
-
-class ARS(OnPolicyAgent):
-    """Augmented random search (Mania et al. 2018), without gradients, for Box and Discrete actions."""
-
-    algorithm: ClassVar[ModuleType] = ars
-
-
-class RecurrentPPO(OnPolicyAgent):
-    """PPO with an LSTM or GRU before the hidden layers, for partially observable environments."""
-
-    algorithm: ClassVar[ModuleType] = recurrent_ppo
-
-
-class MaskablePPO(OnPolicyAgent):
-    """PPO with ``action_masks=True``: masks of the allowed actions, from the environment (Huang and Ontanon 2022)."""
-
-    algorithm: ClassVar[ModuleType] = maskable_ppo
-
-
-class PQN(OnPolicyAgent):
-    """Parallelized Q-network (Gallici et al. 2024), Q-learning from rollouts for Discrete actions."""
-
-    algorithm: ClassVar[ModuleType] = pqn
-
-    q_values = policy.q_values

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import ast
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 from rejeu import presets
+from rejeu.algorithms.catalog import CATALOG
 from rejeu.cli.commands import List
 from rejeu.presets import Preset
-
-FOLDER = Path(presets.__file__).parents[1] / "agents"
 
 
 def run_list(arguments: List) -> tuple[int, dict[str, Any]]:
@@ -51,10 +48,7 @@ def described(is_extended: bool) -> dict[str, str]:
         from rejeu.agents import AGENTS
 
         return {name: (agent.__doc__ or "").partition("\n")[0] for name, agent in AGENTS.items()}
-    texts = [(FOLDER / f"{kind}_policy.py").read_text("utf-8") for kind in ("off", "on")]
-    classes = [one for text in texts for one in ast.parse(text).body if isinstance(one, ast.ClassDef)]
-    docs = {one.name: (ast.get_docstring(one) or "").partition("\n")[0] for one in classes}
-    return {name: text for name, text in docs.items() if not name.endswith("Agent")}
+    return {name: entry.summary for name, entry in CATALOG.items()}
 
 
 def as_dict(preset: Preset) -> dict[str, Any]:

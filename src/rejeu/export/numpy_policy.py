@@ -11,6 +11,7 @@ import numpy as np
 from gymnasium.spaces import Box, Discrete, MultiBinary, MultiDiscrete
 
 from rejeu import spaces
+from rejeu.algorithms.catalog import CATALOG
 from rejeu.errors import CheckpointError
 from rejeu.io import checkpoint
 from rejeu.runs.folder import find_model
@@ -29,15 +30,6 @@ ACTIVATIONS: dict[str, Function] = {
     "leakyrelu": lambda x: np.where(x >= 0, x, 0.01 * x),
     "sigmoid": lambda x: 1.0 / (1.0 + np.exp(-x)),
 }
-PROJECTED = ("FlashSAC", "XQC")
-SQUASHED = ("SAC", "TQC", "CrossQ", "TD3", "TD3BC", "ReBRAC", "DDPG", "IQL", *PROJECTED)
-ACTORS = {
-    **dict.fromkeys(("PPO", "A2C", "TRPO", "MaskablePPO", "DQN", "IQN", "PQN"), "network"),
-    **dict.fromkeys(SQUASHED, "actor"),
-    "QRDQN": "network.outputs",
-    **dict.fromkeys(("ARS", "IQL"), "actor.network"),
-}
-"""Where the policy's network is in the state of each algorithm."""
 WRONG = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
 
 
@@ -57,7 +49,7 @@ class NumpyPolicy:
         self._encoders = [encoder(leaf, scale) for leaf, scale in zip(self._leaves, scaled, strict=True)]
         self._shape = config["policy_kwargs"]
         n_outputs = _count(config, "n_quantiles") if name == "QRDQN" else None
-        prefix = ACTORS[name]
+        prefix = CATALOG[name].actor
         if config.get("distribution") == "categorical":
             prefix, n_outputs = "network.outputs", _count(config, "n_atoms")
         hidden = self._torso(f"{prefix}.torso")
@@ -80,7 +72,7 @@ class NumpyPolicy:
             hidden.append(lambda x: x.mean(axis=-2))
         self._steps = hidden
         self.takes_masks = config.get("action_masks", name == "MaskablePPO")
-        is_squashed = name in SQUASHED or (
+        is_squashed = CATALOG[name].is_squashed or (
             len(hidden) > 1 if name == "ARS" else self._shape.get("squash_output", False)
         )
         self._choose = chooser(self.action_space, is_squashed)
@@ -197,7 +189,7 @@ class NumpyPolicy:
 
     def _linear(self, prefix: str) -> Function:
         weight = self._arrays[f"{prefix}.weight"]
-        if self._name in PROJECTED and not prefix.endswith(".head"):
+        if CATALOG[self._name].is_projected and not prefix.endswith(".head"):
             return lambda x: x @ weight
         bias = self._arrays[f"{prefix}.bias"]
         return lambda x: x @ weight + bias
@@ -316,9 +308,9 @@ def load_policy(path: str | Path) -> NumpyPolicy:
     to_do = "export it with rejeu export --to onnx"
     with checkpoint.opened(find_model(path), "agent") as file:
         name = file.header.get("algorithm")
-        prefix = ACTORS.get(name) if isinstance(name, str) else None
+        prefix = CATALOG[name].actor if isinstance(name, str) and name in CATALOG else ""
         prefixes = [f"{before}{prefix}." for before in ("", "learner.", "learner.learner.")]
-        if prefix is None or any(key.startswith(f"{one}encoder.") for one in prefixes for key in file.specs):
+        if not prefix or any(key.startswith(f"{one}encoder.") for one in prefixes for key in file.specs):
             raise CheckpointError(
                 f"{file.path}: the policy of {str(name)[:40]} has images, memory or modules of your own, which NumPy cannot "
                 f"act with; {to_do}"

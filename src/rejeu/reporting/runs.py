@@ -21,6 +21,7 @@ import numpy as np
 from filelock import FileLock, Timeout
 
 from rejeu import presets
+from rejeu.algorithms.catalog import CATALOG
 from rejeu.errors import CheckpointError
 from rejeu.io.records import Malformed, convert, is_deep, parse_json, shown
 from rejeu.reporting.formatting import quoted
@@ -309,31 +310,9 @@ def is_file(path: Path) -> bool:
 
 def default_hyperparameters(algorithm: str, given: Mapping[str, Any] = MappingProxyType({})) -> dict[str, Any]:
     """Returns ``given`` and the defaults of an algorithm as JSON values; empty if it is neither rejeu's nor registered."""
-    from rejeu.algorithms import (
-        a2c,
-        ars,
-        config,
-        crossq,
-        ddpg,
-        dqn,
-        flashsac,
-        iql,
-        iqn,
-        maskable_ppo,
-        ppo,
-        pqn,
-        qrdqn,
-        rebrac,
-        recurrent_ppo,
-        sac,
-        td3,
-        td3_bc,
-        tqc,
-        trpo,
-        xqc,
-    )
+    from rejeu.algorithms import config
 
-    from_replay = (crossq, ddpg, dqn, flashsac, iql, iqn, qrdqn, rebrac, sac, td3, td3_bc, tqc, xqc)
-    modules: Any = (*from_replay, a2c, ars, maskable_ppo, ppo, pqn, recurrent_ppo, trpo)
-    kinds = {module.Config.name: module.Config for module in modules} | config.registered
+    kinds = dict(config.registered)
+    if algorithm in CATALOG:
+        kinds[algorithm] = CATALOG[algorithm].load().Config
     return config.to_json(kinds[algorithm](**given)) if algorithm in kinds else {}
