@@ -18,7 +18,7 @@ from __future__ import annotations
 import os
 import re
 import shutil
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
@@ -148,19 +148,6 @@ def again(jobs: Iterable[Job], typed: RunConfig) -> str:
     """
     run = next((job.run for job in jobs if job.run.names_code), RunConfig(env="plain"))
     return replace(run, imports=typed.imports).again()
-
-
-def flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yields the values of a nested mapping by dotted name.
-
-    >>> dict(flat({"gamma": 0.9, "policy_kwargs": {"net_arch": [8]}}))
-    {'gamma': 0.9, 'policy_kwargs.net_arch': [8]}
-    """
-    for key, value in values.items():
-        if isinstance(value, Mapping) and value:
-            yield from flat(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
 
 
 def job_name(*parts: object) -> str:

@@ -21,9 +21,10 @@ from rejeu import devices, presets, spaces
 from rejeu.agents import AGENTS, choose_algorithm, find_agent, find_preset
 from rejeu.envs.make import BACKENDS, make_vector
 from rejeu.envs.registry import are_plain, is_plain_id, maker, register
-from rejeu.experiments.folder import FILES, MAX_JOBS, Job, Resources, flat, job_name
+from rejeu.experiments.folder import FILES, MAX_JOBS, Job, Resources, job_name
 from rejeu.io.records import Seed, convert, shown
 from rejeu.reporting.logging import check_logs, require
+from rejeu.reporting.tables import flat
 from rejeu.runs.config import RunConfig, merged, options
 from rejeu.validation import build, check_names, choice, field_names
 

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from rejeu.algorithms.catalog import CATALOG
 from rejeu.errors import MissingExtra
 from rejeu.io.records import Malformed, parse_json, shown
 from rejeu.reporting.formatting import counted
@@ -149,10 +150,7 @@ MONITOR = re.compile(r"(.*\.)?monitor\.csv")
 EVENTS = re.compile(r"events\.out\.tfevents\..+")
 FILES = (MONITOR, EVENTS)
 ZOO_NAME = re.compile(r"(.+-v\d+)_(\d+)")
-ALGORITHMS = {
-    name.lower(): name for name in ("A2C", "ARS", "CrossQ", "DDPG", "DQN", "HER", "PPO", "QRDQN", "SAC", "TD3")
-}
-ALGORITHMS |= {"ppo_lstm": "RecurrentPPO", "tqc": "TQC", "trpo": "TRPO"}
+ALGORITHMS = {name.lower(): name for name in CATALOG} | {"her": "HER", "ppo_lstm": "RecurrentPPO"}
 """Algorithms by the names of RL Zoo's folders."""
 MAX_FILES = 4096
 """Upper limit on the files of one run."""

@@ -90,7 +90,11 @@ def evaluation_table(evaluations: Iterable[tuple[int, Any]], episodes: Episodes 
 
 
 def flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yields the values of nested mappings by dotted name. A schedule is one value."""
+    """Yields the values of nested mappings by dotted name. A schedule is one value.
+
+    >>> dict(flat({"gamma": 0.9, "policy_kwargs": {"net_arch": [8]}}))
+    {'gamma': 0.9, 'policy_kwargs.net_arch': [8]}
+    """
     for name, value in values.items():
         if isinstance(value, Mapping) and value and not {"schedule", "noise"} & value.keys():
             yield from flat(value, f"{prefix}{name}.")
