@@ -14,33 +14,17 @@ from typing import Any, TypeVar
 import gymnasium as gym
 
 from rejeu import presets as all_presets
-from rejeu.agents.agent import Agent
+from rejeu.agents.agent import Agent as Agent
 from rejeu.agents.named import *  # noqa: F403
 from rejeu.agents.named import BUILT_IN
-from rejeu.agents.off_policy import OffPolicyAgent
-from rejeu.agents.on_policy import OnPolicyAgent
+from rejeu.agents.off_policy import OffPolicyAgent as OffPolicyAgent
+from rejeu.agents.on_policy import OnPolicyAgent as OnPolicyAgent
 from rejeu.algorithms import config as configs
-from rejeu.callbacks.base import Callback
 from rejeu.errors import CheckpointError
 from rejeu.io import checkpoint
 from rejeu.io.records import shown
 from rejeu.presets import Preset
 from rejeu.runs.folder import find_model
-from rejeu.validation import whole_seed
-
-__all__ = [
-    "AGENTS",
-    "Agent",
-    "Callback",
-    "OffPolicyAgent",
-    "OnPolicyAgent",
-    "agent_of_file",
-    "find_agent",
-    "load",
-    "modules_of",
-    "register",
-    "whole_seed",
-]
 
 A = TypeVar("A", bound=type[Agent])
 
