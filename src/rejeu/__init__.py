@@ -19,7 +19,6 @@ else:
     importlib.import_module("rejeu.envs")  # registers rejeu's environments
 
 if TYPE_CHECKING:
-    import rejeu.sb3.common.vec_env.adapters  # noqa: F401
     from rejeu.agents import (
         AGENTS as AGENTS,
         OffPolicyAgent as OffPolicyAgent,
@@ -66,6 +65,7 @@ if TYPE_CHECKING:
     from rejeu.reporting.video import record_video as record_video, show_videos as show_videos
     from rejeu.sb3.common.evaluation import evaluate_policy as evaluate_policy
     from rejeu.sb3.common.monitor import Monitor as Monitor
+    from rejeu.sb3.common.vec_env.adapters import to_vec_env as to_vec_env
     from rejeu.schedules import Exponential as Exponential, Linear as Linear
 
 __version__ = "0.1.0"
@@ -81,6 +81,7 @@ _MODULES = {
     "rejeu.envs.make": "make_vec make_vector",
     "rejeu.sb3.common.evaluation": "evaluate_policy",
     "rejeu.sb3.common.monitor": "Monitor",
+    "rejeu.sb3.common.vec_env.adapters": "to_vec_env",
     "rejeu.envs.wrappers": "FlatGoals OldEnvironment TimeLimitTerminates",
     "rejeu.errors": "BadEnvironmentError CheckpointError MissingExtra NonFiniteError RunInUseError WorkerError",
     "rejeu.export.numpy_policy": "load_policy",

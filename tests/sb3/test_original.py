@@ -239,6 +239,7 @@ def test_the_rollout_of_an_agent_has_its_values_and_advantages_also_right_after_
 
     def look(known, names):
         sizes.append(known["self"].rollout_buffer.size())
+        return True
 
     agent = sb3.A2C("MlpPolicy", gym.make("CartPole-v1"), n_steps=8, gae_lambda=0.5, learning_rate=0.0, seed=0, **SMALL)
     agent.learn(16, callback=look)

@@ -306,7 +306,7 @@ class Agent(BaseAgent):
         if env.venv is None:
             import rejeu  # whose wings the library does not import
 
-            env.venv = rejeu.sb3.common.vec_env.adapters.to_vec_env(env)
+            env.venv = rejeu.to_vec_env(env)
         return env.venv
 
     def set_logger(self, logger: Logger) -> None:
