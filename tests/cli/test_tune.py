@@ -50,6 +50,7 @@ def test_a_terminal_shows_the_trials_that_run(pretend, tmp_path, capsys, monkeyp
     from rich.console import Console
 
     monkeypatch.setattr(Console, "is_terminal", True)
+    monkeypatch.setattr("rejeu.experiments.sweep.REFRESH", 0.0)
     assert tune("--trials", "2", "--final-seeds", "0", out=tmp_path / "study") == 0
     printed = capsys.readouterr().out
     assert "1 of 2 trials have ended, best return" in printed
