@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from rejeu import courses
+from rejeu.teaching import courses
 from trials.provenance import provenance, write
 
 RESULT = Path(__file__).parent / "results" / "course.json"

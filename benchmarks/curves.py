@@ -19,10 +19,11 @@ from typing import Any
 import numpy as np
 
 import rejeu
-from rejeu import presets, validation
+from rejeu.agents import presets
 from rejeu.algorithms import config as configs
+from rejeu.core import validation
 from rejeu.envs import make_vector
-from rejeu.reporting.plots import drawing as style
+from rejeu.logs.plots import drawing as style
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks import learning

@@ -30,7 +30,7 @@ import gymnasium as gym
 import numpy as np
 
 import rejeu
-from rejeu import presets
+from rejeu.agents import presets
 from rejeu.callbacks import Evaluate
 from rejeu.demonstrations import Demonstrations, clone, dagger, learn_offline, read, record
 

@@ -84,8 +84,8 @@ def child(name: str, kind: str, n_envs: int, n_seeds: int, seconds: float) -> di
     import jax
 
     import rejeu
-    from rejeu import xla
     from rejeu.agents.together import train_seeds
+    from rejeu.core import xla
 
     case, begun = CASES[name], time.perf_counter()
     policy = "MultiInputPolicy" if "arking" in case.env else "MlpPolicy"

@@ -31,7 +31,7 @@ from rejeu.envs.envpool import envpool_knows
 from rejeu.envs.functional import FunctionalEnv, make
 from rejeu.envs.functional.vector import VectorState, reset_all, reset_done, step_all
 from rejeu.envs.make import make_vector
-from rejeu.runs.config import versions
+from rejeu.lab.runs.config import versions
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from trials.provenance import machine, provenance, write

@@ -21,12 +21,13 @@ import jax
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from rejeu import load_policy, spaces
+from rejeu import load_policy
 from rejeu.agents import Agent, exporting
-from rejeu.errors import CheckpointError
+from rejeu.core import spaces
+from rejeu.core.errors import CheckpointError
 from rejeu.export import check
 from rejeu.export.check import Run
-from rejeu.runs.config import versions
+from rejeu.lab.runs.config import versions
 from tests.export.policies import KINDS, agent_of
 from trials.provenance import machine, provenance, write
 

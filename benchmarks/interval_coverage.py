@@ -3,12 +3,12 @@
     python benchmarks/interval_coverage.py
 
 Scores are of a normal distribution with mean 0. Each of 10,000 groups of ``n`` runs gets the interval that ``rejeu compare``
-computes, with 1,000 bootstrap samples. ``rejeu.reporting.statistics.COVERAGE`` holds the shares.
+computes, with 1,000 bootstrap samples. ``rejeu.logs.statistics.COVERAGE`` holds the shares.
 """
 
 import numpy as np
 
-from rejeu.reporting import statistics
+from rejeu.logs import statistics
 
 GROUPS, SAMPLES, AT_ONCE = 10_000, 1_000, 500
 

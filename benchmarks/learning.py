@@ -38,12 +38,13 @@ from gymnasium.wrappers import TransformObservation
 from scipy import stats
 
 import rejeu
-from rejeu import presets, validation
+from rejeu.agents import presets
 from rejeu.algorithms import config as configs
 from rejeu.callbacks import Evaluate
+from rejeu.core import validation
+from rejeu.core.records import convert
 from rejeu.envs import make_vector
 from rejeu.envs.make import VectorEnv
-from rejeu.io.records import convert
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from trials.provenance import machine, provenance

@@ -19,14 +19,14 @@ import jax.numpy as jnp
 from jax import Array
 
 import rejeu
+from rejeu.agents.presets import Preset
 from rejeu.algorithms import optimizers
 from rejeu.algorithms.config import OffPolicyConfig
-from rejeu.core import AVERAGED, TD_ERROR, PyTree, copy, descend, ensemble, minimize, polyak, weighted_mean
-from rejeu.distributions import Normal
+from rejeu.core.algorithm import AVERAGED, TD_ERROR, PyTree, copy, descend, ensemble, minimize, polyak, weighted_mean
+from rejeu.core.distributions import Normal
+from rejeu.core.schedules import at
+from rejeu.core.spaces import action_dimension, check_box_action, leaves
 from rejeu.networks import Network, QNetwork, action_values
-from rejeu.presets import Preset
-from rejeu.schedules import at
-from rejeu.spaces import action_dimension, check_box_action, leaves
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,8 +10,8 @@ import optax
 
 import rejeu
 from rejeu.algorithms import dqn
+from rejeu.core.spaces import leaves
 from rejeu.networks import Network, PolicyConfig
-from rejeu.spaces import leaves
 
 
 def train_from_parts(episodes, seed=0, epsilon=(0.9, 0.01), copy_every=10):

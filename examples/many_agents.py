@@ -16,7 +16,7 @@ import numpy as np
 import optax
 
 from rejeu.algorithms import pqn
-from rejeu.core import Clock, Rollout
+from rejeu.core.algorithm import Clock, Rollout
 from rejeu.envs.functional import make
 from rejeu.envs.functional.vector import reset_all, reset_done, step_all
 

@@ -7,7 +7,7 @@ import numpy as np
 
 import rejeu
 from rejeu.agents import Agent
-from rejeu.loops.run import Progress
+from rejeu.training.run import Progress
 
 
 def watch_returns(agent: Agent, progress: Progress) -> bool:

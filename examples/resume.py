@@ -7,7 +7,7 @@ import numpy as np
 import rejeu
 from rejeu.agents import Agent
 from rejeu.callbacks import Checkpoint
-from rejeu.loops.run import Progress
+from rejeu.training.run import Progress
 
 STEPS, INTERRUPTED_AT = 2_000, 50
 

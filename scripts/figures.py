@@ -1,6 +1,6 @@
 """Writes every figure of the README and the documentation from the measured data.
 
-    python scripts/figures.py            # updates src/rejeu/presets/results.json and the marked blocks of the pages
+    python scripts/figures.py            # updates src/rejeu/agents/presets/results.json and the marked blocks of the pages
     python scripts/figures.py --check    # changes nothing; exits with 1 if something is out of date
 
 A marked block starts with ``<!-- figures: NAME ARGUMENTS -->`` and ends with ``<!-- end of figures -->``. The data is
@@ -29,19 +29,19 @@ sys.path[:0] = [str(ROOT), str(ROOT / "src")]
 
 from benchmarks.bench.summary import best, by_round, ratio, step_seconds  # noqa: E402
 from benchmarks.bench.text import table, times  # noqa: E402
-from rejeu import presets, schedules, validation  # noqa: E402
-from rejeu.agents import AGENTS  # noqa: E402
+from rejeu.agents import AGENTS, presets  # noqa: E402
+from rejeu.agents.presets import Result  # noqa: E402
 from rejeu.algorithms import dqn, ppo  # noqa: E402
 from rejeu.algorithms.actor_critic import OnPolicyConfig  # noqa: E402
 from rejeu.algorithms.config import OffPolicyConfig  # noqa: E402
 from rejeu.algorithms.rollout_config import RolloutConfig  # noqa: E402
 from rejeu.algorithms.sac import continuous as sac  # noqa: E402
+from rejeu.core import schedules, validation  # noqa: E402
 from rejeu.envs.masks import n_choices  # noqa: E402
-from rejeu.presets import Result  # noqa: E402
 from scripts import sb3_parity  # noqa: E402
 
 DATA = ROOT / "benchmarks" / "results"
-PRESET_RESULTS = ROOT / "src" / "rejeu" / "presets" / "results.json"
+PRESET_RESULTS = ROOT / "src" / "rejeu" / "agents" / "presets" / "results.json"
 PAGES = [
     ROOT / "README.md",
     *(page for name in ("benchmarks", "docs", "trials") for page in sorted((ROOT / name).rglob("*.md"))),

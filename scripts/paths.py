@@ -25,10 +25,10 @@ import gymnasium as gym
 import numpy as np
 
 import rejeu
-from rejeu import cli
-from rejeu.loops.device import Stops, train_one
-from rejeu.loops.off_policy import off_policy
-from rejeu.loops.on_policy import on_policy
+from rejeu.lab import cli
+from rejeu.training.compiled import Stops, train_one
+from rejeu.training.off_policy import off_policy
+from rejeu.training.on_policy import on_policy
 
 PACKAGE = Path(rejeu.__file__).parent
 DESIGN = PACKAGE.parent.parent / "docs" / "design.md"

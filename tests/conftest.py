@@ -81,10 +81,10 @@ def strict_dtypes() -> Iterator[None]:
 def forget_registered() -> Iterator[None]:
     """Removes what a test registered, for example with a page of the docs: algorithms, presets, encoders and so on."""
     import rejeu
-    from rejeu import presets
-    from rejeu.buffers.hindsight import STRATEGIES
+    from rejeu.agents import presets
     from rejeu.envs.functional import REGISTRY
     from rejeu.networks.layers import ENCODERS
+    from rejeu.replay.hindsight import STRATEGIES
 
     registries: tuple[dict[str, Any], ...] = (rejeu.AGENTS, presets.registered, REGISTRY, STRATEGIES, ENCODERS)
     before = [dict(registry) for registry in registries]

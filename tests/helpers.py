@@ -9,7 +9,7 @@ import numpy as np
 
 import rejeu
 from rejeu.agents import Agent
-from rejeu.loops.learner import Readings
+from rejeu.training.learner import Readings
 from tests.sharing import shared_learners
 
 

@@ -8,9 +8,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from rejeu import play as play_package
-from rejeu.cli import main
-from rejeu.play.window import Window
+from rejeu.lab.cli import main
+from rejeu.teaching import play as play_package
+from rejeu.teaching.play.window import Window
 
 pygame = pytest.importorskip("pygame")
 

@@ -14,8 +14,8 @@ import gymnasium as gym
 import numpy as np
 from hypothesis import strategies as st
 
-from rejeu import spaces
-from rejeu.buffers.ring import Ring
+from rejeu.core import spaces
+from rejeu.replay.ring import Ring
 
 
 @dataclass

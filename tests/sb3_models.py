@@ -11,12 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 from gymnasium import spaces
 
-from rejeu import normalization
+from rejeu.agents.zip_files import load_zip
 from rejeu.algorithms.sac.continuous import policy as squashed_normal
-from rejeu.core import Masked
-from rejeu.distributions import Normal, TanhNormal
-from rejeu.sb3.zip_files import load_zip
-from rejeu.spaces import groups, unscale_action
+from rejeu.core import normalization
+from rejeu.core.algorithm import Masked
+from rejeu.core.distributions import Normal, TanhNormal
+from rejeu.core.spaces import groups, unscale_action
 
 
 def loaded(path: Path) -> Any:

@@ -15,10 +15,10 @@ from unittest import mock
 
 import gymnasium as gym
 
-from rejeu import spaces
 from rejeu.agents import Agent, base
 from rejeu.algorithms.config import OffPolicyConfig
-from rejeu.loops.learner import Learner
+from rejeu.core import spaces
+from rejeu.training.learner import Learner
 
 READ_ELSEWHERE = ("learning_starts", "buffer_size", "train_freq", "gradient_steps", "n_steps")
 """Settings of off-policy algorithms that only the loop and the replay buffer use."""

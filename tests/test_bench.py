@@ -203,7 +203,7 @@ def test_the_count_of_an_update_is_that_by_hand_and_what_is_elementwise():
 
 
 def test_the_benchmarks_full_ring_is_one_that_episodes_would_have_made():
-    from rejeu.buffers.ring import Ring
+    from rejeu.replay.ring import Ring
 
     ring = buffers.rejeu_ring("parking", 505)
     played = Ring(505, 1, ring.obs_leaves, ring.obs_structure, (2,), np.float32, counters=("until_end",))

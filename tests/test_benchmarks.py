@@ -7,7 +7,7 @@ import pytest
 
 import rejeu
 from benchmarks import learning
-from rejeu.validation import build
+from rejeu.core.validation import build
 
 ZOO = [(one["env_id"], one["algorithm"]) for one in tomllib.loads(learning.ZOO.read_text("utf-8"))["preset"]]
 

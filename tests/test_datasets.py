@@ -18,10 +18,10 @@ import pytest
 from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Tuple
 
 from rejeu import demonstrations
+from rejeu.core.errors import CheckpointError
+from rejeu.core.spaces import same
 from rejeu.demonstrations import dataset
 from rejeu.demonstrations.recording import Recording
-from rejeu.errors import CheckpointError
-from rejeu.spaces import same
 from tests.full_disk import FullDisk
 
 h5py = pytest.importorskip("h5py")
@@ -388,8 +388,8 @@ def test_a_clone_imports_no_environment_that_a_dataset_names(
     env_id: str, kwargs: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Gymnasium imports what an id has before a colon."""
-    from rejeu.cli.clone import environment_of
-    from rejeu.cli.commands import Clone
+    from rejeu.lab.cli.clone import environment_of
+    from rejeu.lab.cli.commands import Clone
 
     (tmp_path / "rejeu_test_evil.py").write_text("raise SystemExit('code of a file was run')")
     monkeypatch.syspath_prepend(tmp_path)

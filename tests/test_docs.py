@@ -22,11 +22,12 @@ import gymnasium
 import pytest
 
 import rejeu
-from rejeu import cli, validation
 from rejeu.algorithms import ppo, sac
-from rejeu.experiments import process
-from rejeu.experiments.plan import read_plan
-from rejeu.runs.config import apply
+from rejeu.core import validation
+from rejeu.lab import cli
+from rejeu.lab.experiments import process
+from rejeu.lab.experiments.plan import read_plan
+from rejeu.lab.runs.config import apply
 from rejeu.sb3 import load_zip
 from tests.sb3_models import MadeUp
 from tests.tiers import only
@@ -142,7 +143,7 @@ PREPARATIONS = {
 def trainings_pretend(monkeypatch):
     """Lets the trainings of a study run a program that pretends."""
     pytest.importorskip("optuna")
-    fake = Path(__file__).parent / "experiments" / "fake_training.py"
+    fake = Path(__file__).parent / "lab" / "experiments" / "fake_training.py"
     monkeypatch.setattr(process, "program", lambda task: [sys.executable, "-S", str(fake), str(task)])
 
 
@@ -150,8 +151,8 @@ def trainings_pretend(monkeypatch):
 def windows_close(monkeypatch):
     """Closes each window after some turns."""
     pygame = pytest.importorskip("pygame")
-    from rejeu import play as package
-    from rejeu.play.window import Window
+    from rejeu.teaching import play as package
+    from rejeu.teaching.play.window import Window
 
     real, count = package.turn, [0]
 
@@ -236,9 +237,9 @@ def test_links_to_the_source_name_definitions():
 
 def test_a_link_to_a_definition_that_does_not_exist_is_found():
     source_links, errors = script("source_links"), []
-    link, docs = "[here](../src/rejeu/core.py#{})", ROOT / "docs"
+    link, docs = "[here](../src/rejeu/core/algorithm.py#{})", ROOT / "docs"
     assert re.fullmatch(
-        r"\[here\]\(https://.*/blob/main/src/rejeu/core.py#L\d+-L\d+\)",
+        r"\[here\]\(https://.*/blob/main/src/rejeu/core/algorithm.py#L\d+-L\d+\)",
         source_links.resolved(link.format("Algorithm.update"), docs, docs, errors.append),
     )
     assert not errors

@@ -30,4 +30,4 @@ def test_the_examples_of_a_module_run(name, tmp_path, monkeypatch):
 def test_there_are_examples():
     finder = doctest.DocTestFinder()
     found = {m for m in MODULES for test in finder.find(importlib.import_module(m)) if test.examples}
-    assert {"rejeu", "rejeu.schedules", "rejeu.envs.make", "rejeu.exploration.noise"} <= found
+    assert {"rejeu", "rejeu.core.schedules", "rejeu.envs.make", "rejeu.exploration.noise"} <= found

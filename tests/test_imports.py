@@ -36,7 +36,7 @@ def test_training_in_gymnasium_imports_neither_envpool_nor_scipy_stats(tmp_path)
     arguments = "train CartPole-v1 --steps 16 --backend gymnasium --algo dqn --evaluate-episodes 1"
     program = f"""
 import sys
-from rejeu.cli import main
+from rejeu.lab.cli import main
 main({[*arguments.split(), "--out", str(tmp_path / "run")]!r})
 print({{"envpool", "scipy.stats"}} & {{*sys.modules}} or "none")
 """
@@ -52,7 +52,7 @@ def test_every_public_name_can_be_imported():
 def test_help_imports_no_jax():
     program = """
 import sys
-from rejeu.cli import main
+from rejeu.lab.cli import main
 for words in (["--help"], ["train", "--help"]):
     try:
         main(words)

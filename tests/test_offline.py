@@ -15,9 +15,9 @@ import pytest
 
 import rejeu
 from rejeu.callbacks import Checkpoint
-from rejeu.core import Clock, Transition, names
+from rejeu.core.algorithm import Clock, Transition, names
 from rejeu.demonstrations import Demonstrations, keeping_policy, learn_offline, read, record
-from rejeu.loops.learner import Learner, Readings
+from rejeu.training.learner import Learner, Readings
 from tests.every_agent import KINDS, Kind
 from tests.sharing import shared_learners
 from tests.test_demonstrations import SMALL, Anywhere, Target, by_hand, shown

@@ -15,18 +15,17 @@ import numpy as np
 import pytest
 
 import rejeu
-from rejeu import presets
-from rejeu.agents import modules_of
+from rejeu.agents import modules_of, presets
 from rejeu.algorithms.config import OffPolicyConfig, to_json
 from rejeu.callbacks import Checkpoint
-from rejeu.core import TD_ERROR, Transition
-from rejeu.errors import CheckpointError
-from rejeu.experiments.folder import NOTHING, Job, Sweep, open_folder
-from rejeu.experiments.plan import PlanError, read_plan
-from rejeu.experiments.sweep import Coordinator
-from rejeu.loops.learner import Learner
-from rejeu.reporting.runs import Run
-from rejeu.runs.config import RunConfig
+from rejeu.core.algorithm import TD_ERROR, Transition
+from rejeu.core.errors import CheckpointError
+from rejeu.lab.experiments.folder import NOTHING, Job, Sweep, open_folder
+from rejeu.lab.experiments.plan import PlanError, read_plan
+from rejeu.lab.experiments.sweep import Coordinator
+from rejeu.lab.reporting.runs import Run
+from rejeu.lab.runs.config import RunConfig
+from rejeu.training.learner import Learner
 from tests.environments import Reach
 
 ROOT = Path(__file__).parents[1]
@@ -262,7 +261,9 @@ def test_the_file_works_as_a_notebook_cell():
 
 def command(site, folder, *arguments):
     """Runs the command in a process in which the package is installed."""
-    program = f"import sys; sys.path.insert(0, {str(site)!r}); from rejeu.cli import main; sys.exit(main(sys.argv[1:]))"
+    program = (
+        f"import sys; sys.path.insert(0, {str(site)!r}); from rejeu.lab.cli import main; sys.exit(main(sys.argv[1:]))"
+    )
     return subprocess.run(
         [sys.executable, "-c", program, *arguments],
         cwd=folder,

@@ -20,7 +20,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from rejeu import presets, spaces
+from rejeu.agents import presets
+from rejeu.core import spaces
 from rejeu.envs.make import make_vector
 from tests.tiers import only
 

@@ -232,7 +232,7 @@ class Case:
                 yield from (self.train, self.save, self.resume)
 
     def make(self) -> str | None:
-        from rejeu.spaces import action_scaler, leaves
+        from rejeu.core.spaces import action_scaler, leaves
 
         self.vector = self.group.vector(self.env_id)
         kinds = ", ".join(sorted({leaf.kind for leaf in leaves(self.vector.observation_space)}))
@@ -257,7 +257,7 @@ class Case:
         return not any(row.get("resume") for row in same) and sum("train" in row for row in same) < 2
 
     def actions(self, rng: Any) -> Any:
-        from rejeu.spaces import random_action
+        from rejeu.core.spaces import random_action
 
         return self.scale(random_action(self.vector.action_space, self.vector.n_envs, rng))
 

@@ -1,6 +1,6 @@
 """Reads all kinds of damaged and malicious files and records the outcomes.
 
-This is the larger version of ``tests/io/test_hostile_files.py``. It truncates every kind of file, in both schemas, at
+This is the larger version of ``tests/core/test_hostile_files.py``. It truncates every kind of file, in both schemas, at
 every
 byte and flips every bit. It also reads the corpus of ``tests/hostile_files.py``, and files in which a pickle that creates
 a file when it is loaded stands in the place of every string::
@@ -31,12 +31,12 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from provenance import provenance, write
 
 import rejeu
-from rejeu.io import checkpoint
+from rejeu.core import checkpoint
 from rejeu.sb3.common.vec_env import DummyVecEnv, VecNormalize
 from tests import hostile_files
+from tests.core.test_hostile_runs import files_of, make_run, replaced, resumed_from
 from tests.environments import Counter
 from tests.golden import record_files
-from tests.io.test_hostile_runs import files_of, make_run, replaced, resumed_from
 from tests.sharing import shared_learners
 
 ROOT = Path(__file__).parents[1]

@@ -37,7 +37,7 @@ def live(folder: str, last: int) -> None:
     """Trains until step ``last``, from the newest checkpoint if there is one, and prints every step."""
     import rejeu
     from rejeu.callbacks import Checkpoint
-    from rejeu.runs.folder import run_files
+    from rejeu.checkpoints.run_folder import run_files
 
     def say(agent: rejeu.SAC, turn: object) -> bool:
         os.write(1, b"%d\n" % agent.num_timesteps)

@@ -133,7 +133,7 @@ def live(name: str, folder: str, kept: bool) -> None:
     """Trains to the end, from the newest checkpoint if there is one. Prints the first step and a final digest."""
     import rejeu
     from rejeu.callbacks import Checkpoint
-    from rejeu.runs.folder import run_files
+    from rejeu.checkpoints.run_folder import run_files
 
     case = CASES[name]
     agent_class = rejeu.AGENTS[case.algorithm]

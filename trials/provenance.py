@@ -34,7 +34,7 @@ def provenance(names: dict[str, str] | None = None) -> dict[str, str]:
 
 def machine() -> dict[str, Any]:
     """Returns processor, cores that this process may use, and load average."""
-    from rejeu.xla import cores
+    from rejeu.core.xla import cores
 
     return {"processor": platform.processor() or platform.machine(), "cores": cores(), "load": os.getloadavg()[0]}
 

@@ -401,8 +401,8 @@ def compared(folder: Path, name: str) -> dict[str, Any]:
     import jax
 
     import rejeu.algorithms.actor_critic.steps as steps
-    from rejeu.io.checkpoint import tree_to_arrays
-    from rejeu.sb3.zip_files import load_zip
+    from rejeu.agents.zip_files import load_zip
+    from rejeu.core.checkpoint import tree_to_arrays
 
     with np.load(folder / f"{name}.npz", allow_pickle=False) as file:
         data = dict(file)
@@ -461,7 +461,7 @@ UNLIKE = {(kind, loss) for kind in ("PPO", "RecurrentPPO", "MaskablePPO") for lo
 
 def clock(k: int) -> Any:
     """Returns the clock of an update; the environment steps are such that DQN's target does not move."""
-    from rejeu.core import Clock
+    from rejeu.core.algorithm import Clock
 
     return Clock(np.uint32(1), np.uint32(0), np.float32(0.0))
 
@@ -474,7 +474,7 @@ def difference(one: Any, two: Any) -> float:
 
 def transition(one: dict[str, Any], kind: str) -> Any:
     """Returns a recorded batch."""
-    from rejeu.core import Transition
+    from rejeu.core.algorithm import Transition
 
     discount = np.where(one["terminated"], 0.0, 0.9).astype(np.float32)
     action = one["action"].astype(np.float32 if kind in BOX else np.int32)
@@ -483,7 +483,7 @@ def transition(one: dict[str, Any], kind: str) -> Any:
 
 def rollout(one: dict[str, Any], kind: str, agent: Any) -> Any:
     """Returns a recorded rollout."""
-    from rejeu.core import Masked, Rollout
+    from rejeu.core.algorithm import Masked, Rollout
 
     memory: Any = ()
     if kind == "RecurrentPPO":
@@ -512,11 +512,11 @@ def compared_parts(folder: Path) -> list[dict[str, Any]]:
     import gymnasium as gym
     import jax.numpy as jnp
 
-    from rejeu import spaces
     from rejeu.algorithms import ars
-    from rejeu.buffers.ring import Ring
-    from rejeu.buffers.uniform import ReplayBuffer
-    from rejeu.normalization import NormalizationConfig, Normalizer, Statistics, merged, no_moments
+    from rejeu.core import spaces
+    from rejeu.core.normalization import NormalizationConfig, Normalizer, Statistics, merged, no_moments
+    from rejeu.replay.ring import Ring
+    from rejeu.replay.uniform import ReplayBuffer
 
     with np.load(folder / "parts.npz", allow_pickle=False) as file:
         data = dict(file)
@@ -582,8 +582,8 @@ def filled(buffer: Any, steps: list[dict[str, np.ndarray]]) -> Any:
 
 def goal_ring(rows: int, counters: tuple[str, ...] = ()) -> Any:
     """Returns a ring of ``rows`` rows for each environment."""
-    from rejeu import spaces
-    from rejeu.buffers.ring import Ring
+    from rejeu.core import spaces
+    from rejeu.replay.ring import Ring
 
     space = goal_space()
     return Ring(rows * ENVS, ENVS, spaces.leaves(space), spaces.structure(space), (1,), np.float32, counters=counters)
@@ -591,8 +591,8 @@ def goal_ring(rows: int, counters: tuple[str, ...] = ()) -> Any:
 
 def compared_hindsight(data: dict[str, Any]) -> dict[str, Any]:
     """Returns the row of hindsight: the transitions that may be drawn must be the same, in every number."""
-    from rejeu.buffers.hindsight import HerReplayBuffer, HindsightConfig, counters
     from rejeu.envs.goals import GoalFunctions
+    from rejeu.replay.hindsight import HerReplayBuffer, HindsightConfig, counters
 
     apart, n_compared, rng = [], 0, np.random.default_rng(0)
     for strategy in HINDSIGHT:
@@ -615,8 +615,8 @@ def compared_hindsight(data: dict[str, Any]) -> dict[str, Any]:
 
 def compared_priorities() -> dict[str, Any]:
     """Returns the row of prioritized replay, beside the equations of the paper in NumPy."""
-    from rejeu.buffers.prioritized import Priorities, PriorityConfig
-    from rejeu.buffers.uniform import ReplayBuffer
+    from rejeu.replay.prioritized import Priorities, PriorityConfig
+    from rejeu.replay.uniform import ReplayBuffer
 
     alpha, beta, epsilon, size = 0.7, 0.5, 1e-2, 32
     ring = goal_ring(KEPT)

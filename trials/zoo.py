@@ -29,9 +29,9 @@ from unittest import mock
 import gymnasium as gym
 import numpy as np
 
+from rejeu.agents.zoo import statistics_beside
 from rejeu.envs.make import make_vector
 from rejeu.sb3 import load_zip
-from rejeu.sb3.zoo import statistics_beside
 from rejeu.sb3_contrib.common.wrappers import TimeFeatureWrapper
 
 N = 500

@@ -10,8 +10,8 @@ import importlib
 import importlib.util
 from typing import TYPE_CHECKING, Any
 
-from rejeu import interrupt
 from rejeu.algorithms.catalog import CATALOG
+from rejeu.core import interrupt
 
 if interrupt.is_command():  # which imports them when it makes an environment, and ends with one line until then
     interrupt.install(lambda number, frame: interrupt.leave(number))
@@ -28,21 +28,13 @@ if TYPE_CHECKING:
     )
     from rejeu.agents.named import *  # noqa: F403
     from rejeu.agents.together import train_seeds as train_seeds
-    from rejeu.buffers.hindsight import (
-        GoalSelectionStrategy as GoalSelectionStrategy,
-        HerReplayBuffer as HerReplayBuffer,
+    from rejeu.core.algorithm import (
+        Algorithm as Algorithm,
+        Clock as Clock,
+        Rollout as Rollout,
+        Transition as Transition,
     )
-    from rejeu.buffers.replay_memory import ReplayMemory as ReplayMemory
-    from rejeu.buffers.uniform import ReplayBuffer as ReplayBuffer
-    from rejeu.core import Algorithm as Algorithm, Clock as Clock, Rollout as Rollout, Transition as Transition
-    from rejeu.envs.checker import check_env as check_env
-    from rejeu.envs.make import make_vec as make_vec, make_vector as make_vector
-    from rejeu.envs.wrappers import (
-        FlatGoals as FlatGoals,
-        OldEnvironment as OldEnvironment,
-        TimeLimitTerminates as TimeLimitTerminates,
-    )
-    from rejeu.errors import (
+    from rejeu.core.errors import (
         BadEnvironmentError as BadEnvironmentError,
         CheckpointError as CheckpointError,
         MissingExtra as MissingExtra,
@@ -50,51 +42,64 @@ if TYPE_CHECKING:
         RunInUseError as RunInUseError,
         WorkerError as WorkerError,
     )
-    from rejeu.experiments.sweep import sweep as sweep
-    from rejeu.experiments.tune import tune as tune
+    from rejeu.core.schedules import Exponential as Exponential, Linear as Linear
+    from rejeu.envs.checker import check_env as check_env
+    from rejeu.envs.make import make_vec as make_vec, make_vector as make_vector
+    from rejeu.envs.wrappers import (
+        FlatGoals as FlatGoals,
+        OldEnvironment as OldEnvironment,
+        TimeLimitTerminates as TimeLimitTerminates,
+    )
     from rejeu.exploration.noise import (
         NormalActionNoise as NormalActionNoise,
         OrnsteinUhlenbeckActionNoise as OrnsteinUhlenbeckActionNoise,
     )
     from rejeu.exploration.parameter_space import ParameterNoise as ParameterNoise
     from rejeu.export.numpy_policy import load_policy as load_policy
-    from rejeu.reporting import plots as plots
-    from rejeu.reporting.comparison import compare as compare
-    from rejeu.reporting.evaluation import Evaluation as Evaluation
-    from rejeu.reporting.report import write_report as write_report
-    from rejeu.reporting.video import record_video as record_video, show_videos as show_videos
+    from rejeu.lab.experiments.sweep import sweep as sweep
+    from rejeu.lab.experiments.tune import tune as tune
+    from rejeu.lab.reporting.comparison import compare as compare
+    from rejeu.lab.reporting.report import write_report as write_report
+    from rejeu.logs import plots as plots
+    from rejeu.logs.evaluation import Evaluation as Evaluation
+    from rejeu.logs.video import record_video as record_video, show_videos as show_videos
+    from rejeu.replay.hindsight import (
+        GoalSelectionStrategy as GoalSelectionStrategy,
+        HerReplayBuffer as HerReplayBuffer,
+    )
+    from rejeu.replay.replay_memory import ReplayMemory as ReplayMemory
+    from rejeu.replay.uniform import ReplayBuffer as ReplayBuffer
     from rejeu.sb3.common.evaluation import evaluate_policy as evaluate_policy
     from rejeu.sb3.common.monitor import Monitor as Monitor
     from rejeu.sb3.common.vec_env.adapters import to_vec_env as to_vec_env
-    from rejeu.schedules import Exponential as Exponential, Linear as Linear
 
 __version__ = "0.1.0"
 
 _MODULES = {
     "rejeu.agents": f"AGENTS OffPolicyAgent OnPolicyAgent load register {' '.join(CATALOG)}",
     "rejeu.agents.together": "train_seeds",
-    "rejeu.buffers.hindsight": "GoalSelectionStrategy HerReplayBuffer",
-    "rejeu.buffers.replay_memory": "ReplayMemory",
-    "rejeu.buffers.uniform": "ReplayBuffer",
-    "rejeu.core": "Algorithm Clock Rollout Transition",
+    "rejeu.replay.hindsight": "GoalSelectionStrategy HerReplayBuffer",
+    "rejeu.replay.replay_memory": "ReplayMemory",
+    "rejeu.replay.uniform": "ReplayBuffer",
+    "rejeu.core.algorithm": "Algorithm Clock Rollout Transition",
     "rejeu.envs.checker": "check_env",
     "rejeu.envs.make": "make_vec make_vector",
     "rejeu.sb3.common.evaluation": "evaluate_policy",
     "rejeu.sb3.common.monitor": "Monitor",
     "rejeu.sb3.common.vec_env.adapters": "to_vec_env",
     "rejeu.envs.wrappers": "FlatGoals OldEnvironment TimeLimitTerminates",
-    "rejeu.errors": "BadEnvironmentError CheckpointError MissingExtra NonFiniteError RunInUseError WorkerError",
+    "rejeu.core.errors": "BadEnvironmentError CheckpointError MissingExtra NonFiniteError RunInUseError WorkerError",
     "rejeu.export.numpy_policy": "load_policy",
     "rejeu.exploration.noise": "NormalActionNoise OrnsteinUhlenbeckActionNoise",
     "rejeu.exploration.parameter_space": "ParameterNoise",
-    "rejeu.reporting": "plots",
-    "rejeu.reporting.comparison": "compare",
-    "rejeu.reporting.evaluation": "Evaluation",
-    "rejeu.reporting.report": "write_report",
-    "rejeu.reporting.video": "record_video show_videos",
-    "rejeu.schedules": "Exponential Linear",
-    "rejeu.experiments.sweep": "sweep",
-    "rejeu.experiments.tune": "tune",
+    "rejeu.logs": "plots",
+    "rejeu.lab.reporting.comparison": "compare",
+    "rejeu.logs.evaluation": "Evaluation",
+    "rejeu.lab.reporting.report": "write_report",
+    "rejeu.logs.video": "record_video show_videos",
+    "rejeu.core.schedules": "Exponential Linear",
+    "rejeu.lab.experiments.sweep": "sweep",
+    "rejeu.lab.experiments.tune": "tune",
 }
 """The public names by the module that defines them."""
 

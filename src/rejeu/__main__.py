@@ -2,7 +2,7 @@
 
 import sys
 
-from rejeu.cli import main
+from rejeu.lab.cli import main
 
 if __name__ == "__main__":
     sys.exit(main())

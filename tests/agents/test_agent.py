@@ -10,9 +10,9 @@ import pytest
 
 import rejeu
 from rejeu import callbacks
-from rejeu.agents import model_files
+from rejeu.checkpoints import model_files
+from rejeu.core.errors import CheckpointError
 from rejeu.envs.make import InProcess
-from rejeu.errors import CheckpointError
 from tests.environments import Counter, Reach, Sampled
 from tests.helpers import assert_same_parameters, count_updates, same_parameters, small_sac
 from tests.tiers import exhaustive, only

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import rejeu
-from rejeu import validation
+from rejeu.core import validation
 
 pytestmark = pytest.mark.usefixtures("learners_are_shared")
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import rejeu
-from rejeu.errors import BadEnvironmentError
+from rejeu.core.errors import BadEnvironmentError
 from tests.environments import Counter, Reach, Sampled
 from tests.helpers import small_sac
 

@@ -14,10 +14,10 @@ import pytest
 import rejeu
 from rejeu.agents import device
 from rejeu.callbacks import TrainingCallback
-from rejeu.cli import main
+from rejeu.lab.cli import main
 from rejeu.sb3.common.callbacks import BaseCallback
-from tests.loops.device.test_off_policy import make
 from tests.tiers import exhaustive, only
+from tests.training.compiled.test_off_policy import make
 
 
 def rewards_of(agent: Any, progress: Any) -> None:
@@ -104,7 +104,7 @@ def test_the_progress_bar_counts_the_steps_of_a_first_chunk_of_many_turns(capsys
 def test_all_episodes_are_judged_when_learn_reaches_its_limit(limit: Any, monkeypatch: Any) -> None:
     """Before that, once in 100 turns."""
     monkeypatch.setattr(device, "MAX_TURNS", 100)
-    monkeypatch.setattr("rejeu.loops.device.MAX_TURNS", 100)
+    monkeypatch.setattr("rejeu.training.compiled.MAX_TURNS", 100)
     agent = make(rejeu.DQN, "jax/CartPole-v1", learning_starts=10_000, best_window=3).learn(**limit)
     assert agent.stops is not None
     means = np.convolve(agent.history["return"], np.full(3, 1 / 3), "valid")

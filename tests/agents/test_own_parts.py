@@ -6,11 +6,11 @@ import pytest
 import rejeu
 from rejeu.agents import OffPolicyAgent
 from rejeu.algorithms import sac
-from rejeu.buffers.hindsight import HerReplayBuffer
-from rejeu.buffers.uniform import ReplayBuffer
 from rejeu.callbacks import Checkpoint
-from rejeu.errors import CheckpointError
+from rejeu.core.errors import CheckpointError
 from rejeu.exploration.noise import NormalActionNoise
+from rejeu.replay.hindsight import HerReplayBuffer
+from rejeu.replay.uniform import ReplayBuffer
 from tests.environments import Reach
 from tests.helpers import small_sac
 

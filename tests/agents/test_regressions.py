@@ -15,13 +15,12 @@ import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import rejeu
-from rejeu import core, spaces
 from rejeu.agents import training
-from rejeu.buffers.ring import Ring
-from rejeu.buffers.uniform import ReplayBuffer
+from rejeu.core import algorithm as core, checkpoint, spaces
 from rejeu.envs.make import InProcess
-from rejeu.io import checkpoint
-from rejeu.reporting.logging import Console, CsvFile
+from rejeu.logs.logging import Console, CsvFile
+from rejeu.replay.ring import Ring
+from rejeu.replay.uniform import ReplayBuffer
 from tests.algorithms.probes.environments import Probe
 from tests.environments import Counter, Sampled
 from tests.every_agent import env_of, every_kind

@@ -14,13 +14,12 @@ import numpy as np
 import pytest
 
 import rejeu
-from rejeu import xla
 from rejeu.callbacks import Checkpoint, Evaluate
+from rejeu.checkpoints.run_folder import run_files
+from rejeu.core import checkpoint, xla
+from rejeu.core.errors import BadEnvironmentError, CheckpointError, RunInUseError
 from rejeu.envs.functional.gym_env import GymnasiumEnv
 from rejeu.envs.make import InProcess
-from rejeu.errors import BadEnvironmentError, CheckpointError, RunInUseError
-from rejeu.io import checkpoint
-from rejeu.runs.folder import run_files
 from rejeu.sb3.common.callbacks import BaseCallback, EvalCallback
 from tests.bit_flipping import BitFlipping
 from tests.environments import Sampled

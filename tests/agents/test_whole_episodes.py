@@ -84,7 +84,7 @@ def test_what_the_padding_holds_changes_nothing(algorithm):
     spoil = lambda x: np.where(rollout.valid.reshape(7, 3, *[1] * (x.ndim - 2)), x, x + x.dtype.type(77))  # noqa: E731
     fields = {key: spoil(getattr(rollout, key)) for key in ("obs", "action", "reward", "next_obs", "discount")}
     inner = agent.learner.algorithm
-    clock = rejeu.core.Clock(np.uint32(0), np.uint32(0), np.float32(0))
+    clock = rejeu.core.algorithm.Clock(np.uint32(0), np.uint32(0), np.float32(0))
     update = jax.jit(inner.update)
     one, other = update(state, rollout, clock)[0], update(state, rollout._replace(**fields), clock)[0]
     for a, b in zip(jax.tree.leaves(one.network), jax.tree.leaves(other.network), strict=True):

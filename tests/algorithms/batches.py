@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rejeu.core import Clock, Transition
+from rejeu.core.algorithm import Clock, Transition
 
 OBS_DIM, ACTION_DIM, N_ACTIONS = 3, 2, 4
 OBS_SPACE = gym.spaces.Box(-5.0, 5.0, (OBS_DIM,), np.float32)

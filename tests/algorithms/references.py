@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from rejeu.core import TD_ERROR, Transition
+from rejeu.core.algorithm import TD_ERROR, Transition
 from tests.algorithms.batches import noise_of
 from tests.numpy_networks import Adam, Layers, action_value, ensemble, follow, forward, layers, softmax, squashed_sample
 

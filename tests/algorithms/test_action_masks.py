@@ -15,7 +15,7 @@ from gymnasium import spaces
 import rejeu
 from rejeu.algorithms import dqn, qrdqn
 from rejeu.algorithms.sac import discrete
-from rejeu.core import Masked, Transition
+from rejeu.core.algorithm import Masked, Transition
 from rejeu.envs.functional.bit_flipping import BitFlipping
 from rejeu.envs.make import InProcess
 from rejeu.sb3 import DQN

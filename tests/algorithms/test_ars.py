@@ -10,7 +10,7 @@ import pytest
 
 import rejeu
 from rejeu.algorithms import ars
-from rejeu.core import Clock, Rollout
+from rejeu.core.algorithm import Clock, Rollout
 
 pytestmark = pytest.mark.usefixtures("learners_are_shared")
 
@@ -99,7 +99,7 @@ def found(monkeypatch):
         n_episodes = config.episodes(run.env.n_envs)
         found.append(np.asarray(ars.episode_returns(run.replay.rollout(), n_episodes, 0.0)).tolist())
 
-    monkeypatch.setattr("rejeu.loops.on_policy.update", noted)
+    monkeypatch.setattr("rejeu.training.on_policy.update", noted)
     return found
 
 

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rejeu import xla
 from rejeu.algorithms.categorical import cross_entropy, make_atoms, mean_of, project
+from rejeu.core import xla
 
 V_MIN, V_MAX, N_ATOMS = -3.0, 5.0, 9
 

@@ -8,12 +8,12 @@ import json
 import pytest
 
 import rejeu
-from rejeu import validation
 from rejeu.algorithms import config as configs
 from rejeu.algorithms.sac import Config
-from rejeu.buffers.hindsight import HindsightConfig
-from rejeu.errors import MissingObjectError
-from rejeu.schedules import Linear
+from rejeu.core import validation
+from rejeu.core.errors import MissingObjectError
+from rejeu.core.schedules import Linear
+from rejeu.replay.hindsight import HindsightConfig
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from gymnasium import spaces
 import rejeu
 from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.algorithms.contract import checked
-from rejeu.core import TD_ERROR, Clock
+from rejeu.core.algorithm import TD_ERROR, Clock
 
 BOX, DISCRETE = spaces.Box(-1.0, 1.0, (2,), np.float32), spaces.Discrete(3)
 OBS, KEY, CLOCK = np.zeros((4, 5), np.float32), jax.random.PRNGKey(0), Clock(0, 0, 0.0)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from rejeu.algorithms import crossq
-from rejeu.core import TD_ERROR
+from rejeu.core.algorithm import TD_ERROR
 from tests.algorithms.batches import ACTION_DIM, BOX as ACTION_SPACE, CLOCK, OBS_SPACE, box_batch, noise_of
 from tests.networks.test_batch_renorm import NumpyRenorm, numpy_torso
 from tests.numpy_networks import squashed_sample

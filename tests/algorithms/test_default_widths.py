@@ -10,7 +10,7 @@ import pytest
 import rejeu
 from rejeu.algorithms import config as configs, crossq, ppo
 from rejeu.algorithms.actor_critic.network import ActorCritic
-from rejeu.spaces import leaves
+from rejeu.core.spaces import leaves
 from tests.environments import Sampled
 from tests.tiers import exhaustive
 

@@ -13,8 +13,8 @@ import pytest
 
 import rejeu
 from rejeu.algorithms import dqn
-from rejeu.core import TD_ERROR, Clock, Transition, clip
-from rejeu.schedules import at
+from rejeu.core.algorithm import TD_ERROR, Clock, Transition, clip
+from rejeu.core.schedules import at
 from tests.bit_flipping import BitFlipping
 from tests.tiers import only
 

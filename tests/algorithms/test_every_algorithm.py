@@ -373,7 +373,7 @@ class Broken(Probe):
 def test_a_reward_that_is_no_number_ends_training_before_anything_is_learnt_from_it(kind):
     agent = kind.small(kind.envs(Broken), n_steps=50)
     before = agent.get_parameters()
-    with pytest.raises(rejeu.errors.BadEnvironmentError, match=r"returned the reward nan .* after 4 steps"):
+    with pytest.raises(rejeu.core.errors.BadEnvironmentError, match=r"returned the reward nan .* after 4 steps"):
         agent.learn(20)
     for name, array in agent.get_parameters().items():
         np.testing.assert_array_equal(array, before[name])

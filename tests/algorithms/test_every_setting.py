@@ -29,12 +29,12 @@ import rejeu
 from rejeu.agents import AGENTS
 from rejeu.algorithms.ars import direction
 from rejeu.algorithms.config import OffPolicyConfig
-from rejeu.buffers.hindsight import HindsightConfig
-from rejeu.buffers.prioritized import PriorityConfig
-from rejeu.core import GRADIENT_STEPS, TD_ERROR, Clock, Rollout, names
-from rejeu.io.checkpoint import tree_to_arrays
-from rejeu.normalization import NormalizationConfig
-from rejeu.schedules import at
+from rejeu.core.algorithm import GRADIENT_STEPS, TD_ERROR, Clock, Rollout, names
+from rejeu.core.checkpoint import tree_to_arrays
+from rejeu.core.normalization import NormalizationConfig
+from rejeu.core.schedules import at
+from rejeu.replay.hindsight import HindsightConfig
+from rejeu.replay.prioritized import PriorityConfig
 from tests.algorithms.batches import (
     ACTION_DIM,
     BOX,
@@ -661,9 +661,9 @@ def test_a_schedule_is_its_value_at_the_progress_of_the_clock(pair: tuple[Case, 
 
 
 AGENT, EVERY = "tests/agents/test_agent.py", "tests/algorithms/test_every_algorithm.py"
-NETWORKS, ROLLOUT = "tests/networks/test_networks.py", "tests/buffers/test_rollout.py"
-NORMALIZATION, HINDSIGHT = "tests/test_normalization.py", "tests/buffers/test_hindsight.py"
-PRIORITIZED, PPO = "tests/buffers/test_prioritized.py", "tests/algorithms/test_ppo.py"
+NETWORKS, ROLLOUT = "tests/networks/test_networks.py", "tests/replay/test_rollout.py"
+NORMALIZATION, HINDSIGHT = "tests/core/test_normalization.py", "tests/replay/test_hindsight.py"
+PRIORITIZED, PPO = "tests/replay/test_prioritized.py", "tests/algorithms/test_ppo.py"
 RAINBOW = "tests/algorithms/test_rainbow.py"
 FLASHSAC = "tests/algorithms/test_flashsac.py"
 RECURRENT = "tests/algorithms/test_recurrent_ppo.py"
@@ -686,17 +686,17 @@ ELSEWHERE = {
     "gamma": f"{AGENT}::test_a_time_limit_still_bootstraps_and_a_termination_does_not",
     "normalize": f"{NORMALIZATION}::test_every_algorithm_learns_on_scaled_numbers_and_keeps_them_in_its_file",
     "share_goals": f"{NORMALIZATION}::test_achieved_and_desired_goals_share_their_statistics_unless_told_otherwise",
-    "nonfinite": "tests/loops/test_finite.py::test_skipping_an_update_is_as_if_its_batch_had_never_been_given",
+    "nonfinite": "tests/training/test_finite.py::test_skipping_an_update_is_as_if_its_batch_had_never_been_given",
     "policy_kwargs": FORWARD,
-    "buffer_size": "tests/buffers/test_uniform.py::test_capacity_is_shared_among_environments",
+    "buffer_size": "tests/replay/test_uniform.py::test_capacity_is_shared_among_environments",
     "learning_starts": f"{AGENT}::test_nothing_is_learnt_before_learning_starts",
-    "batch_size": "tests/buffers/test_uniform.py::test_a_batch_has_the_shape_that_was_asked_for",
+    "batch_size": "tests/replay/test_uniform.py::test_a_batch_has_the_shape_that_was_asked_for",
     "train_freq": f"{AGENT}::test_gradient_steps_follow_the_steps_after_learning_starts",
     "gradient_steps": f"{AGENT}::test_gradient_steps_follow_the_steps_after_learning_starts",
     "action_noise": f"{AGENT}::test_action_noise_is_added_and_clipped",
     "replay_buffer_class": "tests/algorithms/test_config.py::test_a_replay_buffer_is_given_by_class_or_name",
     "replay_buffer_kwargs": f"{HINDSIGHT}::test_of_every_batch_the_share_k_over_k_plus_one_is_relabelled",
-    "n_steps": "tests/buffers/test_uniform.py::test_samples_are_exactly_the_steps_that_are_kept",
+    "n_steps": "tests/replay/test_uniform.py::test_samples_are_exactly_the_steps_that_are_kept",
     "priorities": f"{PRIORITIZED}::test_steps_are_drawn_in_proportion_to_their_priorities",
     "demonstrations": "tests/test_demonstrations.py::test_a_run_with_demonstrations_resumes_equal",
     "offline": "tests/test_offline.py::test_an_offline_run_steps_no_environment_and_resumes_equal",

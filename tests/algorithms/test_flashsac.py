@@ -13,10 +13,10 @@ from scipy import special
 
 import rejeu
 from rejeu.algorithms import flashsac, xqc
-from rejeu.core import TD_ERROR
+from rejeu.core.algorithm import TD_ERROR
+from rejeu.core.normalization import NormalizationConfig, normalizer_of
 from rejeu.networks.layers import RMSNorm
 from rejeu.networks.projected import UnitLinear
-from rejeu.normalization import NormalizationConfig, normalizer_of
 from tests.algorithms.batches import BOX, CLOCK, DISCRETE, OBS_SPACE, box_batch, noise_of
 from tests.environments import Reach
 from tests.networks.test_projected import numpy_torso

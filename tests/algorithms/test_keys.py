@@ -14,7 +14,7 @@ import pytest
 import rejeu
 from rejeu import agents
 from rejeu.algorithms.config import OffPolicyConfig
-from rejeu.loops.run import clock_of
+from rejeu.training.run import clock_of
 from tests.algorithms.probes.environments import Discretely, Probe
 from tests.tiers import only
 

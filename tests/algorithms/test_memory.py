@@ -15,11 +15,11 @@ from rejeu.algorithms import dqn, td3
 from rejeu.algorithms.config import RndConfig
 from rejeu.algorithms.rnd import with_rnd
 from rejeu.algorithms.sac import continuous as sac, discrete as discrete_sac
-from rejeu.buffers.ring import Ring
-from rejeu.buffers.uniform import ReplayBuffer
-from rejeu.core import Masked, Sequences, Transition
+from rejeu.core.algorithm import Masked, Sequences, Transition
+from rejeu.core.spaces import Leaf, leaves
 from rejeu.envs.make import InProcess
-from rejeu.spaces import Leaf, leaves
+from rejeu.replay.ring import Ring
+from rejeu.replay.uniform import ReplayBuffer
 from tests.algorithms.test_recurrent_ppo import Recall, dense, numpy_empty, numpy_step
 from tests.tiers import exhaustive, only, only_tuples
 
@@ -222,7 +222,7 @@ def test_sequences_of_one_step_are_transitions_whose_observations_begin_episodes
     algorithm = with_rnd(module.make(config, OBS_SPACE, action_space), leaves(OBS_SPACE), RndConfig())
     state, batch = algorithm.init(jax.random.PRNGKey(0)), transitions(action_space)
     n_numbers = algorithm.explorer.init(algorithm.actor(state), 1).shape[1]
-    clock = rejeu.core.Clock(np.uint32(4), np.uint32(0), np.float32(0.0))
+    clock = rejeu.core.algorithm.Clock(np.uint32(4), np.uint32(0), np.float32(0.0))
     plain, metrics = algorithm.update(state, batch, clock)
     unrolled, same_metrics = algorithm.update(state, one_step(batch, n_numbers), clock)
     for one, other in zip(jax.tree.leaves((plain, metrics)), jax.tree.leaves((unrolled, same_metrics)), strict=True):

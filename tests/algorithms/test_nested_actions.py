@@ -16,10 +16,10 @@ import rejeu
 from rejeu.algorithms.actor_critic.network import ActorCritic, action_kind
 from rejeu.algorithms.actor_critic.steps import entropy_of
 from rejeu.algorithms.sac import mixed
-from rejeu.core import Clock, Transition
-from rejeu.distributions import Bernoulli, Categorical, Joint, MultiCategorical, Normal, TanhNormal
+from rejeu.core.algorithm import Clock, Transition
+from rejeu.core.distributions import Bernoulli, Categorical, Joint, MultiCategorical, Normal, TanhNormal
+from rejeu.core.spaces import action_width, random_action, rows, scale_action
 from rejeu.envs.functional import FunctionalEnv
-from rejeu.spaces import action_width, random_action, rows, scale_action
 from tests.helpers import assert_same_parameters
 from tests.tiers import exhaustive, only, only_tuples
 
@@ -195,7 +195,7 @@ def test_log_probability_and_entropy_are_sums_over_the_parts():
 )
 def test_the_network_gives_every_part_its_outputs(settings):
     config = rejeu.PPO.algorithm.Config(policy_kwargs={"net_arch": [4], "log_std_init": -1.0, **settings})
-    leaf = rejeu.spaces.leaves(Strict.observation_space)
+    leaf = rejeu.core.spaces.leaves(Strict.observation_space)
     network = ActorCritic(jax.random.PRNGKey(0), leaf, action_kind(NESTED), config.policy_kwargs)
     joint = network.policy(jnp.zeros((5, 2)))
     (bits, choices, last), gear, steer = joint.parts[0].parts, *joint.parts[1:]

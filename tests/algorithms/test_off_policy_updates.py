@@ -15,7 +15,7 @@ import rejeu
 from rejeu.algorithms import ddpg, rebrac, sac, td3, td3_bc, tqc
 from rejeu.algorithms.ddpg import discrete as ddpg_discrete
 from rejeu.algorithms.sac import discrete as sac_discrete
-from rejeu.core import TD_ERROR
+from rejeu.core.algorithm import TD_ERROR
 from tests.algorithms import references
 from tests.algorithms.batches import (
     BOX,

@@ -14,8 +14,8 @@ import pytest
 
 from rejeu.algorithms import a2c, crossq, optimizers, sac
 from rejeu.algorithms.config import rebuild, to_json
-from rejeu.core import descend
-from rejeu.errors import CheckpointError
+from rejeu.core.algorithm import descend
+from rejeu.core.errors import CheckpointError
 from tests.tiers import exhaustive
 
 SETTINGS = {"learning_starts": 8, "batch_size": 4, "buffer_size": 100, "seed": 0}

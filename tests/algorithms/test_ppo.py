@@ -16,9 +16,9 @@ from rejeu.algorithms import ppo
 from rejeu.algorithms.actor_critic.config import ActorCriticConfig
 from rejeu.algorithms.actor_critic.network import ActorCritic, action_kind, is_value
 from rejeu.algorithms.actor_critic.steps import Samples, explained_variance, shuffled, standardized
-from rejeu.core import Clock, Rollout
-from rejeu.prng import nth
-from rejeu.spaces import leaves
+from rejeu.core.algorithm import Clock, Rollout
+from rejeu.core.prng import nth
+from rejeu.core.spaces import leaves
 from tests import numpy_actor_critic as by_hand
 from tests.environments import Sampled
 from tests.numpy_networks import assert_equal_layers, gradient

@@ -13,10 +13,10 @@ from hypothesis import given, settings as hypothesis_settings, strategies as st
 
 import rejeu
 from rejeu.algorithms import config as configs, pqn
-from rejeu.core import Clock
+from rejeu.core.algorithm import Clock
+from rejeu.core.prng import nth
+from rejeu.core.spaces import leaves
 from rejeu.networks import LayerNorm
-from rejeu.prng import nth
-from rejeu.spaces import leaves
 from tests.algorithms.test_gae import random_steps
 from tests.algorithms.test_ppo import LAST_STEP_MISSING, OBS_SPACE, random_rollout
 from tests.numpy_networks import gradient

@@ -13,7 +13,7 @@ import pytest
 
 import rejeu
 from rejeu.algorithms import dqn, qrdqn
-from rejeu.core import TD_ERROR, Clock, Transition
+from rejeu.core.algorithm import TD_ERROR, Clock, Transition
 from tests.algorithms.test_dqn import (
     BATCH,
     CLOCK,

@@ -15,7 +15,7 @@ import pytest
 import rejeu
 from rejeu.algorithms import dqn, iqn, qrdqn
 from rejeu.algorithms.quantile_loss import quantile_huber_loss
-from rejeu.core import TD_ERROR, Masked
+from rejeu.core.algorithm import TD_ERROR, Masked
 from rejeu.export import check
 from tests.algorithms.test_categorical import by_loops
 from tests.algorithms.test_dqn import (

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 import rejeu
-from rejeu.core import Clock, Transition
-from rejeu.io.checkpoint import tree_to_arrays
+from rejeu.core.algorithm import Clock, Transition
+from rejeu.core.checkpoint import tree_to_arrays
 from tests.algorithms.batches import BOX, OBS_SPACE
 from tests.algorithms.test_dqn import ACTION_SPACE as DISCRETE
 from tests.environments import Sampled

@@ -17,9 +17,9 @@ import rejeu
 from rejeu.algorithms import recurrent_ppo
 from rejeu.algorithms.actor_critic.network import action_kind
 from rejeu.algorithms.recurrent_ppo import Cell, Config, RecurrentActorCritic, RecurrentConfig
-from rejeu.core import Clock, Rollout
+from rejeu.core.algorithm import Clock, Rollout
+from rejeu.core.spaces import leaves
 from rejeu.envs.make import InProcess
-from rejeu.spaces import leaves
 from tests.algorithms.probes.environments import Probe
 from tests.environments import Counter
 from tests.helpers import assert_same_parameters, same_parameters

@@ -9,7 +9,7 @@ import pytest
 
 import rejeu
 from rejeu.algorithms import sac
-from rejeu.core import TD_ERROR
+from rejeu.core.algorithm import TD_ERROR
 from rejeu.networks import action_values, with_dropout
 from tests.algorithms.batches import BOX, CLOCK, OBS_SPACE, box_batch, noise_of
 from tests.numpy_networks import squashed_sample

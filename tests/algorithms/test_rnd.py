@@ -12,8 +12,8 @@ import rejeu
 from rejeu.algorithms import rnd
 from rejeu.algorithms.config import RndConfig
 from rejeu.callbacks import Checkpoint
-from rejeu.core import Algorithm, Clock, Rollout, Transition
-from rejeu.spaces import leaves
+from rejeu.core.algorithm import Algorithm, Clock, Rollout, Transition
+from rejeu.core.spaces import leaves
 from tests.every_agent import KINDS
 from tests.helpers import assert_same_parameters, same_parameters
 from tests.tiers import exhaustive, only

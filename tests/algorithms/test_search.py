@@ -4,8 +4,9 @@ import math
 
 import pytest
 
-from rejeu import AGENTS, validation
+from rejeu import AGENTS
 from rejeu.algorithms.search import HINDSIGHT, OFF_POLICY, Choice, Integers, LogUniform, NearOne, Uniform
+from rejeu.core import validation
 
 
 def built(name, values):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rejeu.callbacks import Checkpoint, TrainingCallback
-from rejeu.errors import CheckpointError
+from rejeu.core.errors import CheckpointError
 from tests.helpers import small_sac
 
 pytestmark = pytest.mark.usefixtures("learners_are_shared")

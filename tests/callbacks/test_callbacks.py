@@ -20,11 +20,11 @@ from rejeu.callbacks import (
 )
 from rejeu.callbacks.base import crossed
 from rejeu.callbacks.evaluate import better
-from rejeu.io.failed_writes import FailedWrites
-from rejeu.loops.run import Episode, Progress
-from rejeu.reporting.evaluation import Evaluation
-from rejeu.reporting.history import History
-from rejeu.reporting.logging import Logger
+from rejeu.core.failed_writes import FailedWrites
+from rejeu.logs.evaluation import Evaluation
+from rejeu.logs.history import History
+from rejeu.logs.logging import Logger
+from rejeu.training.run import Episode, Progress
 from tests.environments import Counter
 from tests.helpers import small_sac
 

@@ -13,12 +13,12 @@ import pytest
 
 import rejeu
 from rejeu.callbacks import Checkpoint, Evaluate
-from rejeu.cli import main
 from rejeu.envs import checker
-from rejeu.reporting import evaluation
-from rejeu.reporting.runs import read_run
-from tests.cli.test_cli import FEWER_FILES, TINY
+from rejeu.lab.cli import main
+from rejeu.lab.reporting.runs import read_run
+from rejeu.logs import evaluation
 from tests.helpers import assert_same_parameters, small_sac
+from tests.lab.cli.test_cli import FEWER_FILES, TINY
 
 SOURCE = """
 import gymnasium as gym, numpy as np

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from rejeu.agents import PPO
+from rejeu.core.errors import WorkerError
 from rejeu.envs.make import make_vector
-from rejeu.errors import WorkerError
 from tests.tiers import only
 from tests.worker_environments import Gated, Losable, Paced, in_order
 

@@ -11,17 +11,17 @@ import pytest
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
 import rejeu
-from rejeu import presets
-from rejeu.cli import main
+from rejeu.agents import presets
+from rejeu.core.errors import BadEnvironmentError
 from rejeu.envs import checker
 from rejeu.envs.checker import findings
 from rejeu.envs.make import GymnasiumVector, make_vector
 from rejeu.envs.registry import make_env
 from rejeu.envs.workers import pool
-from rejeu.errors import BadEnvironmentError
-from rejeu.loops import checks
-from rejeu.loops.checks import check_finite
+from rejeu.lab.cli import main
 from rejeu.sb3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor
+from rejeu.training import checks
+from rejeu.training.checks import check_finite
 from tests.bad_environments import EVERY, Good, Line, RewardReadsInfo, RewardWithAxis, SameArray, seeing
 from tests.helpers import small_sac
 from tests.tiers import crossed, only

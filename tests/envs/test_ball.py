@@ -9,9 +9,9 @@ from gymnasium.utils.env_checker import check_env
 from scipy.stats import norm
 
 import rejeu
-from rejeu.envs.ball import Ball
-from rejeu.envs.ball_drawing import BallDrawing
-from rejeu.errors import MissingExtra
+from rejeu.core.errors import MissingExtra
+from rejeu.envs.functional.ball_drawing import BallDrawing
+from rejeu.teaching.ball import Ball
 from tests.tiers import only
 
 NOTHING = np.zeros(2, np.float32)

@@ -6,12 +6,12 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from rejeu import spaces
+from rejeu.core import spaces
+from rejeu.core.errors import BadEnvironmentError
 from rejeu.envs import masks
 from rejeu.envs.checker import advice_on_observations, check_env, findings
-from rejeu.errors import BadEnvironmentError
 from rejeu.export import contract
-from rejeu.loops.device import program
+from rejeu.training.compiled import program
 from tests.environments import Reach, Sampled
 from tests.golden.vec_env_script import Walk
 

@@ -11,12 +11,12 @@ import pytest
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
 import rejeu
+from rejeu.core.errors import MissingExtra
 from rejeu.envs.make import EnvPool, GymnasiumVector, InProcess, auto_backend, make_vector
 from rejeu.envs.registry import make_env
-from rejeu.errors import MissingExtra
-from rejeu.loops.run import restart
 from rejeu.sb3.common.env_util import make_vec_env
 from rejeu.sb3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
+from rejeu.training.run import restart
 from tests.environments import Counter, Reach, Sampled
 from tests.helpers import small_sac
 

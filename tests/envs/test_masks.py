@@ -14,12 +14,12 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 import rejeu
 from rejeu.algorithms import ppo
 from rejeu.algorithms.actor_critic.steps import samples
-from rejeu.core import Clock, Masked
+from rejeu.core.algorithm import Clock, Masked
+from rejeu.core.errors import BadEnvironmentError, WorkerError
 from rejeu.envs.make import InProcess, make_vector
 from rejeu.envs.masks import make_masked
-from rejeu.errors import BadEnvironmentError, WorkerError
-from rejeu.loops.learner import Readings
 from rejeu.sb3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor
+from rejeu.training.learner import Readings
 from tests.environments import Counter
 from tests.helpers import assert_same_parameters
 from tests.tiers import crossed, exhaustive, only

@@ -16,10 +16,10 @@ import pytest
 
 import rejeu
 from rejeu.callbacks import Checkpoint
+from rejeu.core.errors import WorkerError
 from rejeu.envs.make import make_vector
 from rejeu.envs.workers import pool, remote
-from rejeu.errors import WorkerError
-from tests import ray_cluster
+from tests.envs import ray_cluster
 from tests.helpers import assert_same_parameters, small_sac
 from tests.worker_environments import Losable, Paced, imports_jax, in_order, process_id
 

@@ -11,10 +11,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from rejeu import cluster
+from rejeu.core.errors import ClusterError, WorkerError
 from rejeu.envs.make import make_vector
-from rejeu.envs.workers import process, remote
-from rejeu.errors import ClusterError, WorkerError
+from rejeu.envs.workers import cluster, process, remote
 from tests.worker_environments import Paced
 
 

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 import rejeu
+from rejeu.core import records
 from rejeu.envs.make import make_vector
 from rejeu.envs.snapshot import restore, state_of
-from rejeu.io import records
 
 CARRIED = [
     "CartPole-v1",

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 import rejeu
-from rejeu.cli import main
 from rejeu.envs.base import success_of
 from rejeu.envs.make import InProcess, make_vector
+from rejeu.lab.cli import main
 from tests.environments import Counter, Reach
 from tests.tiers import exhaustive
 

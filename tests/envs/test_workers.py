@@ -20,9 +20,9 @@ import pytest
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 
+from rejeu.core.errors import BadEnvironmentError, WorkerError
 from rejeu.envs.make import GymnasiumVector, make_vector
 from rejeu.envs.workers import pool
-from rejeu.errors import BadEnvironmentError, WorkerError
 from rejeu.sb3.common.vec_env import SubprocVecEnv
 from tests.environments import Counter
 from tests.helpers import small_sac

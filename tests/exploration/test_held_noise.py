@@ -11,7 +11,7 @@ import pytest
 
 from rejeu.algorithms import crossq, flashsac, sac, tqc, xqc
 from rejeu.algorithms.sac import continuous
-from rejeu.core import Clock
+from rejeu.core.algorithm import Clock
 from rejeu.exploration.held_noise import spells
 from tests.algorithms.batches import BOX, DISCRETE, OBS_DIM, OBS_SPACE
 from tests.tiers import only

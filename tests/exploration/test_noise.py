@@ -12,7 +12,7 @@ from gymnasium import spaces
 
 import rejeu
 from rejeu.algorithms import config as configs
-from rejeu.core import Algorithm, Clock
+from rejeu.core.algorithm import Algorithm, Clock
 from rejeu.exploration import explorer
 from rejeu.exploration.noise import (
     NormalActionNoise,

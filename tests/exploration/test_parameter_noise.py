@@ -10,12 +10,11 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from rejeu import core
 from rejeu.algorithms import ddpg, dqn
-from rejeu.core import Clock
+from rejeu.core import algorithm as core, checkpoint
+from rejeu.core.algorithm import Clock
 from rejeu.exploration import explorer, parameter_space
 from rejeu.exploration.parameter_space import ParameterNoise
-from rejeu.io import checkpoint
 
 CLOCK = Clock(np.uint32(0), np.uint32(0), np.float32(1))
 OBS_SPACE = spaces.Box(-1, 1, (3,), np.float32)

@@ -15,9 +15,9 @@ from rejeu.algorithms import ppo, sac
 from rejeu.algorithms.actor_critic.config import ActorCriticConfig
 from rejeu.algorithms.actor_critic.network import ActorCritic, action_kind, explorer_of, sde_explorer
 from rejeu.algorithms.sac.continuous import SdeActor
-from rejeu.core import Clock
+from rejeu.core.algorithm import Clock
+from rejeu.core.spaces import leaves
 from rejeu.envs.make import InProcess
-from rejeu.spaces import leaves
 from tests.algorithms.probes.environments import ByAction, BySightAndAction, Discretely
 from tests.environments import Counter
 from tests.helpers import assert_same_parameters

@@ -10,7 +10,8 @@ import jax
 import numpy as np
 from gymnasium import spaces
 
-from rejeu import agents, xla
+from rejeu import agents
+from rejeu.core import xla
 from tests.sharing import shared_learners
 
 LIMITS = np.array([-2.0, -1.0], np.float32), np.array([2.0, 5.0], np.float32)

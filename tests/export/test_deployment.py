@@ -16,7 +16,7 @@ import pytest
 
 from rejeu.agents import exporting
 from rejeu.agents.exporting import SUFFIXES
-from rejeu.cli import main
+from rejeu.lab.cli import main
 from rejeu.networks import Linear
 from tests.export.policies import agent_of, made, observations
 from tests.full_disk import FullDisk

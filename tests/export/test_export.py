@@ -15,14 +15,14 @@ import numpy as np
 import pytest
 from gymnasium.wrappers import FrameStackObservation
 
-from rejeu import spaces
 from rejeu.agents import exporting
 from rejeu.algorithms.sac.continuous import policy as sac_policy
-from rejeu.cli import main
-from rejeu.errors import CheckpointError
+from rejeu.core import spaces
+from rejeu.core.errors import CheckpointError
+from rejeu.core.spaces import parts
 from rejeu.export import c_file, check, contract, stablehlo_file
 from rejeu.export.numpy_policy import load_policy
-from rejeu.spaces import parts
+from rejeu.lab.cli import main
 from tests.export.policies import KINDS, agent_of, made, observations
 from tests.tiers import crossed, exhaustive, only
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import rejeu
-from rejeu.errors import CheckpointError
+from rejeu.core.errors import CheckpointError
 from rejeu.export.numpy_policy import ACTIVATIONS, load_policy
 from rejeu.networks import layers
 from tests import hostile_files

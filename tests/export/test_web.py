@@ -12,9 +12,9 @@ import pytest
 
 import rejeu
 from rejeu.agents import exporting
-from rejeu.cli import main
 from rejeu.export import check, web_file
 from rejeu.export.check import node
+from rejeu.lab.cli import main
 from tests.export.policies import made
 from tests.tiers import only
 

@@ -1,4 +1,4 @@
-"""Records files of the current schema and their contents for ``tests/io/test_schemas.py``.
+"""Records files of the current schema and their contents for ``tests/core/test_schemas.py``.
 
 Run it when the schema changes, with the folder removed::
 

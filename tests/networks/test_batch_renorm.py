@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from rejeu.core.spaces import Leaf
 from rejeu.networks.batch_renorm import BatchRenorm, RenormalizedMLP, RenormalizedNetwork, with_statistics
-from rejeu.spaces import Leaf
 
 WIDTH, BATCH = 3, 6
 

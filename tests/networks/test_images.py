@@ -13,12 +13,12 @@ from gymnasium.wrappers import FrameStackObservation
 from hypothesis import given, settings, strategies as st
 
 import rejeu
-from rejeu.buffers.hindsight import HerReplayBuffer, HindsightConfig
-from rejeu.buffers.prioritized import Priorities, PriorityConfig
-from rejeu.buffers.ring import Ring, check_memory
-from rejeu.buffers.uniform import ReplayBuffer
+from rejeu.core.spaces import leaves, structure
 from rejeu.envs.goals import GoalFunctions
-from rejeu.spaces import leaves, structure
+from rejeu.replay.hindsight import HerReplayBuffer, HindsightConfig
+from rejeu.replay.prioritized import Priorities, PriorityConfig
+from rejeu.replay.ring import Ring, check_memory
+from rejeu.replay.uniform import ReplayBuffer
 
 SIZE = (2, 3)
 
@@ -228,7 +228,7 @@ def test_saved_stacks_come_back(tmp_path):
     other.load_replay_buffer(path)
     first, second = (a.replay_buffer.sample(np.random.default_rng(0), (32,)) for a in (agent, other))
     jax.tree.map(np.testing.assert_array_equal, first, second)
-    with pytest.raises(rejeu.errors.CheckpointError, match="saved with another environment or buffer_size"):
+    with pytest.raises(rejeu.core.errors.CheckpointError, match="saved with another environment or buffer_size"):
         make().load_replay_buffer(path)
 
 
@@ -292,7 +292,7 @@ def test_the_bytes_of_a_ring_are_told(frame_stack):
 
 
 def test_a_buffer_that_memory_cannot_hold_is_refused_before_anything_is_reserved(monkeypatch):
-    monkeypatch.setattr("rejeu.buffers.ring.free_memory", lambda: 2**32)
+    monkeypatch.setattr("rejeu.replay.ring.free_memory", lambda: 2**32)
     space = spaces.Box(0, 255, (4, 84, 84), np.uint8)
     per_row = 84 * 84 + 4 + 4 + 1 + 4
     tracemalloc.start()

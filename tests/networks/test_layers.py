@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy import special
 
-from rejeu.core import ensemble
+from rejeu.core.algorithm import ensemble
 from rejeu.networks import ACTIVATIONS, Linear, PolicyConfig
 from rejeu.networks.layers import product
 

@@ -13,10 +13,12 @@ from gymnasium import spaces
 from scipy import stats
 
 import rejeu
-from rejeu import cli, validation
 from rejeu.algorithms import config as configs, sac
-from rejeu.core import ensemble
-from rejeu.errors import CheckpointError
+from rejeu.core import validation
+from rejeu.core.algorithm import ensemble
+from rejeu.core.errors import CheckpointError
+from rejeu.core.spaces import leaves
+from rejeu.lab import cli
 from rejeu.networks import (
     ENCODERS,
     Convolution,
@@ -31,7 +33,6 @@ from rejeu.networks import (
     encoder,
 )
 from rejeu.networks.encoder import CNN, NATURE, SMALL, channels_last, image_shape
-from rejeu.spaces import leaves
 from tests.tiers import only
 
 pytestmark = pytest.mark.usefixtures("learners_are_shared")

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from rejeu.core.spaces import Leaf
 from rejeu.networks import Network, PolicyConfig
 from rejeu.networks.noisy import NoisyLinear, drawn, noisy
-from rejeu.spaces import Leaf
 
 N_INPUTS, N_OUTPUTS = 3, 4
 LEAVES = (Leaf("", "continuous", (N_INPUTS,), "float32"),)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import rejeu
-from rejeu.reporting import evaluation as limits
+from rejeu.logs import evaluation as limits
 from rejeu.sb3 import A2C, PPO, SAC
 from rejeu.sb3.common.callbacks import BaseCallback
 from rejeu.sb3.common.evaluation import evaluate_policy

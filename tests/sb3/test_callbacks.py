@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import rejeu
-from rejeu.reporting.logging import CsvFile, Logger, configure
+from rejeu.logs.logging import CsvFile, Logger, configure
 from rejeu.sb3.common.callbacks import (
     BaseCallback,
     CallbackList,

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 import rejeu
-from rejeu.reporting.video import record_video
+from rejeu.logs.video import record_video
 from rejeu.sb3.common.vec_env import DummyVecEnv, VecVideoRecorder
 from rejeu.sb3.common.vec_env.base_vec_env import tile_images
-from tests.reporting.test_video import Lamp, decode
+from tests.logs.test_video import Lamp, decode
 from tests.tiers import exhaustive
 
 

@@ -15,7 +15,7 @@ from gymnasium import spaces
 
 from rejeu import sb3
 from rejeu.algorithms.actor_critic.network import sde_std
-from rejeu.distributions import Normal, TanhNormal
+from rejeu.core.distributions import Normal, TanhNormal
 from rejeu.sb3.common import env_checker, logger as loggers
 from rejeu.sb3.common.buffers import HerReplayBuffer
 from rejeu.sb3.common.distributions import Distribution, half_widths

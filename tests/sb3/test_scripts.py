@@ -12,8 +12,8 @@ import pytest
 
 import rejeu
 from rejeu import sb3
+from rejeu.core.schedules import at
 from rejeu.sb3 import algorithms
-from rejeu.schedules import at
 from tests.golden.vec_env_script import Walk
 from tests.tiers import only
 

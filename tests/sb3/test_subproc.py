@@ -8,7 +8,7 @@ import signal
 import numpy as np
 import pytest
 
-from rejeu.errors import WorkerError
+from rejeu.core.errors import WorkerError
 from rejeu.sb3.common.monitor import Monitor
 from rejeu.sb3.common.vec_env import SubprocVecEnv, VecMonitor
 from tests.golden.vec_env_script import Walk

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from rejeu.distributions import TanhNormal
+from rejeu.core.distributions import TanhNormal
 from rejeu.sb3.common import distributions, logger as loggers, preprocessing, save_util, utils
 from rejeu.sb3.common.results_plotter import rolling_window
 from rejeu.sb3.common.torch_layers import create_mlp

@@ -11,9 +11,8 @@ import pytest
 from gymnasium import spaces
 
 import rejeu
-from rejeu.errors import BadEnvironmentError, CheckpointError
-from rejeu.io import checkpoint
-from rejeu.loops.learner import Readings
+from rejeu.core import checkpoint
+from rejeu.core.errors import BadEnvironmentError, CheckpointError
 from rejeu.sb3.common.env_util import make_vec_env
 from rejeu.sb3.common.monitor import Monitor
 from rejeu.sb3.common.running_mean_std import RunningMeanStd
@@ -30,9 +29,10 @@ from rejeu.sb3.common.vec_env import (
     sync_envs_normalization,
     unwrap_vec_wrapper,
 )
+from rejeu.training.learner import Readings
 from tests.environments import Reach
 from tests.golden.vec_env_script import Walk
-from tests.reporting.test_video import Lamp
+from tests.logs.test_video import Lamp
 
 pytestmark = pytest.mark.usefixtures("learners_are_shared")
 
@@ -149,7 +149,7 @@ def rolled(env, steps=60):
     rollouts = taught(agent)
     agent.learn(steps)
     (batch,) = rollouts
-    return rejeu.core.Rollout(*(part.reshape(-1, *part.shape[2:]) for part in batch), *[None] * 5)
+    return rejeu.core.algorithm.Rollout(*(part.reshape(-1, *part.shape[2:]) for part in batch), *[None] * 5)
 
 
 VECTORS = {

@@ -17,13 +17,12 @@ import numpy as np
 import pytest
 
 import rejeu
-from rejeu import spaces
-from rejeu.cli import main
-from rejeu.core import Clock, Transition
-from rejeu.errors import CheckpointError
-from rejeu.io import checkpoint
+from rejeu.agents.conversion import Policy, converted, parts_of
+from rejeu.core import checkpoint, spaces
+from rejeu.core.algorithm import Clock, Transition
+from rejeu.core.errors import CheckpointError
+from rejeu.lab.cli import main
 from rejeu.sb3 import algorithms, load_zip
-from rejeu.sb3.conversion import Policy, converted, parts_of
 from tests.hostile_zips import hostile_zips
 from tests.sb3_models import MadeUp, difference_from, loaded
 from tests.tiers import exhaustive, only

@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 
 import rejeu
-from rejeu.cli import main
-from rejeu.errors import CheckpointError
-from rejeu.io.records import Malformed
+from rejeu.agents.zoo import model_in, notes_beside, read_yaml, statistics_beside
+from rejeu.checkpoints.pickled import parse, tensors_of
+from rejeu.core.errors import CheckpointError
+from rejeu.core.records import Malformed
+from rejeu.lab.cli import main
 from rejeu.sb3 import algorithms, load_zip
 from rejeu.sb3.common.env_util import make_vec_env
 from rejeu.sb3.common.vec_env import VecNormalize
-from rejeu.sb3.pickled import parse, tensors_of
-from rejeu.sb3.zoo import model_in, notes_beside, read_yaml, statistics_beside
 from tests.tiers import exhaustive
 from tests.torch_files import (
     Tensor,

@@ -43,9 +43,9 @@ def rejeu_ring(kind: str, rows: int) -> Any:
 
     The buffer of parking includes the data for the hindsight strategy ``future``.
     """
-    from rejeu import spaces as own
-    from rejeu.buffers.hindsight import HindsightConfig, counters
-    from rejeu.buffers.ring import LAST, STEP, Ring
+    from rejeu.core import spaces as own
+    from rejeu.replay.hindsight import HindsightConfig, counters
+    from rejeu.replay.ring import LAST, STEP, Ring
 
     space = observation_space(kind)
     kept = counters(HindsightConfig() if kind == "parking" else None)

@@ -119,7 +119,7 @@ def time_learning(agent: Any, library: str, warm_up: int, unit: int, seconds: fl
     taken = run(steps)
     result: dict[str, Any] = {"seconds_per_step": taken / steps, "steps": steps, "seconds": taken}
     if library == "rejeu":
-        from rejeu import xla
+        from rejeu.core import xla
 
         spent = {part: value - before[part] for part, value in agent.seconds.items()}
         parts = {part: spent[part] / steps for part in ("env", "replay", "update")}

@@ -89,7 +89,7 @@ def off_policy(agent: Any, n_envs: int) -> dict[str, float]:
     """Returns the operations of one gradient step, and of acting for one environment step, of an off-policy agent."""
     import numpy as np
 
-    from rejeu.core import Clock
+    from rejeu.core.algorithm import Clock
 
     config, algorithm, shapes = agent.config, agent.learner.algorithm, agent.learner.shapes
     batch = agent.replay_buffer.sample(np.random.default_rng(0), (config.batch_size,))
@@ -102,7 +102,7 @@ def on_policy(agent: Any, n_envs: int) -> dict[str, float]:
     """Returns the operations of one update with all its epochs, and of acting, per environment step."""
     import numpy as np
 
-    from rejeu.core import Clock
+    from rejeu.core.algorithm import Clock
 
     config, algorithm, shapes = agent.config, agent.learner.algorithm, agent.learner.shapes
     rollout = agent.run.replay.rollout()

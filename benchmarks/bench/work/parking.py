@@ -39,7 +39,7 @@ def rejeu_job(folder: Path, backend: str, n_envs: int, settings: dict[str, Any],
     import jax
 
     import rejeu
-    from rejeu import xla
+    from rejeu.core import xla
 
     env: Any = rejeu.make_vector("parking-v0", n_envs, backend, seed=0)
     imported = time.perf_counter()

@@ -13,18 +13,18 @@ from typing import Any, TypeVar
 
 import gymnasium as gym
 
-from rejeu import presets as all_presets
+from rejeu.agents import presets as all_presets
 from rejeu.agents.agent import Agent as Agent
 from rejeu.agents.named import *  # noqa: F403
 from rejeu.agents.named import BUILT_IN
 from rejeu.agents.off_policy import OffPolicyAgent as OffPolicyAgent
 from rejeu.agents.on_policy import OnPolicyAgent as OnPolicyAgent
+from rejeu.agents.presets import Preset
 from rejeu.algorithms import config as configs
-from rejeu.errors import CheckpointError
-from rejeu.io import checkpoint
-from rejeu.io.records import shown
-from rejeu.presets import Preset
-from rejeu.runs.folder import find_model
+from rejeu.checkpoints.run_folder import find_model
+from rejeu.core import checkpoint
+from rejeu.core.errors import CheckpointError
+from rejeu.core.records import shown
 
 A = TypeVar("A", bound=type[Agent])
 

@@ -9,20 +9,19 @@ from typing import TYPE_CHECKING, Any, Self
 import jax
 import numpy as np
 
-from rejeu import core, devices, spaces
-from rejeu.agents import model_files, policy, resume, training
+from rejeu.agents import policy, summary, training
 from rejeu.agents.base import BaseAgent
-from rejeu.agents.run_files import RunFolder, run_folder
 from rejeu.callbacks.base import Callback
+from rejeu.checkpoints import model_files, resume
+from rejeu.checkpoints.run_files import RunFolder, run_folder
+from rejeu.checkpoints.run_folder import find_model
+from rejeu.core import algorithm as core, checkpoint, devices, spaces
+from rejeu.core.validation import number, whole
 from rejeu.envs.base import seed_of_run
 from rejeu.envs.masks import split
-from rejeu.io import checkpoint
-from rejeu.reporting import summary
-from rejeu.reporting.evaluation import Evaluation, evaluate
-from rejeu.reporting.formatting import counted
-from rejeu.reporting.logging import Logger, Sink
-from rejeu.runs.folder import find_model
-from rejeu.validation import number, whole
+from rejeu.logs.evaluation import Evaluation, evaluate
+from rejeu.logs.formatting import counted
+from rejeu.logs.logging import Logger, Sink
 
 if TYPE_CHECKING:
     from rejeu.agents.exporting import Exported, Target
@@ -64,8 +63,8 @@ class Agent(BaseAgent):
             episodes: stop after this number of episodes, over all environments.
             minutes: stop after so many, without compilation. Schedules follow the nearest limit; with
                 ``reset_num_timesteps=False`` earlier episodes and training time count as earlier steps do.
-            sinks: further outputs for the rows of statistics, such as ``rejeu.reporting.logging.CsvFile(path)`` or
-                ``rejeu.reporting.trackers.WandB(project="car")``; they are not closed.
+            sinks: further outputs for the rows of statistics, such as ``rejeu.logs.logging.CsvFile(path)`` or
+                ``rejeu.logs.trackers.WandB(project="car")``; they are not closed.
 
         Without any limit, an agent from :meth:`resume` completes the ``learn`` that was interrupted, with the limits and
         the ``log_interval`` of that call.
@@ -379,7 +378,7 @@ class Agent(BaseAgent):
         self.drop_rollout()
 
     def summary(self) -> str:
-        """Returns a table of the networks, their layers and numbers of parameters; see :mod:`rejeu.reporting.summary`."""
+        """Returns a table of the networks, their layers and numbers of parameters; see :mod:`rejeu.agents.summary`."""
         return summary.describe(self.learner.shapes, self.obs_leaves)
 
 

@@ -20,25 +20,25 @@ import gymnasium as gym
 import jax
 import numpy as np
 
-from rejeu import devices, hardware, spaces, validation, xla
 from rejeu.algorithms import config as configs, contract
 from rejeu.algorithms.rnd import with_rnd
 from rejeu.callbacks.base import Stateful
-from rejeu.core import Algorithm, Masked, names
+from rejeu.core import devices, hardware, spaces, validation, xla
+from rejeu.core.algorithm import Algorithm, Masked, names
+from rejeu.core.failed_writes import FailedWrites
+from rejeu.core.normalization import normalized
+from rejeu.core.validation import number, whole, whole_seed
 from rejeu.envs.make import Backend, VectorEnv
 from rejeu.envs.masks import mask_leaf, n_choices
 from rejeu.exploration import explorer as exploration
 from rejeu.exploration.noise import Noise, check_fits
-from rejeu.io.failed_writes import FailedWrites
-from rejeu.loops import finite
-from rejeu.loops.device import Stops
-from rejeu.loops.learner import Learner, PackedState
-from rejeu.loops.run import Progress, Run, TrainingCall, initial_run
-from rejeu.normalization import normalized
-from rejeu.reporting.formatting import counted, html_table
-from rejeu.reporting.history import History
-from rejeu.reporting.logging import Logger, check_logs
-from rejeu.validation import number, whole, whole_seed
+from rejeu.logs.formatting import counted, html_table
+from rejeu.logs.history import History
+from rejeu.logs.logging import Logger, check_logs
+from rejeu.training import finite
+from rejeu.training.compiled import Stops
+from rejeu.training.learner import Learner, PackedState
+from rejeu.training.run import Progress, Run, TrainingCall, initial_run
 
 BEST_WINDOW = 20
 """Default number of training episodes over whose mean return the best weights are chosen."""
@@ -165,7 +165,7 @@ class BaseAgent(ABC):
     last_saved: Path | None = None
     """The newest file that :meth:`save` wrote."""
     report_folder: Path | None = None
-    """Where a batch that led to a non-finite number is saved; None: see :func:`rejeu.loops.finite.folder_of`."""
+    """Where a batch that led to a non-finite number is saved; None: see :func:`rejeu.training.finite.folder_of`."""
     made_from_id: bool = False
     """Whether the environments were made from an id."""
     trained_on: tuple[str, Mapping[str, Any]] | None = None

@@ -10,21 +10,21 @@ from typing import Any
 import jax
 import numpy as np
 
-from rejeu import devices
 from rejeu.agents.base import BaseAgent
 from rejeu.algorithms.config import OffPolicyConfig
-from rejeu.buffers.hindsight import HerReplayBuffer, takes_generator
-from rejeu.buffers.rollout import RolloutBuffer
-from rejeu.buffers.uniform import ReplayBuffer
 from rejeu.callbacks.base import Periodic, TrainingCallback
+from rejeu.core import devices
 from rejeu.envs.functional.vector import reset_all
 from rejeu.envs.masks import functional_vector
-from rejeu.loops.device import Stops
-from rejeu.loops.device.off_policy import most_updates
-from rejeu.loops.device.program import MAX_TURNS
-from rejeu.loops.device.trainer import vector_of
-from rejeu.loops.learner import Learner
-from rejeu.loops.run import Progress, Run, TrainingCall
+from rejeu.replay.hindsight import HerReplayBuffer, takes_generator
+from rejeu.replay.rollout import RolloutBuffer
+from rejeu.replay.uniform import ReplayBuffer
+from rejeu.training.compiled import Stops
+from rejeu.training.compiled.off_policy import most_updates
+from rejeu.training.compiled.program import MAX_TURNS
+from rejeu.training.compiled.trainer import vector_of
+from rejeu.training.learner import Learner
+from rejeu.training.run import Progress, Run, TrainingCall
 
 GIB = 2**30
 COPIES = 3

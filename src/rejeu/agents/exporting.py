@@ -14,18 +14,17 @@ import gymnasium as gym
 import jax
 import numpy as np
 
-from rejeu import spaces, xla
 from rejeu.agents.base import BaseAgent
-from rejeu.buffers.ring import stacked_leaves
-from rejeu.core import Masked
+from rejeu.core import atomic, spaces, xla
+from rejeu.core.algorithm import Masked
 from rejeu.envs.make import VectorEnv
 from rejeu.envs.masks import mask_leaf
 from rejeu.envs.registry import maker, register
 from rejeu.export import c_file, check, stablehlo_file, web_file
 from rejeu.export.check import Check, Recording, Run
 from rejeu.export.contract import CARD, FrameStack, Policy, frame_stack_of, policy_of
-from rejeu.io import atomic
-from rejeu.loops import finite
+from rejeu.replay.ring import stacked_leaves
+from rejeu.training import finite
 
 Target = Literal["onnx", "c", "stablehlo", "web"]
 SUFFIXES: dict[str, str] = {"onnx": ".onnx", "c": ".c", "stablehlo": ".stablehlo", "web": ".html"}

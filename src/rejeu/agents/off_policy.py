@@ -9,25 +9,24 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 
-from rejeu import spaces
-from rejeu.agents import model_files
 from rejeu.agents.agent import Agent
 from rejeu.algorithms.config import OffPolicyConfig
-from rejeu.buffers import ring_io
-from rejeu.buffers.hindsight import HerReplayBuffer, counters
-from rejeu.buffers.prioritized import Priorities, PriorityConfig
-from rejeu.buffers.ring import Ring
-from rejeu.buffers.uniform import ReplayBuffer
+from rejeu.checkpoints import model_files
+from rejeu.core import checkpoint, spaces
+from rejeu.core.errors import CheckpointError
+from rejeu.core.records import brief
 from rejeu.envs.goals import GoalFunctions
 from rejeu.envs.make import Backend, VectorEnv, make_vector
 from rejeu.envs.masks import make_masked
-from rejeu.errors import CheckpointError
 from rejeu.exploration.noise import Noise, for_actions
-from rejeu.io import checkpoint
-from rejeu.io.records import brief
-from rejeu.loops.device import train_one
-from rejeu.loops.off_policy import begin_episodes, off_policy, offline
-from rejeu.loops.run import Progress
+from rejeu.replay import ring_io
+from rejeu.replay.hindsight import HerReplayBuffer, counters
+from rejeu.replay.prioritized import Priorities, PriorityConfig
+from rejeu.replay.ring import Ring
+from rejeu.replay.uniform import ReplayBuffer
+from rejeu.training.compiled import train_one
+from rejeu.training.off_policy import begin_episodes, off_policy, offline
+from rejeu.training.run import Progress
 
 if TYPE_CHECKING:
     from rejeu.demonstrations import Demonstrations

@@ -8,18 +8,18 @@ from typing import Any
 import jax
 import numpy as np
 
-from rejeu import devices, spaces
 from rejeu.agents import policy
 from rejeu.agents.agent import Agent
 from rejeu.algorithms.rollout_config import RolloutConfig
-from rejeu.buffers.rollout import RolloutBuffer
+from rejeu.core import devices, spaces
 from rejeu.envs.make import Backend, VectorEnv, make_vector
 from rejeu.envs.masks import make_masked, split
 from rejeu.exploration.noise import Noise
-from rejeu.loops import finite
-from rejeu.loops.device import train_one
-from rejeu.loops.on_policy import begin_episodes, on_policy
-from rejeu.loops.run import Progress
+from rejeu.replay.rollout import RolloutBuffer
+from rejeu.training import finite
+from rejeu.training.compiled import train_one
+from rejeu.training.on_policy import begin_episodes, on_policy
+from rejeu.training.run import Progress
 
 
 class OnPolicyAgent(Agent):

@@ -10,14 +10,14 @@ import gymnasium as gym
 import jax
 import numpy as np
 
-from rejeu import devices, spaces
 from rejeu.agents.base import BaseAgent
+from rejeu.core import devices, spaces
 from rejeu.envs.envpool import envpool_knows
 from rejeu.envs.make import VectorEnv
 from rejeu.envs.masks import split
 from rejeu.envs.registry import maker, register
-from rejeu.loops import finite
-from rejeu.loops.run import clock_of
+from rejeu.training import finite
+from rejeu.training.run import clock_of
 
 CRITICS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "min": lambda values: values.min(axis=0),
@@ -224,7 +224,7 @@ def lent(agent: BaseAgent, vector: VectorEnv, seeded: bool = False) -> Iterator[
 
 
 def policy(agent: BaseAgent, deterministic: bool) -> Callable[[Any, np.ndarray], np.ndarray]:
-    """Returns the policy as a function for :func:`rejeu.reporting.evaluation.evaluate`, which keeps a recurrent state."""
+    """Returns the policy as a function for :func:`rejeu.logs.evaluation.evaluate`, which keeps a recurrent state."""
     memory: Any = None
 
     def choose(obs: Any, ended: np.ndarray) -> np.ndarray:

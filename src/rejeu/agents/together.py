@@ -14,24 +14,24 @@ from typing import Any, TypeVar
 
 import jax
 
-from rejeu import devices, hardware, xla
 from rejeu.agents import device, training
 from rejeu.agents.agent import Agent
 from rejeu.agents.device import require_memory
 from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.callbacks.base import Callback, in_order, listed
 from rejeu.callbacks.progress_bar import ProgressBar
+from rejeu.core import devices, hardware, xla
+from rejeu.core.interrupt import Interrupt
+from rejeu.core.validation import whole, whole_seed
 from rejeu.envs.functional import is_functional
 from rejeu.envs.functional.protocol import FunctionalEnv
 from rejeu.envs.make import make_vector
 from rejeu.exploration import explorer as exploration
-from rejeu.interrupt import Interrupt
-from rejeu.loops import finite
-from rejeu.loops.device import Stops, train
-from rejeu.loops.finite import NonFiniteUpdate
-from rejeu.loops.run import TrainingCall
-from rejeu.reporting.logging import Sink
-from rejeu.validation import whole, whole_seed
+from rejeu.logs.logging import Sink
+from rejeu.training import finite
+from rejeu.training.compiled import Stops, train
+from rejeu.training.finite import NonFiniteUpdate
+from rejeu.training.run import TrainingCall
 
 A = TypeVar("A", bound=Agent)
 IN_REPLAY = ("gamma",)

@@ -11,18 +11,18 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from rejeu import schedules, xla
 from rejeu.agents import device
 from rejeu.agents.base import BaseAgent, Best
 from rejeu.algorithms import config as configs
 from rejeu.callbacks.base import Callback, called, in_order, listed, listening, stateful
 from rejeu.callbacks.progress_bar import ProgressBar
+from rejeu.core import schedules, xla
+from rejeu.core.interrupt import Interrupt
 from rejeu.exploration.noise import warn_without_noise
-from rejeu.interrupt import Interrupt
-from rejeu.loops import finite
-from rejeu.loops.finite import NonFiniteUpdate
-from rejeu.loops.run import Episode, Progress, TrainingCall, checked_limits, time_shares
-from rejeu.reporting.logging import Console, RetryingSink, Sink, guarded, next_folder, open_log
+from rejeu.logs.logging import Console, RetryingSink, Sink, guarded, next_folder, open_log
+from rejeu.training import finite
+from rejeu.training.finite import NonFiniteUpdate
+from rejeu.training.run import Episode, Progress, TrainingCall, checked_limits, time_shares
 
 TABLE_SECONDS = 2.0
 """Least time between two tables that ``verbose=1`` prints; other outputs get every row."""

@@ -36,9 +36,9 @@ from rejeu.algorithms.actor_critic.steps import (
     samples,
     standardized,
 )
-from rejeu.core import EXPLAINED_VARIANCE, Algorithm, Clock, Metrics, PyTree, Rollout
-from rejeu.schedules import Schedule, at
-from rejeu.validation import coerce, flag, number
+from rejeu.core.algorithm import EXPLAINED_VARIANCE, Algorithm, Clock, Metrics, PyTree, Rollout
+from rejeu.core.schedules import Schedule, at
+from rejeu.core.validation import coerce, flag, number
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -28,16 +28,16 @@ import jax.numpy as jnp
 from gymnasium import spaces
 from jax import Array
 
-from rejeu import schedules
 from rejeu.algorithms.config import network_inputs
 from rejeu.algorithms.rollout_config import RolloutConfig
 from rejeu.algorithms.search import LogUniform, SearchSpace
-from rejeu.core import Algorithm, Clock, Explorer, Metrics, PyTree, Rollout
+from rejeu.core import schedules
+from rejeu.core.algorithm import Algorithm, Clock, Explorer, Metrics, PyTree, Rollout
+from rejeu.core.prng import nth
+from rejeu.core.schedules import Schedule, at
+from rejeu.core.spaces import action_dimension, check_action
+from rejeu.core.validation import coerce, flag, number, whole
 from rejeu.networks import Network, Widths
-from rejeu.prng import nth
-from rejeu.schedules import Schedule, at
-from rejeu.spaces import action_dimension, check_action
-from rejeu.validation import coerce, flag, number, whole
 
 SMALLEST_DEVIATION = 1e-6
 """Added to the standard deviation of returns, which is 0 where all are equal."""

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from rejeu import xla
+from rejeu.core import xla
 
 
 def make_atoms(v_min: float, v_max: float, n_atoms: int) -> Array:

@@ -16,19 +16,19 @@ from typing import Any, ClassVar, Literal
 import optax
 from gymnasium import spaces
 
-from rejeu import normalization, schedules
 from rejeu.algorithms import optimizers, search
 from rejeu.algorithms.search import SearchSpace
-from rejeu.buffers.hindsight import STRATEGIES, HerReplayBuffer, HindsightConfig
-from rejeu.buffers.prioritized import PriorityConfig
-from rejeu.errors import MissingObjectError
+from rejeu.core import normalization, schedules
+from rejeu.core.errors import MissingObjectError
+from rejeu.core.normalization import NormalizationConfig
+from rejeu.core.schedules import Schedule
+from rejeu.core.spaces import Leaf, leaves
+from rejeu.core.validation import C, assign, build, choice, coerce, flag, nested, number, whole
 from rejeu.exploration import noise as action_noises
 from rejeu.exploration.parameter_space import ParameterNoise
 from rejeu.networks import ENCODERS, MemoryConfig, PolicyConfig, Widths, reads_image, settled
-from rejeu.normalization import NormalizationConfig
-from rejeu.schedules import Schedule
-from rejeu.spaces import Leaf, leaves
-from rejeu.validation import C, assign, build, choice, coerce, flag, nested, number, whole
+from rejeu.replay.hindsight import STRATEGIES, HerReplayBuffer, HindsightConfig
+from rejeu.replay.prioritized import PriorityConfig
 
 REPLAY_BUFFERS = {"ReplayBuffer": None, "HerReplayBuffer": HindsightConfig}
 """The replay buffers by name, and the configuration of each."""
@@ -171,7 +171,7 @@ class OffPolicyConfig(AlgorithmConfig):
     ``"ou(0.2)"``, an object such as ``NormalActionNoise(mean, sigma)``, or one of your own. None for no noise."""
     replay_buffer_class: str | type = "ReplayBuffer"
     """``HerReplayBuffer`` relabels goals in hindsight and needs a goal environment; ``ReplayBuffer`` or None does not.
-    Or a class of your own with the constructor and methods of one of them, such as a subclass; see ``rejeu.buffers``."""
+    Or a class of your own with the constructor and methods of one of them, such as a subclass; see ``rejeu.replay``."""
     replay_buffer_kwargs: HindsightConfig | tuple[tuple[str, Any], ...] | None = None
     """Settings of the replay buffer: ``n_sampled_goal`` and ``goal_selection_strategy`` for ``HerReplayBuffer``;
     further keyword arguments for a class of your own."""

@@ -42,15 +42,25 @@ from rejeu.algorithms.sac.continuous import (
     temperature_step,
 )
 from rejeu.algorithms.search import Integers, SearchSpace
-from rejeu.core import Algorithm, Clock, Metrics, Optimizer, PyTree, Transition, ensemble, minimize, weighted_mean
-from rejeu.distributions import TanhNormal
+from rejeu.core.algorithm import (
+    Algorithm,
+    Clock,
+    Metrics,
+    Optimizer,
+    PyTree,
+    Transition,
+    ensemble,
+    minimize,
+    weighted_mean,
+)
+from rejeu.core.distributions import TanhNormal
+from rejeu.core.prng import nth
+from rejeu.core.schedules import Schedule, at
+from rejeu.core.spaces import Leaf, action_dimension, check_box_action, leaves
+from rejeu.core.validation import coerce, whole
 from rejeu.exploration.held_noise import held_explorer
 from rejeu.networks import PolicyConfig, Widths, action_values, values_by_critics
 from rejeu.networks.batch_renorm import RenormalizedMLP, RenormalizedNetwork, with_statistics
-from rejeu.prng import nth
-from rejeu.schedules import Schedule, at
-from rejeu.spaces import Leaf, action_dimension, check_box_action, leaves
-from rejeu.validation import coerce, whole
 
 ACTOR_LAYERS = (256, 256)
 """Default widths of the actor."""

@@ -49,7 +49,7 @@ from rejeu.algorithms import categorical, optimizers, search
 from rejeu.algorithms.config import OffPolicyConfig, network_inputs
 from rejeu.algorithms.memory import remembering
 from rejeu.algorithms.search import SearchSpace
-from rejeu.core import (
+from rejeu.core.algorithm import (
     AVERAGED,
     TD_ERROR,
     Algorithm,
@@ -66,14 +66,14 @@ from rejeu.core import (
     weighted_mean,
     without_gradient,
 )
-from rejeu.distributions import forbid
+from rejeu.core.distributions import forbid
+from rejeu.core.prng import nth
+from rejeu.core.schedules import Exponential, Linear, Schedule, at
+from rejeu.core.spaces import Leaf, check_discrete_action, nth_allowed
+from rejeu.core.validation import LARGEST_VALUE, MOST_OUTPUTS, choice, coerce, flag, number, whole
 from rejeu.exploration.noise import NoiseProcess
 from rejeu.networks import MLP, Network, PolicyConfig, Torso, Widths, make_encoder, make_head, make_torso, with_memory
 from rejeu.networks.noisy import drawn, noisy
-from rejeu.prng import nth
-from rejeu.schedules import Exponential, Linear, Schedule, at
-from rejeu.spaces import Leaf, check_discrete_action, nth_allowed
-from rejeu.validation import LARGEST_VALUE, MOST_OUTPUTS, choice, coerce, flag, number, whole
 
 MARGIN = 0.8
 """By how much a demonstrated action should be better than the others; that of arXiv 1704.03732."""

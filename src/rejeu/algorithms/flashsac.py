@@ -13,8 +13,8 @@ policy ``pi``, critics that give distributions ``Z_i`` of the return over 101 va
     Z'_i                       <- Z'_i + tau (Z_i - Z'_i)
 
 Rewards are divided so that returns fit the values of the critics: by the standard deviation of the returns, but at least by
-the largest return in size over ``value_limit`` (:mod:`rejeu.normalization`). The networks are inverted residual blocks with
-batch normalization, and after each step weights and gains are scaled to a fixed norm (:mod:`rejeu.networks.projected`). A
+the largest return in size over ``value_limit`` (:mod:`rejeu.core.normalization`). The networks are inverted residual blocks
+with batch normalization, and after each step weights and gains are scaled to a fixed norm (:mod:`rejeu.networks.projected`). A
 network goes by the statistics of the batch, which for the critics has both halves and for the actor the observations of both,
 only in its own loss. The actor and the temperature, whose loss is SAC's, take a step at every ``policy_delay``-th update. The
 target entropy is that of a normal distribution with the standard deviation 0.15, and exploring noise is held
@@ -45,7 +45,7 @@ from rejeu.algorithms.sac.continuous import (
     metrics_of,
 )
 from rejeu.algorithms.search import Choice, Integers, SearchSpace
-from rejeu.core import (
+from rejeu.core.algorithm import (
     Algorithm,
     Clock,
     Metrics,
@@ -58,16 +58,16 @@ from rejeu.core import (
     weighted_mean,
     without_gradient,
 )
-from rejeu.distributions import TanhNormal
+from rejeu.core.distributions import TanhNormal
+from rejeu.core.normalization import NormalizationConfig
+from rejeu.core.prng import nth
+from rejeu.core.schedules import Linear, Schedule, at
+from rejeu.core.spaces import Leaf, action_dimension, check_box_action, leaves
+from rejeu.core.validation import LARGEST_VALUE, MOST_OUTPUTS, coerce, number, whole
 from rejeu.exploration.held_noise import held_explorer
 from rejeu.networks import PolicyConfig, Widths
 from rejeu.networks.batch_renorm import RenormalizedNetwork, with_statistics
 from rejeu.networks.projected import InvertedResidual, head, projected
-from rejeu.normalization import NormalizationConfig
-from rejeu.prng import nth
-from rejeu.schedules import Linear, Schedule, at
-from rejeu.spaces import Leaf, action_dimension, check_box_action, leaves
-from rejeu.validation import LARGEST_VALUE, MOST_OUTPUTS, coerce, number, whole
 
 ACTOR_LAYERS = (128, 128)
 """Default widths of the actor's blocks."""

@@ -28,7 +28,7 @@ from jax import Array
 
 from rejeu.algorithms import optimizers, search
 from rejeu.algorithms.config import OffPolicyConfig, network_inputs
-from rejeu.core import (
+from rejeu.core.algorithm import (
     AVERAGED,
     TD_ERROR,
     Algorithm,
@@ -42,11 +42,11 @@ from rejeu.core import (
     polyak,
     weighted_mean,
 )
-from rejeu.distributions import Normal
+from rejeu.core.distributions import Normal
+from rejeu.core.schedules import at
+from rejeu.core.spaces import action_dimension, check_box_action
+from rejeu.core.validation import coerce, number, whole
 from rejeu.networks import Network, QNetwork, action_values, values_by_critics
-from rejeu.schedules import at
-from rejeu.spaces import action_dimension, check_box_action
-from rejeu.validation import coerce, number, whole
 
 HIDDEN_LAYERS = (256, 256)
 """Default widths of all networks but on images, those of the paper."""

@@ -33,11 +33,11 @@ from rejeu.algorithms import optimizers
 from rejeu.algorithms.dqn import HIDDEN_LAYERS, Dueling, QLearningConfig, Returns, parted, q_learning, taken
 from rejeu.algorithms.qrdqn import quantile_loss, quantile_target
 from rejeu.algorithms.quantile_loss import quantile_fractions
-from rejeu.core import Algorithm, PyTree, rows_read
+from rejeu.core.algorithm import Algorithm, PyTree, rows_read
+from rejeu.core.schedules import Schedule
+from rejeu.core.spaces import Leaf
+from rejeu.core.validation import MOST_OUTPUTS, coerce, whole
 from rejeu.networks import Linear, Network, PolicyConfig, Torso, make_encoder, make_torso
-from rejeu.schedules import Schedule
-from rejeu.spaces import Leaf
-from rejeu.validation import MOST_OUTPUTS, coerce, whole
 
 
 @dataclass(frozen=True, kw_only=True)

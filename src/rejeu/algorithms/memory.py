@@ -8,7 +8,7 @@ from typing import Any
 import jax.numpy as jnp
 from jax import Array
 
-from rejeu.core import Algorithm, Clock, Explorer, Masked, PyTree, Remembered, unmasked
+from rejeu.core.algorithm import Algorithm, Clock, Explorer, Masked, PyTree, Remembered, unmasked
 from rejeu.networks import MemoryConfig, Recurrent
 
 
@@ -18,8 +18,8 @@ def remembering(
     """Returns an algorithm whose networks may have a memory as one that acts with it; unchanged if they have none.
 
     Args:
-        algorithm: how it acts and learns with the observations of :class:`rejeu.core.Remembered`, and
-            :class:`rejeu.core.Sequences`.
+        algorithm: how it acts and learns with the observations of :class:`rejeu.core.algorithm.Remembered`, and
+            :class:`rejeu.core.algorithm.Sequences`.
         shape: the settings of the networks.
         networks: returns the networks with memory of a state, the one that acts first.
     """

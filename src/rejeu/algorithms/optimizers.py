@@ -1,8 +1,8 @@
 """The optimizers that the setting ``optimizer`` names, and how one of your own is used.
 
 Algorithms keep the learning rate apart, because it may follow a schedule: an optimizer here turns gradients into a
-direction, and :func:`rejeu.core.descend` subtracts ``learning_rate`` times that direction. An Optax optimizer of your own
-is created with the learning rate 1 and used in the same way::
+direction, and :func:`rejeu.core.algorithm.descend` subtracts ``learning_rate`` times that direction. An Optax optimizer of
+your own is created with the learning rate 1 and used in the same way::
 
     rejeu.SAC("MlpPolicy", env, optimizer="adamw")
     rejeu.SAC("MlpPolicy", env, optimizer=optax.lamb)
@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import optax
 
-from rejeu.core import Clipped, Elementwise, Optimizer
+from rejeu.core.algorithm import Clipped, Elementwise, Optimizer
 
 WEIGHT_DECAY = 1e-4
 """Decoupled weight decay of ``"adamw"``, which is multiplied by the learning rate as well."""
@@ -99,7 +99,9 @@ def parse(key: str, value: Any) -> Any:
 
 
 def make(optimizer: Any, max_norm: float | None = None, max_value: float | None = None, **adam: float) -> Optimizer:
-    """Returns a transformation from gradients to directions, without a learning rate, for :func:`rejeu.core.descend`.
+    """Returns a transformation from gradients to directions, without a learning rate.
+
+    :func:`rejeu.core.algorithm.descend` applies it.
 
     Args:
         optimizer: what :func:`parse` returned.

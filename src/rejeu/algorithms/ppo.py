@@ -32,7 +32,6 @@ import optax
 from gymnasium import spaces
 from jax import Array
 
-from rejeu import schedules
 from rejeu.algorithms import optimizers, search
 from rejeu.algorithms.actor_critic.config import OnPolicyConfig
 from rejeu.algorithms.actor_critic.network import ActorCritic, algorithm_of, checked
@@ -47,10 +46,11 @@ from rejeu.algorithms.actor_critic.steps import (
     standardized,
 )
 from rejeu.algorithms.search import SearchSpace
-from rejeu.core import EXPLAINED_VARIANCE, GRADIENT_STEPS, Algorithm, Clock, Metrics, PyTree, Rollout
-from rejeu.prng import nth
-from rejeu.schedules import Schedule, at
-from rejeu.validation import coerce, number, whole
+from rejeu.core import schedules
+from rejeu.core.algorithm import EXPLAINED_VARIANCE, GRADIENT_STEPS, Algorithm, Clock, Metrics, PyTree, Rollout
+from rejeu.core.prng import nth
+from rejeu.core.schedules import Schedule, at
+from rejeu.core.validation import coerce, number, whole
 
 ADAM_EPSILON = 1e-5
 """Added to Adam's denominator, as in the authors' code."""

@@ -35,12 +35,12 @@ from rejeu.algorithms.config import network_inputs
 from rejeu.algorithms.dqn import check_epsilon, epsilon_greedy_algorithm, epsilon_schedule, metrics_of, taken
 from rejeu.algorithms.rollout_config import RolloutConfig
 from rejeu.algorithms.search import SearchSpace
-from rejeu.core import GRADIENT_STEPS, Algorithm, Clock, Metrics, PyTree, Rollout, minimize
+from rejeu.core.algorithm import GRADIENT_STEPS, Algorithm, Clock, Metrics, PyTree, Rollout, minimize
+from rejeu.core.prng import nth
+from rejeu.core.schedules import Linear, Schedule, at
+from rejeu.core.spaces import check_discrete_action
+from rejeu.core.validation import assign, coerce, number, whole
 from rejeu.networks import Network, PolicyConfig, Widths
-from rejeu.prng import nth
-from rejeu.schedules import Linear, Schedule, at
-from rejeu.spaces import check_discrete_action
-from rejeu.validation import assign, coerce, number, whole
 
 HIDDEN_LAYERS = (128, 128)
 """Default widths of the network but on images, those of the authors' code."""

@@ -28,9 +28,9 @@ from jax import Array
 from rejeu.algorithms import optimizers
 from rejeu.algorithms.dqn import QLearningConfig, Returns, q_learning, taken, value_network
 from rejeu.algorithms.quantile_loss import quantile_huber_loss
-from rejeu.core import Algorithm, PyTree
-from rejeu.schedules import Schedule
-from rejeu.validation import MOST_OUTPUTS, coerce, whole
+from rejeu.core.algorithm import Algorithm, PyTree
+from rejeu.core.schedules import Schedule
+from rejeu.core.validation import MOST_OUTPUTS, coerce, whole
 
 
 @dataclass(frozen=True, kw_only=True)

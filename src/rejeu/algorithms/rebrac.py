@@ -26,9 +26,9 @@ from jax import Array
 
 from rejeu.algorithms import search, td3
 from rejeu.algorithms.ddpg.continuous import policy
-from rejeu.core import Algorithm, Transition
+from rejeu.core.algorithm import Algorithm, Transition
+from rejeu.core.validation import coerce, flag, number
 from rejeu.networks import Network, QNetwork, Widths, action_values
-from rejeu.validation import coerce, flag, number
 
 
 @dataclass(frozen=True, kw_only=True)

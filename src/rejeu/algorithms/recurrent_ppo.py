@@ -34,11 +34,11 @@ from rejeu.algorithms.actor_critic.network import (
 from rejeu.algorithms.actor_critic.steps import Samples, flat, shuffled, with_advantages
 from rejeu.algorithms.ppo import ADAM_EPSILON, Losses, State, epochs, loss_of
 from rejeu.algorithms.search import Choice, SearchSpace
-from rejeu.core import Algorithm, Clock, Explorer, Masked, Metrics, PyTree, Rollout, renew, unmasked
+from rejeu.core.algorithm import Algorithm, Clock, Explorer, Masked, Metrics, PyTree, Rollout, renew, unmasked
+from rejeu.core.prng import nth
+from rejeu.core.spaces import Leaf
+from rejeu.core.validation import choice, coerce, flag, nested, whole
 from rejeu.networks import Cell, make_encoder
-from rejeu.prng import nth
-from rejeu.spaces import Leaf
-from rejeu.validation import choice, coerce, flag, nested, whole
 
 
 @dataclass(frozen=True)

@@ -26,11 +26,11 @@ from jax import Array
 from rejeu.algorithms import optimizers
 from rejeu.algorithms.actor_critic.steps import flat, masked_mean, minibatches
 from rejeu.algorithms.config import RndConfig
-from rejeu.core import Algorithm, Clock, Metrics, PyTree, Rollout, minimize, rows_read
+from rejeu.core.algorithm import Algorithm, Clock, Metrics, PyTree, Rollout, minimize, rows_read
+from rejeu.core.normalization import NormalizationConfig, Statistics, merged, normalizer_of
+from rejeu.core.prng import nth
+from rejeu.core.spaces import Leaf
 from rejeu.networks import Network, PolicyConfig
-from rejeu.normalization import NormalizationConfig, Statistics, merged, normalizer_of
-from rejeu.prng import nth
-from rejeu.spaces import Leaf
 
 HIDDEN_LAYERS = (128, 128)
 """Widths of both networks."""

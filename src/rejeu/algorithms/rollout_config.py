@@ -8,8 +8,8 @@ from typing import ClassVar
 from rejeu.algorithms import search
 from rejeu.algorithms.config import AlgorithmConfig
 from rejeu.algorithms.search import SearchSpace
+from rejeu.core.validation import coerce, whole
 from rejeu.networks import Widths
-from rejeu.validation import coerce, whole
 
 
 @dataclass(frozen=True, kw_only=True)

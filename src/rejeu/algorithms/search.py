@@ -17,7 +17,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from rejeu.validation import is_finite
+from rejeu.core.validation import is_finite
 
 
 @dataclass(frozen=True)

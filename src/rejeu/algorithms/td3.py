@@ -36,7 +36,7 @@ from rejeu.algorithms.ddpg.continuous import (
     policy,
 )
 from rejeu.algorithms.memory import remembering
-from rejeu.core import (
+from rejeu.core.algorithm import (
     AVERAGED,
     Algorithm,
     Clock,
@@ -52,11 +52,11 @@ from rejeu.core import (
     weighted_mean,
     without_gradient,
 )
+from rejeu.core.prng import nth
+from rejeu.core.schedules import at
+from rejeu.core.spaces import action_dimension, check_box_action
+from rejeu.core.validation import coerce, number, whole
 from rejeu.networks import Network, QNetwork, action_values, first, values_by_critics, with_memory
-from rejeu.prng import nth
-from rejeu.schedules import at
-from rejeu.spaces import action_dimension, check_box_action
-from rejeu.validation import coerce, number, whole
 
 
 @dataclass(frozen=True, kw_only=True)

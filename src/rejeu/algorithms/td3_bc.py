@@ -24,11 +24,11 @@ from jax import Array
 
 from rejeu.algorithms import search, td3
 from rejeu.algorithms.ddpg.continuous import action_value, policy
-from rejeu.core import Algorithm, Transition
+from rejeu.core.algorithm import Algorithm, Transition
+from rejeu.core.normalization import NormalizationConfig
+from rejeu.core.schedules import Schedule
+from rejeu.core.validation import coerce, number
 from rejeu.networks import Network, QNetwork, Widths, first
-from rejeu.normalization import NormalizationConfig
-from rejeu.schedules import Schedule
-from rejeu.validation import coerce, number
 
 
 @dataclass(frozen=True, kw_only=True)

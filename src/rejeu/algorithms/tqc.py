@@ -44,12 +44,21 @@ from rejeu.algorithms.sac.continuous import (
     policy,
 )
 from rejeu.algorithms.search import Integers, SearchSpace
-from rejeu.core import Algorithm, Clock, Metrics, PyTree, Transition, minimize, weighted_mean, without_gradient
+from rejeu.core.algorithm import (
+    Algorithm,
+    Clock,
+    Metrics,
+    PyTree,
+    Transition,
+    minimize,
+    weighted_mean,
+    without_gradient,
+)
+from rejeu.core.prng import nth
+from rejeu.core.schedules import at
+from rejeu.core.spaces import Leaf, action_dimension, check_box_action, leaves
+from rejeu.core.validation import MOST_OUTPUTS, coerce, whole
 from rejeu.networks import Network, QNetwork, each, with_dropout
-from rejeu.prng import nth
-from rejeu.schedules import at
-from rejeu.spaces import Leaf, action_dimension, check_box_action, leaves
-from rejeu.validation import MOST_OUTPUTS, coerce, whole
 
 
 @dataclass(frozen=True, kw_only=True)

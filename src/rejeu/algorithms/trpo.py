@@ -44,10 +44,19 @@ from rejeu.algorithms.actor_critic.steps import (
     standardized,
 )
 from rejeu.algorithms.search import LogUniform, NearOne, SearchSpace
-from rejeu.core import EXPLAINED_VARIANCE, GRADIENT_STEPS, Algorithm, Clock, Metrics, PyTree, Rollout, minimize
-from rejeu.prng import nth
-from rejeu.schedules import Schedule, at
-from rejeu.validation import coerce, number, whole
+from rejeu.core.algorithm import (
+    EXPLAINED_VARIANCE,
+    GRADIENT_STEPS,
+    Algorithm,
+    Clock,
+    Metrics,
+    PyTree,
+    Rollout,
+    minimize,
+)
+from rejeu.core.prng import nth
+from rejeu.core.schedules import Schedule, at
+from rejeu.core.validation import coerce, number, whole
 
 
 @dataclass(frozen=True, kw_only=True)

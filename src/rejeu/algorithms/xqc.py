@@ -18,10 +18,10 @@ from jax import Array
 
 from rejeu.algorithms import flashsac
 from rejeu.algorithms.flashsac import LOG_STD_RANGE, make
+from rejeu.core.normalization import NormalizationConfig
+from rejeu.core.schedules import Linear, Schedule
 from rejeu.networks import Widths
 from rejeu.networks.projected import NormalizedMLP
-from rejeu.normalization import NormalizationConfig
-from rejeu.schedules import Linear, Schedule
 
 __all__ = ["Config", "make"]
 ACTOR_LAYERS = (256, 256, 256, 256)

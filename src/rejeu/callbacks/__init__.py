@@ -17,8 +17,8 @@ from rejeu.callbacks.checkpoint import Checkpoint
 from rejeu.callbacks.evaluate import Evaluate, Evaluated
 from rejeu.callbacks.progress_bar import ProgressBar
 from rejeu.callbacks.record_video import RecordVideo
-from rejeu.loops.run import Episode, Progress
-from rejeu.validation import whole
+from rejeu.core.validation import whole
+from rejeu.training.run import Episode, Progress
 
 __all__ = [
     "Callback",

@@ -8,10 +8,10 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
-from rejeu.errors import CheckpointError
-from rejeu.interrupt import Stopped
-from rejeu.io.records import WRONG, brief, shown
-from rejeu.loops.run import Progress
+from rejeu.core.errors import CheckpointError
+from rejeu.core.interrupt import Stopped
+from rejeu.core.records import WRONG, brief, shown
+from rejeu.training.run import Progress
 
 Callback = Callable[[Any, Progress], bool | None]
 """Called after every step of the environments as ``callback(agent, progress)``. Only ``False`` stops training."""

@@ -10,10 +10,10 @@ from typing import Any, ClassVar
 import jax
 
 from rejeu.callbacks.base import TrainingCallback, crossed
-from rejeu.errors import NonFiniteError
-from rejeu.io.failed_writes import RETRY_SECONDS
-from rejeu.loops.run import Progress
-from rejeu.validation import number, whole
+from rejeu.core.errors import NonFiniteError
+from rejeu.core.failed_writes import RETRY_SECONDS
+from rejeu.core.validation import number, whole
+from rejeu.training.run import Progress
 
 MINUTES = 5.0
 """Wall time between two checkpoints by default."""

@@ -11,10 +11,10 @@ import gymnasium as gym
 import numpy as np
 
 from rejeu.callbacks.base import TrainingCallback, crossed, step_before
+from rejeu.core.validation import whole
 from rejeu.envs.make import VectorEnv, make_vector
-from rejeu.loops.run import Progress
-from rejeu.reporting.evaluation import Evaluation
-from rejeu.validation import whole
+from rejeu.logs.evaluation import Evaluation
+from rejeu.training.run import Progress
 
 EVALUATED = ("returns", "lengths", "successes")
 """The arrays of an :class:`Evaluation`."""

@@ -7,10 +7,10 @@ from collections import deque
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
-from rejeu import xla
 from rejeu.callbacks.base import TrainingCallback, step_before
-from rejeu.loops.run import Progress, TrainingCall, time_shares
-from rejeu.reporting import formatting
+from rejeu.core import xla
+from rejeu.logs import formatting
+from rejeu.training.run import Progress, TrainingCall, time_shares
 
 if TYPE_CHECKING:
     from rich.console import Console

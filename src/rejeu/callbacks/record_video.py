@@ -10,9 +10,9 @@ from typing import Any
 import gymnasium as gym
 
 from rejeu.callbacks.base import crossed, step_before
-from rejeu.loops.run import Progress
-from rejeu.reporting.video import record_video
-from rejeu.validation import whole
+from rejeu.core.validation import whole
+from rejeu.logs.video import record_video
+from rejeu.training.run import Progress
 
 DIGITS = 9
 """Of the step in the name of a video."""

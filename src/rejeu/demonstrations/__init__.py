@@ -27,19 +27,19 @@ import numpy as np
 import optax
 from gymnasium.envs.registration import EnvSpec
 
-from rejeu import interrupt, spaces
 from rejeu.algorithms.config import OffPolicyConfig
-from rejeu.core import Algorithm, Clock, Metrics, PyTree, averaged_fields, names
+from rejeu.core import interrupt, spaces
+from rejeu.core.algorithm import Algorithm, Clock, Metrics, PyTree, averaged_fields, names
+from rejeu.core.errors import MissingExtra
+from rejeu.core.validation import number, whole
 from rejeu.demonstrations import dataset
 from rejeu.envs.masks import for_agent, split
 from rejeu.envs.registry import make_env
-from rejeu.errors import MissingExtra
-from rejeu.loops.learner import Learner
-from rejeu.loops.off_policy import STEPS_OFFLINE, learn_from
+from rejeu.logs.formatting import counted
 from rejeu.networks.batch_renorm import in_training, is_normalized, with_statistics
 from rejeu.networks.projected import projected
-from rejeu.reporting.formatting import counted
-from rejeu.validation import number, whole
+from rejeu.training.learner import Learner
+from rejeu.training.off_policy import STEPS_OFFLINE, learn_from
 
 
 @dataclass(frozen=True, eq=False)

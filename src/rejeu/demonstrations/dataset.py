@@ -21,9 +21,8 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
-from rejeu import spaces
-from rejeu.io import atomic
-from rejeu.io.records import WRONG, brief, shown
+from rejeu.core import atomic, spaces
+from rejeu.core.records import WRONG, brief, shown
 
 METADATA, MAIN = "metadata.json", "main_data.hdf5"
 EPISODE = re.compile(r"episode_(\d{1,9})")
@@ -132,7 +131,7 @@ def parts(data: Path) -> list[Path]:
 
 
 def described(space: Any) -> Any:
-    """Returns Minari's description of a space as one of :func:`rejeu.spaces.describe`."""
+    """Returns Minari's description of a space as one of :func:`rejeu.core.spaces.describe`."""
     kind = space["type"]
     if kind == "Dict":
         return {kind: {key: described(one) for key, one in space["subspaces"].items()}}

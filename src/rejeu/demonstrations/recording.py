@@ -13,13 +13,13 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
+from rejeu.core import atomic
+from rejeu.core.errors import MissingExtra
+from rejeu.core.failed_writes import FailedWrites
 from rejeu.demonstrations import dataset
 from rejeu.envs.validation import id_of
-from rejeu.errors import MissingExtra
-from rejeu.io import atomic
-from rejeu.io.failed_writes import FailedWrites
-from rejeu.reporting.formatting import counted
-from rejeu.reporting.video import HOLD_SECONDS, VideoFile, ffmpeg
+from rejeu.logs.formatting import counted
+from rejeu.logs.video import HOLD_SECONDS, VideoFile, ffmpeg
 
 VIDEO_NAME = "video.mp4"
 

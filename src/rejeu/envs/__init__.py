@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from rejeu.envs.make import VectorEnv, make_vector
 
 if "rejeu/Ball-v0" not in gym.registry:
-    gym.register("rejeu/Ball-v0", "rejeu.envs.ball:Ball", max_episode_steps=500)
+    gym.register("rejeu/Ball-v0", "rejeu.teaching.ball:Ball", max_episode_steps=500)
 if "rejeu/CartPoleNoVelocity-v0" not in gym.registry:
     gym.register(
         "rejeu/CartPoleNoVelocity-v0",

@@ -15,8 +15,8 @@ import gymnasium as gym
 import jax
 import numpy as np
 
+from rejeu.core.errors import BadEnvironmentError
 from rejeu.envs.goals import GoalFunctions
-from rejeu.errors import BadEnvironmentError
 
 Seed = int | Sequence[int] | None
 """A number ``seed``, so that environment i is seeded with ``seed + i``; one number for each environment; or None."""
@@ -237,7 +237,7 @@ class VectorEnv(ABC):
         return False
 
     def snapshot(self) -> Any:
-        """Returns the state of the running environments as plain data (see :mod:`rejeu.io.records`).
+        """Returns the state of the running environments as plain data (see :mod:`rejeu.core.records`).
 
         None where the backend or an environment does not offer it.
         """

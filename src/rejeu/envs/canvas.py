@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rejeu.errors import MissingExtra
+from rejeu.core.errors import MissingExtra
 
 
 class Scene(NamedTuple):

@@ -16,11 +16,20 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env as check_gymnasium_env
 
+from rejeu.core.errors import BadEnvironmentError
+from rejeu.core.spaces import (
+    GOAL_KEYS,
+    bounded,
+    check_action,
+    check_goal_space,
+    check_policy,
+    members,
+    plain,
+    random_action,
+)
 from rejeu.envs import masks, validation
 from rejeu.envs.base import SEEDS_END
 from rejeu.envs.goals import attribute
-from rejeu.errors import BadEnvironmentError
-from rejeu.spaces import GOAL_KEYS, bounded, check_action, check_goal_space, check_policy, members, plain, random_action
 
 MOST_STEPS = 2_000
 """Random steps after which episodes are assumed never to end, in an environment that declares no time limit."""

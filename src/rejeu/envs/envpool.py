@@ -18,6 +18,8 @@ import gymnasium as gym
 import jax
 import numpy as np
 
+from rejeu.core.spaces import action_scaler, cast, check_env_actions, leaves, random_action
+from rejeu.core.validation import whole
 from rejeu.envs import goals as goals_module
 from rejeu.envs.base import SEEDS_END, SUCCESS_KEYS, DivergedError, Seed, Step, VectorEnv, checked_seed, replaced
 from rejeu.envs.goals import GoalFunctions
@@ -30,8 +32,6 @@ from rejeu.envs.registry import (
     register,
     unknown_environment,
 )
-from rejeu.spaces import action_scaler, cast, check_env_actions, leaves, random_action
-from rejeu.validation import whole
 
 STEP, STEP_SOME, RESET, RESET_SOME = range(4)
 BLOCK = 2**20
@@ -118,7 +118,7 @@ class ActionLog:
             self._open = bytearray()
 
     def to_plain(self) -> dict[str, Any]:
-        """Returns the log as plain data (see :mod:`rejeu.io.records`)."""
+        """Returns the log as plain data (see :mod:`rejeu.core.records`)."""
         return {"n_operations": self.n_operations, "blocks": [*self._blocks, _compressed(self._open)]}
 
     def operations(self, saved: dict[str, Any]) -> Iterator[Operation]:

@@ -12,11 +12,11 @@ import jax
 import numpy as np
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 
+from rejeu.core.errors import BadEnvironmentError, WorkerError
+from rejeu.core.spaces import leaves, plain
 from rejeu.envs import goals as goals_module, validation
 from rejeu.envs.base import SUCCESS_KEYS, Seed, Step, VectorEnv, describe_spec, each_info, each_seed, step_whole
 from rejeu.envs.goals import GoalFunctions
-from rejeu.errors import BadEnvironmentError, WorkerError
-from rejeu.spaces import leaves, plain
 
 SAME_ARRAY = (
     "the final observations of the first episodes of {} are those of the resets that followed: does it write all of them into "

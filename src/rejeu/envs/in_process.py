@@ -9,19 +9,19 @@ import gymnasium as gym
 import jax
 import numpy as np
 
+from rejeu.core.errors import BadEnvironmentError
+from rejeu.core.spaces import leaves, rows, structure
 from rejeu.envs import goals as goals_module, snapshot, validation
 from rejeu.envs.base import Seed, Step, VectorEnv, describe_spec, each_seed, success_of
 from rejeu.envs.goals import GoalFunctions
 from rejeu.envs.validation import convert_step
-from rejeu.errors import BadEnvironmentError
-from rejeu.spaces import leaves, rows, structure
 
 
 class InProcess(VectorEnv):
     """Gymnasium environments stepped one after the other in this process.
 
-    Invalid values raise :class:`rejeu.errors.BadEnvironmentError`, which names the environment and the step. Exceptions that
-    an environment raises itself are not changed.
+    Invalid values raise :class:`rejeu.core.errors.BadEnvironmentError`, which names the environment and the step. Exceptions
+    that an environment raises itself are not changed.
 
     Args:
         envs: the environments.

@@ -12,7 +12,7 @@ from typing import Any, Literal, NamedTuple
 
 import gymnasium as gym
 
-from rejeu import validation
+from rejeu.core import validation
 from rejeu.envs import functional
 from rejeu.envs.base import Seed, Step, VectorEnv, checked_seed
 from rejeu.envs.envpool import EnvPool, check_envpool_knows, envpool_knows
@@ -100,7 +100,7 @@ def make_vector(
         worker_timeout: seconds that workers have for a step or a reset before they count as hung; None: for ever. Of no
             meaning on other backends.
         restart_workers: how many workers that crashed, hung or were lost with their machine are restarted, with a warning,
-            and their episode counted as truncated there; after that, and by default, :class:`rejeu.errors.WorkerError` is
+            and their episode counted as truncated there; after that, and by default, :class:`rejeu.core.errors.WorkerError` is
             raised. Only for ``"gymnasium-async"`` and ``"ray"``, like the options that follow.
         wait_for: how many results off-policy algorithms take at a time, from 1 to ``n_envs``: those that arrive first.
             They are stored, and these environments continue while the others still step. None: all environments step

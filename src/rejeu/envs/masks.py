@@ -18,7 +18,9 @@ import numpy as np
 from gymnasium import spaces
 from jax import Array
 
-from rejeu.core import Masked
+from rejeu.core.algorithm import Masked
+from rejeu.core.errors import BadEnvironmentError
+from rejeu.core.spaces import Leaf
 from rejeu.envs import functional, snapshot
 from rejeu.envs.base import Seed
 from rejeu.envs.functional.protocol import FunctionalEnv
@@ -38,8 +40,6 @@ from rejeu.envs.make import (
 from rejeu.envs.registry import maker
 from rejeu.envs.validation import id_of
 from rejeu.envs.workers.pool import TIMEOUT
-from rejeu.errors import BadEnvironmentError
-from rejeu.spaces import Leaf
 
 OBSERVATION, MASK = "observation", "action_mask"
 """Keys of the observations of :class:`MaskInObservation`."""
@@ -138,7 +138,7 @@ def with_mask(make: Callable[[], gym.Env]) -> gym.Env:
 
 
 class MaskedVector(VectorEnv):
-    """A vector environment whose observations are :class:`rejeu.core.Masked`.
+    """A vector environment whose observations are :class:`rejeu.core.algorithm.Masked`.
 
     Args:
         inner: a vector of :class:`MaskInObservation` environments; with ``asks``, of any environments.

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
 
-from rejeu.errors import MissingExtra
+from rejeu.core.errors import MissingExtra
 
 PLAIN_ID = re.compile(r"[\w./-]{1,200}")
 """Pattern of ids that are looked up. An id with a colon makes Gymnasium import a module."""

@@ -14,7 +14,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from rejeu import hardware
+from rejeu.core import hardware
 from rejeu.envs.validation import describe_value, keeps_values
 
 DEFAULT_FPS = 30.0

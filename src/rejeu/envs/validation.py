@@ -20,8 +20,8 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from rejeu.errors import BadEnvironmentError
-from rejeu.spaces import Leaf, cast, leaves, parts
+from rejeu.core.errors import BadEnvironmentError
+from rejeu.core.spaces import Leaf, cast, leaves, parts
 
 FLAGS = frozenset((bool, np.bool_))
 """Types of ``terminated`` and ``truncated``."""
@@ -62,7 +62,7 @@ def to_array(value: Any, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
 
 
 def leaf_spaces(space: spaces.Space) -> list[spaces.Space]:
-    """Returns the spaces at the leaves of a space, in the order of :func:`rejeu.spaces.leaves`."""
+    """Returns the spaces at the leaves of a space, in the order of :func:`rejeu.core.spaces.leaves`."""
     if isinstance(space, spaces.Dict):
         return [part for key in sorted(space.spaces) for part in leaf_spaces(space.spaces[key])]
     if isinstance(space, spaces.Tuple):
@@ -117,7 +117,7 @@ def to_bool(flag: Any) -> bool:
 def make_writer(space: spaces.Space, stores: Sequence[np.ndarray]) -> Callable[[int, Any], None]:
     """Returns ``put(i, observation)``, which writes one observation into row ``i`` of each of the ``stores``.
 
-    ``stores`` hold the leaves of ``space`` in the order of :func:`rejeu.spaces.leaves`, ``(n_envs, *leaf.shape)``, of the
+    ``stores`` hold the leaves of ``space`` in the order of :func:`rejeu.core.spaces.leaves`, ``(n_envs, *leaf.shape)``, of the
     kept dtypes. Values of another dtype are cast if only precision is lost. ``put`` raises any exception for an invalid
     observation; :func:`observation_fault` then describes what is wrong.
     """
@@ -220,7 +220,7 @@ def copy_observation(space: spaces.Space, obs: Any) -> Any:
 
 
 def to_batch(space: spaces.Space, space_leaves: tuple[Leaf, ...], n_envs: int, obs: Any) -> Any:
-    """Returns the observations of a vector environment, converted by :func:`rejeu.spaces.cast`.
+    """Returns the observations of a vector environment, converted by :func:`rejeu.core.spaces.cast`.
 
     Raises:
         BadEnvironmentError: with the description only, if they are not ``(n_envs, *leaf.shape)`` at every leaf.

@@ -10,9 +10,9 @@ import numpy as np
 from gymnasium.envs.classic_control import CartPoleEnv
 from gymnasium.wrappers import TransformObservation
 
+from rejeu.core.spaces import check_goal_space, leaves
 from rejeu.envs import snapshot
 from rejeu.envs.goals import attribute
-from rejeu.spaces import check_goal_space, leaves
 
 
 class TimeLimitTerminates(gym.Wrapper, gym.utils.RecordConstructorArgs):

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from rejeu.core import Algorithm, Clock, Explorer, PyTree, renew
+from rejeu.core.algorithm import Algorithm, Clock, Explorer, PyTree, renew
 from rejeu.exploration import parameter_space
 from rejeu.exploration.noise import Noise, NoiseProcess
 from rejeu.exploration.parameter_space import ParameterNoise

@@ -15,8 +15,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from rejeu.core import Clock, Explorer, PyTree
-from rejeu.distributions import TanhNormal
+from rejeu.core.algorithm import Clock, Explorer, PyTree
+from rejeu.core.distributions import TanhNormal
 
 EXPONENT = 2.0
 """How fast long spells become rare."""

@@ -24,8 +24,8 @@ from gymnasium import spaces
 from jax import Array
 from numpy.typing import ArrayLike
 
+from rejeu.core.validation import assign
 from rejeu.exploration.parameter_space import ParameterNoise
-from rejeu.validation import assign
 
 PerDimension = Any
 """A number for all action dimensions, or a sequence of one for each; kept as a tuple of floats."""

@@ -28,11 +28,11 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from rejeu.core import Algorithm, Clock, PyTree
+from rejeu.core.algorithm import Algorithm, Clock, PyTree
+from rejeu.core.validation import coerce, number, whole
 from rejeu.networks import LayerNorm
 from rejeu.networks.batch_renorm import BatchRenorm
 from rejeu.networks.layers import RMSNorm
-from rejeu.validation import coerce, number, whole
 
 NORMALIZATION_LAYERS: tuple[type[eqx.Module], ...] = (
     LayerNorm,

@@ -11,11 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, ShapeDtypeStruct, export
 
-from rejeu import spaces
-from rejeu.core import Algorithm, Clock, Masked, PyTree
+from rejeu.core import spaces
+from rejeu.core.algorithm import Algorithm, Clock, Masked, PyTree
+from rejeu.core.spaces import Leaf
 from rejeu.exploration import explorer as exploration
 from rejeu.export.program import Program, trace
-from rejeu.spaces import Leaf
 
 Role = Literal["observation", "action_mask", "state", "episode_start", "noise", "action"]
 CARD = 1
@@ -31,7 +31,7 @@ class Port(NamedTuple):
     """Without the batch axis."""
     dtype: str
     low: Any = None
-    """Smallest values as of :func:`rejeu.spaces.describe`; None without bounds."""
+    """Smallest values as of :func:`rejeu.core.spaces.describe`; None without bounds."""
     high: Any = None
     """Largest values, likewise."""
     drawn: str = ""
@@ -226,7 +226,7 @@ def bounds(space: gym.Space) -> tuple[Any, Any]:
 
 
 def action_scaler(space: gym.Space) -> Callable[[Array], Array]:
-    """Returns :func:`rejeu.spaces.scale_action` in JAX: float32 instead of double precision, int32 instead of int64."""
+    """Returns :func:`rejeu.core.spaces.scale_action` in JAX: float32 instead of double precision, int32 instead of int64."""
     shape = (-1, *(space.shape or ()))
     if isinstance(space, gym.spaces.Box):
         bounded = spaces.bounded(space)

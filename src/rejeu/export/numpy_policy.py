@@ -10,13 +10,12 @@ from typing import Any
 import numpy as np
 from gymnasium.spaces import Box, Discrete, MultiBinary, MultiDiscrete
 
-from rejeu import spaces
 from rejeu.algorithms.catalog import CATALOG
-from rejeu.errors import CheckpointError
-from rejeu.io import checkpoint
-from rejeu.runs.folder import find_model
-from rejeu.spaces import Leaf
-from rejeu.validation import LARGEST_VALUE, MOST_OUTPUTS, number, whole
+from rejeu.checkpoints.run_folder import find_model
+from rejeu.core import checkpoint, spaces
+from rejeu.core.errors import CheckpointError
+from rejeu.core.spaces import Leaf
+from rejeu.core.validation import LARGEST_VALUE, MOST_OUTPUTS, number, whole
 
 Function = Callable[[np.ndarray], np.ndarray]
 GELU = math.sqrt(2 / math.pi)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from rejeu.errors import MissingExtra
+from rejeu.core.errors import MissingExtra
 from rejeu.export.contract import Policy
 from rejeu.export.loops import PRIMITIVES
 from rejeu.export.program import Operation, Value, unsupported

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 from jax import Array, ShapeDtypeStruct
 
-from rejeu import spaces
+from rejeu.core import spaces
 from rejeu.envs import functional
 from rejeu.envs.functional import FunctionalEnv
 from rejeu.export.contract import Policy

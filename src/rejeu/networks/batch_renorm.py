@@ -29,10 +29,10 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from rejeu.core import PyTree
+from rejeu.core.algorithm import PyTree
+from rejeu.core.spaces import Leaf
 from rejeu.networks.encoder import Encoder
 from rejeu.networks.layers import ACTIVATIONS, Linear
-from rejeu.spaces import Leaf
 
 Network = TypeVar("Network")
 

@@ -11,10 +11,10 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from rejeu.core import PyTree, unmasked
+from rejeu.core.algorithm import PyTree, unmasked
+from rejeu.core.spaces import Leaf
 from rejeu.networks.layers import LayerNorm, Linear, find_encoder, own_module
 from rejeu.networks.shape import PolicyConfig
-from rejeu.spaces import Leaf
 
 
 class Convolutions(NamedTuple):

@@ -11,8 +11,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array, ShapeDtypeStruct
 
-from rejeu import xla
-from rejeu.core import PyTree
+from rejeu.core import xla
+from rejeu.core.algorithm import PyTree
 
 M = TypeVar("M", bound=Callable[..., Any])
 ENCODERS: dict[str, Callable[..., Any]] = {}

@@ -3,9 +3,9 @@
 Cells: LSTM (Hochreiter and Schmidhuber 1997, with the forget gate of Gers et al. 2000) and GRU (Cho et al. 2014, arXiv
 1406.1078), in the form of PyTorch's documentation.
 
-Networks that learn from replay see their observations as :class:`rejeu.core.Sequences`, and unroll the cell over them from the
-memory that was stored when they acted (Kapturowski et al. 2019, "Recurrent Experience Replay in Distributed Reinforcement
-Learning", R2D2). All losses stay as they are, since what a network returns has one row for each transition.
+Networks that learn from replay see their observations as :class:`rejeu.core.algorithm.Sequences`, and unroll the cell over
+them from the memory that was stored when they acted (Kapturowski et al. 2019, "Recurrent Experience Replay in Distributed
+Reinforcement Learning", R2D2). All losses stay as they are, since what a network returns has one row for each transition.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from rejeu.core import PyTree, Remembered, Sequences, renew, unmasked
+from rejeu.core.algorithm import PyTree, Remembered, Sequences, renew, unmasked
+from rejeu.core.spaces import Leaf
+from rejeu.core.validation import choice, coerce, whole
 from rejeu.networks.encoder import make_encoder
 from rejeu.networks.shape import PolicyConfig
-from rejeu.spaces import Leaf
-from rejeu.validation import choice, coerce, whole
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,12 @@ import jax
 import jax.numpy as jnp
 from jax import Array, ShapeDtypeStruct
 
-from rejeu.core import PyTree
+from rejeu.core.algorithm import PyTree
+from rejeu.core.spaces import Leaf
 from rejeu.networks.encoder import make_encoder
 from rejeu.networks.layers import ACTIVATIONS, MLP, LayerNorm, Linear, own_module
 from rejeu.networks.memory import each
 from rejeu.networks.shape import PolicyConfig
-from rejeu.spaces import Leaf
 
 
 class Branches(eqx.Module):

@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from rejeu.core import PyTree
+from rejeu.core.algorithm import PyTree
 from rejeu.networks.layers import Linear, product
 
 SCALE = 0.5

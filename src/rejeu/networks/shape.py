@@ -8,9 +8,9 @@ from typing import Any, Literal, NamedTuple
 
 from jax import Array
 
+from rejeu.core.spaces import Leaf
+from rejeu.core.validation import assign, choice, coerce, flag, number, whole
 from rejeu.networks.layers import ACTIVATIONS, find_encoder
-from rejeu.spaces import Leaf
-from rejeu.validation import assign, choice, coerce, flag, number, whole
 
 
 class Widths(NamedTuple):

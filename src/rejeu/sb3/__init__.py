@@ -16,10 +16,10 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from rejeu.agents.zip_files import load_zip
     from rejeu.sb3.algorithms import A2C, DDPG, DQN, PPO, QRDQN, SAC, TD3, TQC, CrossQ, MaskablePPO, RecurrentPPO
     from rejeu.sb3.common.buffers import HerReplayBuffer
     from rejeu.sb3.common.utils import get_system_info
-    from rejeu.sb3.zip_files import load_zip
 
 __all__ = [
     "A2C",
@@ -57,7 +57,7 @@ def __getattr__(name: str) -> Any:
     elsewhere = {
         "HerReplayBuffer": "rejeu.sb3.common.buffers",
         "get_system_info": "rejeu.sb3.common.utils",
-        "load_zip": "rejeu.sb3.zip_files",
+        "load_zip": "rejeu.agents.zip_files",
     }
     return getattr(importlib.import_module(elsewhere.get(name, "rejeu.sb3.algorithms")), name)
 
@@ -104,6 +104,6 @@ for _name in ("A2C", "DDPG", "DQN", "PPO", "SAC", "TD3"):
     alias(_path, _name.lower(), "policies")
 define_lazily(
     f"{__name__}.her",
-    {"HerReplayBuffer": f"{__name__}.common.buffers", "GoalSelectionStrategy": "rejeu.buffers.hindsight"},
+    {"HerReplayBuffer": f"{__name__}.common.buffers", "GoalSelectionStrategy": "rejeu.replay.hindsight"},
 )
 alias(f"{__name__}.her", "goal_selection_strategy", "her_replay_buffer")

@@ -23,24 +23,26 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rejeu import agents, schedules, validation
-from rejeu.agents import Agent, model_files
+from rejeu import agents
+from rejeu.agents import Agent
 from rejeu.agents.base import AGENT_ARGUMENTS
 from rejeu.agents.off_policy import OffPolicyAgent
+from rejeu.agents.zip_files import load_zip, restore_windows
+from rejeu.agents.zoo import statistics_beside
 from rejeu.algorithms import config as configs
 from rejeu.algorithms.actor_critic.network import ActorCritic
 from rejeu.algorithms.actor_critic.steps import samples
 from rejeu.algorithms.config import REPLAY_BUFFERS
 from rejeu.callbacks.base import Callback, TrainingCallback
-from rejeu.core import Rollout
+from rejeu.checkpoints import model_files
+from rejeu.core import checkpoint, schedules, validation
+from rejeu.core.algorithm import Rollout
+from rejeu.core.errors import CheckpointError
 from rejeu.envs.masks import split
 from rejeu.envs.registry import register
 from rejeu.envs.wrappers import TimeLimitTerminates
-from rejeu.errors import CheckpointError
 from rejeu.exploration.noise import ActionNoise
-from rejeu.io import checkpoint
-from rejeu.loops import finite
-from rejeu.reporting import logging
+from rejeu.logs import logging
 from rejeu.sb3 import arguments, policy as policies
 from rejeu.sb3.common import base_callback, buffers, logger as loggers, utils
 from rejeu.sb3.common.env_util import is_wrapped, make_vec_env
@@ -51,8 +53,7 @@ from rejeu.sb3.common.torch_layers import encoder_of, register_again
 from rejeu.sb3.common.vec_env.vec_normalize import VecNormalize
 from rejeu.sb3.common.vec_env.vec_transpose import VecTransposeImage
 from rejeu.sb3.policy import BasePolicy
-from rejeu.sb3.zip_files import load_zip, restore_windows
-from rejeu.sb3.zoo import statistics_beside
+from rejeu.training import finite
 
 __all__ = [
     "A2C",

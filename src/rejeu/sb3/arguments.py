@@ -6,10 +6,10 @@ import warnings
 from collections.abc import Mapping
 from typing import Any
 
-from rejeu import validation
 from rejeu.agents import Agent
 from rejeu.agents.base import AGENT_ARGUMENTS
 from rejeu.algorithms.config import REPLAY_BUFFERS
+from rejeu.core import validation
 from rejeu.sb3.common import buffers, utils
 from rejeu.sb3.common.noise import VectorizedActionNoise
 from rejeu.sb3.common.torch_layers import encoder_of
@@ -96,7 +96,7 @@ def convert_buffer(settings: dict[str, Any]) -> None:
     if isinstance(kind, type) and issubclass(kind, buffers.ReplayBuffer):
         if kind.__name__ not in REPLAY_BUFFERS and kind.__module__ != buffers.__name__:
             raise TypeError(
-                f"replay_buffer_class={kind.__name__}: a class of your own derives from rejeu.buffers.ReplayBuffer, "
+                f"replay_buffer_class={kind.__name__}: a class of your own derives from rejeu.replay.ReplayBuffer, "
                 "which stores every observation once; the classes of rejeu.sb3.common.buffers show an agent's"
             )
         if kind is buffers.NStepReplayBuffer:

@@ -20,11 +20,11 @@ import jax.numpy as jnp
 import numpy as np
 from gymnasium import spaces
 
-from rejeu import spaces as rejeu_spaces
+from rejeu.core import spaces as rejeu_spaces
+from rejeu.core.spaces import as_batch
 from rejeu.sb3.common.distributions import Distribution, half_widths
 from rejeu.sb3.common.preprocessing import maybe_transpose
 from rejeu.sb3.common.utils import Tensor, is_vectorized_observation
-from rejeu.spaces import as_batch
 
 __all__ = [
     "ActorCriticCnnPolicy",

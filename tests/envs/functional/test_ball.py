@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rejeu.envs.ball import Ball as Reference
 from rejeu.envs.functional import ball, make
+from rejeu.teaching.ball import Ball as Reference
 
 
 class Kicks:

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import rejeu
-from rejeu.core import Masked
+from rejeu.core.algorithm import Masked
+from rejeu.core.errors import BadEnvironmentError
 from rejeu.envs.functional.gym_env import GymnasiumEnv
 from rejeu.envs.masks import make_masked
-from rejeu.errors import BadEnvironmentError
 from tests.jax_environments import Forbidden
 from tests.tiers import only
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import rejeu
+from rejeu.core.errors import MissingExtra
 from rejeu.envs.functional import mjx
-from rejeu.errors import MissingExtra
 
 HAS_MJX = importlib.util.find_spec("mujoco") is not None and importlib.util.find_spec("mujoco.mjx") is not None
 

@@ -14,10 +14,10 @@ import pytest
 from gymnasium import spaces
 
 import rejeu
-from rejeu.cli import main
+from rejeu.core.errors import BadEnvironmentError
 from rejeu.envs.functional import REGISTRY, FunctionalEnv, GoalEnv, make
 from rejeu.envs.functional.validation import check
-from rejeu.errors import BadEnvironmentError
+from rejeu.lab.cli import main
 
 ZERO, NO = jnp.float32(0.0), jnp.bool_(False)
 

@@ -7,14 +7,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from rejeu import schedules
 from rejeu.algorithms import search
 from rejeu.algorithms.rollout_config import RolloutConfig
 from rejeu.algorithms.search import SearchSpace
+from rejeu.core import schedules
+from rejeu.core.schedules import Schedule
+from rejeu.core.spaces import Leaf
+from rejeu.core.validation import assign, coerce, flag, number, whole
 from rejeu.networks import PolicyConfig, Widths, convolutions, split_net_arch
-from rejeu.schedules import Schedule
-from rejeu.spaces import Leaf
-from rejeu.validation import assign, coerce, flag, number, whole
 
 HIDDEN_LAYERS = (64, 64)
 """Default widths of policy and value."""

@@ -15,10 +15,10 @@ from jax import Array
 
 from rejeu.algorithms.actor_critic.config import HIDDEN_LAYERS, ActorCriticConfig, OnPolicyConfig, check_value_rate
 from rejeu.algorithms.config import network_inputs
-from rejeu.core import Algorithm, Clock, Explorer, PyTree, unmasked
-from rejeu.distributions import Bernoulli, Categorical, Joint, MultiCategorical, Normal, TanhNormal, forbid
+from rejeu.core.algorithm import Algorithm, Clock, Explorer, PyTree, unmasked
+from rejeu.core.distributions import Bernoulli, Categorical, Joint, MultiCategorical, Normal, TanhNormal, forbid
+from rejeu.core.spaces import Leaf, check_action, members
 from rejeu.networks import Convolution, Linear, Torso, make_encoder, make_head, make_torso
-from rejeu.spaces import Leaf, check_action, members
 
 LOG_STD_RANGE = (-20.0, 2.0)
 """Bounds of a log standard deviation that depends on the observation, in nats."""
@@ -73,7 +73,7 @@ class ActionKind(NamedTuple):
 
 
 def action_kind(space: spaces.Space) -> ActionKind:
-    """Returns the kind of a checked action space (see :func:`rejeu.spaces.check_action`)."""
+    """Returns the kind of a checked action space (see :func:`rejeu.core.spaces.check_action`)."""
     if isinstance(space, spaces.Box):
         return ActionKind("box", (int(np.prod(space.shape, dtype=int)),), False)
     if isinstance(space, spaces.Discrete):
@@ -200,7 +200,7 @@ class ActorCritic(eqx.Module):
 
 
 def explore(actor: ActorCritic, obs: PyTree, key: Array, clock: Clock) -> Array:
-    """Returns actions sampled from the policy; for :class:`rejeu.core.Algorithm`, as are the next two."""
+    """Returns actions sampled from the policy; for :class:`rejeu.core.algorithm.Algorithm`, as are the next two."""
     return actor.policy(obs).sample(key)
 
 

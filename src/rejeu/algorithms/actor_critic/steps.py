@@ -14,9 +14,9 @@ from jax import Array
 from rejeu.algorithms.actor_critic.config import OnPolicyConfig
 from rejeu.algorithms.actor_critic.gae import advantages
 from rejeu.algorithms.actor_critic.network import ActorCritic, Distribution, is_value
-from rejeu.core import PyTree, Rollout, clip, descend
-from rejeu.distributions import is_squashed
-from rejeu.schedules import at
+from rejeu.core.algorithm import PyTree, Rollout, clip, descend
+from rejeu.core.distributions import is_squashed
+from rejeu.core.schedules import at
 
 D = TypeVar("D")
 MOST_PACKED = 2**14

@@ -4,7 +4,7 @@ from gymnasium import spaces
 
 from rejeu.algorithms.ddpg import continuous, discrete
 from rejeu.algorithms.ddpg.continuous import Config, State
-from rejeu.core import Algorithm
+from rejeu.core.algorithm import Algorithm
 
 __all__ = ["Config", "State", "make"]
 

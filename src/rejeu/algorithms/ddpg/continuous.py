@@ -27,7 +27,7 @@ from jax import Array
 from rejeu.algorithms import optimizers, search
 from rejeu.algorithms.config import OffPolicyConfig, network_inputs
 from rejeu.algorithms.search import SearchSpace
-from rejeu.core import (
+from rejeu.core.algorithm import (
     AVERAGED,
     TD_ERROR,
     Algorithm,
@@ -45,10 +45,10 @@ from rejeu.core import (
     weighted_mean,
     without_gradient,
 )
+from rejeu.core.schedules import Schedule, at
+from rejeu.core.spaces import action_dimension, check_box_action
+from rejeu.core.validation import coerce, whole
 from rejeu.networks import Network, QNetwork, Widths
-from rejeu.schedules import Schedule, at
-from rejeu.spaces import action_dimension, check_box_action
-from rejeu.validation import coerce, whole
 
 HIDDEN_LAYERS = (400, 300)
 """Default widths of actor and critic but on images, those of the paper."""

@@ -23,7 +23,7 @@ from rejeu.algorithms import optimizers
 from rejeu.algorithms.config import network_inputs
 from rejeu.algorithms.ddpg.continuous import HIDDEN_LAYERS, Config, State, initial_state, metrics_of, next_state
 from rejeu.algorithms.sac.discrete import exploit, explore, imitation
-from rejeu.core import (
+from rejeu.core.algorithm import (
     Algorithm,
     Clock,
     Metrics,
@@ -33,8 +33,8 @@ from rejeu.core import (
     weighted_mean,
     without_gradient,
 )
+from rejeu.core.schedules import at
 from rejeu.networks import Network
-from rejeu.schedules import at
 
 ENTROPY_COEFFICIENT = 0.01
 """Weight of the actor's entropy in nats, in the unit of rewards."""

@@ -4,7 +4,7 @@ from gymnasium import spaces
 
 from rejeu.algorithms.sac import continuous, discrete, mixed
 from rejeu.algorithms.sac.continuous import Config, State
-from rejeu.core import Algorithm
+from rejeu.core.algorithm import Algorithm
 
 __all__ = ["Config", "State", "make"]
 

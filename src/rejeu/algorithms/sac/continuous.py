@@ -40,7 +40,7 @@ from rejeu.algorithms import optimizers
 from rejeu.algorithms.actor_critic.network import sde_explorer, sde_log_std
 from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.algorithms.memory import remembering
-from rejeu.core import (
+from rejeu.core.algorithm import (
     AVERAGED,
     TD_ERROR,
     Algorithm,
@@ -59,7 +59,11 @@ from rejeu.core import (
     weighted_mean,
     without_gradient,
 )
-from rejeu.distributions import TanhNormal
+from rejeu.core.distributions import TanhNormal
+from rejeu.core.prng import nth
+from rejeu.core.schedules import at
+from rejeu.core.spaces import Leaf, action_dimension, check_box_action, leaves
+from rejeu.core.validation import coerce, flag, number, whole
 from rejeu.exploration.held_noise import held_explorer
 from rejeu.networks import (
     Network,
@@ -73,10 +77,6 @@ from rejeu.networks import (
     with_dropout,
     with_memory,
 )
-from rejeu.prng import nth
-from rejeu.schedules import at
-from rejeu.spaces import Leaf, action_dimension, check_box_action, leaves
-from rejeu.validation import coerce, flag, number, whole
 
 S = TypeVar("S", bound=Any)
 """The state of an algorithm with an entropy bonus."""

@@ -37,7 +37,7 @@ from rejeu.algorithms.sac.continuous import (
     metrics_of,
     networks,
 )
-from rejeu.core import (
+from rejeu.core.algorithm import (
     Algorithm,
     Clock,
     Metrics,
@@ -49,11 +49,11 @@ from rejeu.core import (
     weighted_mean,
     without_gradient,
 )
-from rejeu.distributions import Categorical, forbid
+from rejeu.core.distributions import Categorical, forbid
+from rejeu.core.prng import nth
+from rejeu.core.schedules import at
+from rejeu.core.spaces import Leaf, leaves
 from rejeu.networks import Network, each, with_dropout
-from rejeu.prng import nth
-from rejeu.schedules import at
-from rejeu.spaces import Leaf, leaves
 
 TARGET_ENTROPY_SHARE = 0.3
 """Automatic target entropy as a share of the uniform policy's."""

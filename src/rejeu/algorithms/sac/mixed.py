@@ -41,7 +41,7 @@ from rejeu.algorithms.sac.continuous import (
     initial_state,
 )
 from rejeu.algorithms.sac.discrete import TARGET_ENTROPY_SHARE
-from rejeu.core import (
+from rejeu.core.algorithm import (
     TD_ERROR,
     Algorithm,
     Clock,
@@ -52,11 +52,11 @@ from rejeu.core import (
     weighted_mean,
     without_gradient,
 )
-from rejeu.distributions import Categorical, TanhNormal
+from rejeu.core.distributions import Categorical, TanhNormal
+from rejeu.core.prng import nth
+from rejeu.core.schedules import at
+from rejeu.core.spaces import Leaf, action_width, check_action, check_box_action, leaves, members
 from rejeu.networks import Network, QNetwork, with_dropout
-from rejeu.prng import nth
-from rejeu.schedules import at
-from rejeu.spaces import Leaf, action_width, check_action, check_box_action, leaves, members
 
 MOST_COMBINATIONS = 1024
 """Upper limit on the combinations of choices, each of which is an output of every critic."""

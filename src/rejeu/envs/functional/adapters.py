@@ -15,8 +15,8 @@ import numpy as np
 from gymnasium import spaces
 from jax import Array
 
+from rejeu.core.spaces import leaves
 from rejeu.envs.functional.protocol import FunctionalEnv, time_is_up
-from rejeu.spaces import leaves
 
 
 def from_gymnax(env: Any, params: Any = None) -> GymnaxEnv:

@@ -11,9 +11,9 @@ import numpy as np
 from gymnasium import spaces
 from jax import Array
 
-from rejeu.envs.ball_drawing import HELD_REWARD, LOST_REWARD, MAX_PUSH, WALL
+from rejeu.core.validation import number, whole
+from rejeu.envs.functional.ball_drawing import HELD_REWARD, LOST_REWARD, MAX_PUSH, WALL
 from rejeu.envs.functional.protocol import FunctionalEnv
-from rejeu.validation import number, whole
 
 
 class State(NamedTuple):

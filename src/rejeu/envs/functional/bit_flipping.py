@@ -10,8 +10,8 @@ import jax.numpy as jnp
 from gymnasium import spaces
 from jax import Array
 
+from rejeu.core.validation import whole
 from rejeu.envs.functional.protocol import GoalEnv, time_is_up
-from rejeu.validation import whole
 
 
 class State(NamedTuple):

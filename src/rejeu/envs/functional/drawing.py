@@ -9,8 +9,8 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.envs import classic_control
 
-from rejeu.envs.ball_drawing import BallDrawing
 from rejeu.envs.canvas import Canvas, Drawing, Scene
+from rejeu.envs.functional.ball_drawing import BallDrawing
 from rejeu.envs.functional.parking import ROW_DISTANCE, spot
 from rejeu.envs.functional.point_maze import RADIUS, TOLERANCE
 from rejeu.envs.registry import make_env

@@ -16,8 +16,8 @@ import numpy as np
 from gymnasium import spaces
 from jax import Array
 
+from rejeu.core.errors import MissingExtra
 from rejeu.envs.functional.protocol import FunctionalEnv, time_is_up
-from rejeu.errors import MissingExtra
 
 INVERTED_PENDULUM = """
 <mujoco model="inverted pendulum">

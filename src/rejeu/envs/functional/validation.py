@@ -10,10 +10,10 @@ import jax
 import numpy as np
 from gymnasium import spaces
 
+from rejeu.core.errors import BadEnvironmentError
+from rejeu.core.spaces import check_goal_space, leaves, narrow, structure
+from rejeu.core.validation import whole
 from rejeu.envs.functional.protocol import FunctionalEnv, GoalEnv
-from rejeu.errors import BadEnvironmentError
-from rejeu.spaces import check_goal_space, leaves, narrow, structure
-from rejeu.validation import whole
 
 UNTRACEABLE = (jax.errors.JAXTypeError, jax.errors.JAXIndexError)
 """What JAX raises where Python needs a value that is not known yet."""

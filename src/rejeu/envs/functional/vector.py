@@ -16,12 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from rejeu import prng
+from rejeu.core import prng
+from rejeu.core.spaces import cast, leaves
 from rejeu.envs.base import Seed, Step, VectorEnv, success_of
 from rejeu.envs.functional.protocol import FunctionalEnv, GoalEnv
 from rejeu.envs.functional.validation import check
 from rejeu.envs.goals import GoalFunctions
-from rejeu.spaces import cast, leaves
 
 
 class VectorState(eqx.Module):

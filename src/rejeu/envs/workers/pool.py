@@ -23,9 +23,9 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 from gymnasium.vector.utils import CloudpickleWrapper
 
+from rejeu.core.errors import WorkerError
 from rejeu.envs.workers import process
 from rejeu.envs.workers.process import Copied, Description, Encoder, Failure
-from rejeu.errors import WorkerError
 
 CLOSE_SECONDS = 5.0
 """Seconds that workers have to exit before they are terminated."""

@@ -19,10 +19,10 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector.utils import CloudpickleWrapper
 
-from rejeu import cluster
+from rejeu.core.errors import BadEnvironmentError
+from rejeu.core.spaces import leaves
 from rejeu.envs import snapshot, validation
-from rejeu.errors import BadEnvironmentError
-from rejeu.spaces import leaves
+from rejeu.envs.workers import cluster
 
 TOKEN_BYTES = 32
 """Length of the token that a worker on another machine presents."""

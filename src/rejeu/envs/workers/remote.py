@@ -21,11 +21,11 @@ from typing import Any
 import gymnasium as gym
 from gymnasium.vector.utils import CloudpickleWrapper
 
-from rejeu import cluster, validation
-from rejeu.envs.workers import process
+from rejeu.core import validation
+from rejeu.core.errors import WorkerError
+from rejeu.envs.workers import cluster, process
 from rejeu.envs.workers.pool import LOOK_SECONDS, Starter, Worker, seconds_until
 from rejeu.envs.workers.process import TOKEN_BYTES, RemoteWorker, ToLeaves
-from rejeu.errors import WorkerError
 
 SLOW_START_SECONDS = 30.0
 """Seconds after which a warning says that a worker still waits for its place on the cluster."""
@@ -40,7 +40,7 @@ class RayOptions:
     """What an environment in an actor reserves, and where."""
 
     address: str | None = None
-    """``"HOST:PORT"`` of the cluster, or ``"auto"``; see :func:`rejeu.cluster.connect`."""
+    """``"HOST:PORT"`` of the cluster, or ``"auto"``; see :func:`rejeu.envs.workers.cluster.connect`."""
     num_cpus: float | None = None
     """CPUs that each environment reserves; a fraction for simulators that mostly wait. None: 1, and 0 on a cluster that is
     started for this process, where nothing else needs a place."""

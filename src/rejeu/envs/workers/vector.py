@@ -13,15 +13,15 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
+from rejeu.core.errors import BadEnvironmentError, WorkerError
+from rejeu.core.records import Count, convert
+from rejeu.core.spaces import Leaf, leaves, rows, structure
 from rejeu.envs import goals as goals_module, snapshot, validation
 from rejeu.envs.base import SUCCESS_KEYS, Seed, Step, VectorEnv, describe_spec, each_seed, success_of
 from rejeu.envs.goals import GoalFunctions
 from rejeu.envs.workers import process
 from rejeu.envs.workers.pool import RESTARTED, TIMEOUT, Processes, Restarted, Starter, Workers
 from rejeu.envs.workers.process import Failure, ToSharedMemory
-from rejeu.errors import BadEnvironmentError, WorkerError
-from rejeu.io.records import Count, convert
-from rejeu.spaces import Leaf, leaves, rows, structure
 
 INDEX = np.uint16
 """Data type of the indices of environments in a record."""

@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from rejeu.errors import MissingExtra
+from rejeu.core.errors import MissingExtra
 
 __all__ = [
     "AtariWrapper",

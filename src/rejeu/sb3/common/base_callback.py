@@ -21,9 +21,9 @@ import numpy as np
 from rejeu.agents import Agent
 from rejeu.callbacks.base import TrainingCallback
 from rejeu.envs.base import each_info
-from rejeu.loops.run import Progress
-from rejeu.reporting.logging import Logger
+from rejeu.logs.logging import Logger
 from rejeu.sb3.common.vec_env.base_vec_env import TERMINAL_OBSERVATION, TIME_LIMIT_TRUNCATED, VecEnv
+from rejeu.training.run import Progress
 
 
 class BaseCallback(TrainingCallback):

@@ -1,7 +1,7 @@
 """Buffers with Stable-Baselines3's attributes and methods: what ``model.replay_buffer`` and ``model.rollout_buffer`` return.
 
-They show the buffers of :mod:`rejeu.buffers` from which an agent learns, and only agents make them. Their arrays are copies
-that cannot be written to. To store and draw transitions yourself use :class:`rejeu.buffers.ReplayMemory`.
+They show the buffers of :mod:`rejeu.replay` from which an agent learns, and only agents make them. Their arrays are copies
+that cannot be written to. To store and draw transitions yourself use :class:`rejeu.replay.ReplayMemory`.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from rejeu.buffers.ring import LAST, TERMINATED
-from rejeu.core import unmasked
+from rejeu.core.algorithm import unmasked
+from rejeu.replay.ring import LAST, TERMINATED
 from rejeu.sb3.common.preprocessing import get_action_dim, get_obs_shape
 from rejeu.sb3.common.type_aliases import (
     DictReplayBufferSamples,
@@ -60,7 +60,7 @@ class BaseBuffer:
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         raise TypeError(
             f"{type(self).__name__} shows the buffer of an agent, as model.replay_buffer or model.rollout_buffer, and cannot "
-            "be made by hand; use rejeu.buffers.ReplayMemory to store transitions yourself"
+            "be made by hand; use rejeu.replay.ReplayMemory to store transitions yourself"
         )
 
     @classmethod

@@ -18,8 +18,9 @@ import numpy as np
 from rejeu.agents import Agent
 from rejeu.agents.off_policy import OffPolicyAgent
 from rejeu.callbacks.progress_bar import ProgressBar
+from rejeu.core import atomic
+from rejeu.core.validation import whole
 from rejeu.envs.masks import make_masked
-from rejeu.io import atomic
 from rejeu.sb3.common.base_callback import (
     BaseCallback,
     CallbackList,
@@ -31,7 +32,6 @@ from rejeu.sb3.common.evaluation import evaluate_policy
 from rejeu.sb3.common.vec_env.adapters import dummy_vec_env, identities
 from rejeu.sb3.common.vec_env.base_vec_env import VecEnv
 from rejeu.sb3.common.vec_env.vec_normalize import sync_envs_normalization
-from rejeu.validation import whole
 
 __all__ = [
     "BaseCallback",

@@ -1,4 +1,4 @@
-"""Distributions of actions with Stable-Baselines3's methods, in NumPy, over those of :mod:`rejeu.distributions`.
+"""Distributions of actions with Stable-Baselines3's methods, in NumPy, over those of :mod:`rejeu.core.distributions`.
 
 Random numbers come from NumPy's global generator, which ``set_random_seed`` seeds.
 """
@@ -15,7 +15,7 @@ import numpy as np
 from gymnasium import spaces
 
 from rejeu.algorithms.actor_critic.network import sde_std
-from rejeu.distributions import Bernoulli, Categorical, MultiCategorical, Normal, TanhNormal, forbid
+from rejeu.core.distributions import Bernoulli, Categorical, MultiCategorical, Normal, TanhNormal, forbid
 from rejeu.sb3.common.preprocessing import get_action_dim
 from rejeu.sb3.common.torch_layers import create_mlp
 from rejeu.sb3.common.utils import Tensor

@@ -13,8 +13,8 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+from rejeu.core.spaces import GOAL_KEYS
 from rejeu.sb3.common.preprocessing import is_image_space_channels_first
-from rejeu.spaces import GOAL_KEYS
 
 __all__ = ["check_env"]
 

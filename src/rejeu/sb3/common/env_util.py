@@ -9,12 +9,12 @@ from typing import Any
 
 import gymnasium as gym
 
+from rejeu.core.validation import whole
 from rejeu.envs.registry import make_env
 from rejeu.sb3.common.atari_wrappers import AtariWrapper
 from rejeu.sb3.common.monitor import Monitor
 from rejeu.sb3.common.vec_env.base_vec_env import VecEnv, is_wrapped, unwrap_wrapper
 from rejeu.sb3.common.vec_env.dummy_vec_env import DummyVecEnv
-from rejeu.validation import whole
 
 __all__ = ["is_wrapped", "make_atari_env", "make_vec_env", "unwrap_wrapper"]
 

@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from rejeu import interrupt
 from rejeu.agents import Agent
 from rejeu.agents.policy import lent
-from rejeu.core import Masked
+from rejeu.core import interrupt
+from rejeu.core.algorithm import Masked
 from rejeu.envs.make import make_vector
 from rejeu.envs.masks import make_masked
-from rejeu.reporting.evaluation import MOST_STEPS, cut_off
+from rejeu.logs.evaluation import MOST_STEPS, cut_off
 
 __all__ = ["evaluate_policy"]
 

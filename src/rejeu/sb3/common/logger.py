@@ -22,9 +22,9 @@ from typing import Any, TextIO
 
 import numpy as np
 
-from rejeu.reporting import logging
-from rejeu.reporting.formatting import LOGS
-from rejeu.reporting.logging import TensorBoard, add_text, open_log
+from rejeu.logs import logging
+from rejeu.logs.formatting import LOGS
+from rejeu.logs.logging import TensorBoard, add_text, open_log
 
 __all__ = [
     "DEBUG",

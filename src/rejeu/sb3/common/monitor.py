@@ -14,9 +14,9 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from rejeu.core import atomic
+from rejeu.core.failed_writes import FailedWrites
 from rejeu.envs.snapshot import check_types
-from rejeu.io import atomic
-from rejeu.io.failed_writes import FailedWrites
 
 __all__ = ["LoadMonitorResultsError", "Monitor", "ResultsWriter", "get_monitor_files", "load_results"]
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from rejeu.errors import MissingExtra
+from rejeu.core.errors import MissingExtra
 from rejeu.sb3.common.monitor import load_results
 
 __all__ = [

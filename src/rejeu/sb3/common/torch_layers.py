@@ -33,11 +33,11 @@ import numpy as np
 from gymnasium import spaces
 from jax import Array
 
-from rejeu.core import PyTree
+from rejeu.core.algorithm import PyTree
+from rejeu.core.spaces import Leaf
 from rejeu.networks import ENCODERS, register_encoder
 from rejeu.networks.layers import own_module
 from rejeu.sb3.common.preprocessing import is_image_space, is_image_space_channels_first, preprocess_obs
-from rejeu.spaces import Leaf
 
 __all__ = [
     "BaseFeaturesExtractor",

@@ -19,8 +19,8 @@ import jax
 import numpy as np
 from gymnasium import spaces
 
-from rejeu import schedules
-from rejeu.schedules import Exponential, Linear, Table
+from rejeu.core import schedules
+from rejeu.core.schedules import Exponential, Linear, Table
 
 __all__ = [
     "ConstantSchedule",

@@ -14,12 +14,13 @@ import gymnasium as gym
 import jax
 import numpy as np
 
+from rejeu.core.errors import BadEnvironmentError
+from rejeu.core.spaces import leaves, plain
 from rejeu.envs import goals as goals_module, validation
 from rejeu.envs.base import Seed, Step, VectorEnv, step_whole, success_of
 from rejeu.envs.goals import GoalFunctions
 from rejeu.envs.in_process import InProcess
 from rejeu.envs.make import register_adapter
-from rejeu.errors import BadEnvironmentError
 from rejeu.sb3.common.vec_env.base_vec_env import (
     TERMINAL_OBSERVATION,
     TIME_LIMIT_TRUNCATED,
@@ -32,7 +33,6 @@ from rejeu.sb3.common.vec_env.base_vec_env import (
 )
 from rejeu.sb3.common.vec_env.dummy_vec_env import DummyVecEnv
 from rejeu.sb3.common.vec_env.vec_normalize import unwrap_vec_normalize
-from rejeu.spaces import leaves, plain
 
 
 def to_vector(venv: VecEnv, seed: Seed = None) -> VectorEnv:

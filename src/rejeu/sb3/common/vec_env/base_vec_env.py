@@ -20,10 +20,10 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector.utils import concatenate, create_empty_array
 
+from rejeu.core.errors import MissingExtra
 from rejeu.envs.rendering import check_renders, rgb_frame
 from rejeu.envs.workers.process import call_method
-from rejeu.errors import MissingExtra
-from rejeu.reporting.formatting import counted
+from rejeu.logs.formatting import counted
 
 __all__ = [
     "VecEnv",

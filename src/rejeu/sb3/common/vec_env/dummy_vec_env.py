@@ -8,9 +8,9 @@ from typing import Any
 
 import gymnasium as gym
 
+from rejeu.core.errors import BadEnvironmentError
 from rejeu.envs.validation import copy_observation, environment_fault, id_of, reset_env, with_location
 from rejeu.envs.workers.process import step_and_reset
-from rejeu.errors import BadEnvironmentError
 from rejeu.sb3.common.vec_env.base_vec_env import Indices, SingleEnvs, StepResult, stacked
 
 __all__ = ["DummyVecEnv"]

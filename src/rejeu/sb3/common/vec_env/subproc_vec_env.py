@@ -7,10 +7,10 @@ from typing import Any
 
 import gymnasium as gym
 
+from rejeu.core.errors import BadEnvironmentError, WorkerError
 from rejeu.envs.validation import with_location
 from rejeu.envs.workers.pool import RESTARTED, TIMEOUT, Processes, ProcessWorker, Restarted, Workers
 from rejeu.envs.workers.process import Failure
-from rejeu.errors import BadEnvironmentError, WorkerError
 from rejeu.sb3.common.vec_env.base_vec_env import Indices, SingleEnvs, StepResult, stacked
 
 __all__ = ["SubprocVecEnv"]

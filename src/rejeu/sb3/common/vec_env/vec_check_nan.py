@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from rejeu.errors import BadEnvironmentError
+from rejeu.core.errors import BadEnvironmentError
 from rejeu.sb3.common.vec_env.base_vec_env import StepResult, VecEnv, VecEnvWrapper, by_key
 
 __all__ = ["VecCheckNan"]

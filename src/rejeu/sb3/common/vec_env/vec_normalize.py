@@ -1,7 +1,8 @@
 """A wrapper that normalizes observations and rewards by running statistics, as Stable-Baselines3's ``VecNormalize`` does.
 
 The statistics are part of the environment, so they must be saved and loaded along with the agent. New code should use the
-agents' option ``normalize=True`` (:mod:`rejeu.normalization`), which keeps the statistics in the agent and its model file.
+agents' option ``normalize=True`` (:mod:`rejeu.core.normalization`), which keeps the statistics in the agent and its model
+file.
 """
 
 from __future__ import annotations
@@ -17,9 +18,10 @@ import numpy as np
 from gymnasium import spaces
 from msgspec import Meta
 
-from rejeu.errors import CheckpointError
-from rejeu.io import checkpoint
-from rejeu.io.records import convert
+from rejeu.checkpoints.pickled import array_of, explained, read_normalization
+from rejeu.core import checkpoint
+from rejeu.core.errors import CheckpointError
+from rejeu.core.records import convert
 from rejeu.sb3.common.running_mean_std import RunningMeanStd
 from rejeu.sb3.common.vec_env.base_vec_env import (
     TERMINAL_OBSERVATION,
@@ -30,7 +32,6 @@ from rejeu.sb3.common.vec_env.base_vec_env import (
     unwrap_vec_wrapper,
 )
 from rejeu.sb3.common.vec_env.vec_transpose import VecTransposeImage
-from rejeu.sb3.pickled import array_of, explained, read_normalization
 
 __all__ = ["VecNormalize", "sync_envs_normalization", "unwrap_vec_normalize"]
 

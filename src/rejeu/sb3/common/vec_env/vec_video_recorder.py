@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from rejeu.envs.rendering import check_renders
-from rejeu.reporting.video import VideoFile
+from rejeu.logs.video import VideoFile
 from rejeu.sb3.common.vec_env.base_vec_env import StepResult, VecEnv, VecEnvWrapper, tile_images
 
 __all__ = ["VecVideoRecorder"]

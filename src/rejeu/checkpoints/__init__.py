@@ -1,0 +1,1 @@
+"""Model files, the state of a run, and exact resume."""

@@ -1,0 +1,254 @@
+"""Model files: everything that an agent has learned, its hyperparameters and counters, and loading them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeVar
+
+import gymnasium as gym
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from rejeu.agents.base import AGENT_ARGUMENTS, BaseAgent
+from rejeu.algorithms import config as configs
+from rejeu.core import checkpoint, devices, spaces, xla
+from rejeu.core.errors import CheckpointError, MissingObjectError
+from rejeu.core.records import WRONG, Positive, Seed, brief, convert
+from rejeu.envs.registry import are_plain, is_plain_id
+
+if TYPE_CHECKING:
+    from rejeu.envs.make import VectorEnv
+
+ARGUMENTS = ("policy", "seed", "stats_window_size", "success_threshold", "best_window")
+"""Arguments of an agent that its model file holds."""
+OUTPUTS = ("verbose", "log", "tensorboard_log")
+"""Arguments that say where rows of statistics go."""
+MAX_LAYERS = 256
+"""Upper limit on the layers of any kind in the networks of a file: each takes time to build, even if it is empty."""
+
+Count32 = Annotated[int, Meta(ge=0, lt=2**32)]
+
+
+class Counters(msgspec.Struct):
+    """The counters of a model file."""
+
+    step: Count32
+    steps_before: Count32
+    episode: Count32
+    n_updates: Count32
+    episodes_before: Count32
+
+
+class GeneratorState(msgspec.Struct):
+    """The state of NumPy's PCG64."""
+
+    state: int
+    inc: int
+
+
+class AgentHeader(msgspec.Struct, kw_only=True):
+    """The header of a model file, which :func:`header` returns; unknown fields are ignored."""
+
+    config: dict[str, Any]
+    policy: str
+    observation_space: Any
+    action_space: Any
+    seed: Seed
+    stats_window_size: Positive
+    counters: Counters
+    rng: GeneratorState
+    success_threshold: float | None = None
+    best_window: Positive
+
+
+class Saved(NamedTuple):
+    """The interpreted header of a model file."""
+
+    header: AgentHeader
+    config: Any
+    """The algorithm's configuration."""
+    observation_space: gym.Space
+    action_space: gym.Space
+
+
+def interpret(header: Mapping[str, Any], room: int, kind: Any, changes: Mapping[str, Any]) -> Saved:
+    """Returns what a header says.
+
+    Args:
+        header: JSON values of schema ``checkpoint.SCHEMA``.
+        room: bytes that the file holds.
+        kind: class of the algorithm's configuration.
+        changes: hyperparameters that the user sets otherwise than they were saved.
+
+    Raises:
+        CheckpointError: if the header is damaged, or names an object of the user's own that is not given.
+        TypeError, ValueError: if ``changes`` are invalid.
+    """
+    try:
+        saved = convert(header, AgentHeader)
+        config = configs.rebuild(kind, saved.config, configs.own_changes(saved.config, changes))
+        largest = max(spaces.MAX_NUMBERS, room)
+        observation_space = spaces.rebuild(saved.observation_space, largest)
+        spaces.check_policy(saved.policy, observation_space, config.policy_kwargs.normalize_images)
+        action_space = spaces.rebuild(saved.action_space, largest)
+    except MissingObjectError:
+        raise
+    except WRONG as error:
+        raise CheckpointError(f"the header is damaged or of another version: {brief(error)}") from None
+    check_depths(config)
+    return Saved(
+        saved, configs.rebuild(kind, saved.config, changes) if changes else config, observation_space, action_space
+    )
+
+
+def check_space(description: Any, own: gym.Space, kind: str) -> None:
+    """Raises ``ValueError`` unless a space of a file is the agent's, apart from the bounds of observations.
+
+    Args:
+        description: JSON values.
+        own: the agent's.
+        kind: ``"observation"`` or ``"action"``.
+    """
+    if description == spaces.describe(own):
+        return
+    other = spaces.rebuild(description, max(spaces.MAX_NUMBERS, sum(leaf.nbytes for leaf in spaces.leaves(own))))
+    if not spaces.same(other, own, bounds=kind == "action"):
+        raise ValueError(f"it is of the {kind} space {other}, and this agent was made for {own}")
+
+
+def check_depths(config: Any) -> None:
+    """Raises ``CheckpointError`` if the networks of a configuration have more layers than :data:`MAX_LAYERS`.
+
+    Shapes are compared before anything is allocated, but each layer takes time.
+    """
+    layers = {key: len(value) for key, value in vars(config.policy_kwargs).items() if isinstance(value, tuple)}
+    for key, depth in {**layers, "n_blocks": config.policy_kwargs.n_blocks}.items():
+        if depth > MAX_LAYERS:
+            raise CheckpointError(f"{key} has {depth} layers, expected {MAX_LAYERS} at most")
+
+
+A = TypeVar("A", bound=BaseAgent)
+
+
+def header(agent: BaseAgent) -> dict[str, Any]:
+    """Returns the header of an agent's model file: everything except arrays, as JSON values."""
+    run = agent.run
+    return {
+        "algorithm": agent.name,
+        "config": configs.to_json(agent.config),
+        "policy": agent.policy_name,
+        "observation_space": spaces.describe(agent.observation_space),
+        "action_space": spaces.describe(agent.action_space),
+        "env_id": run.env.env_id if run.env is not None else agent.trained_on and agent.trained_on[0],
+        "made_from": made_from(agent),
+        "seed": agent.seed,
+        "stats_window_size": agent.stats_window_size,
+        "success_threshold": agent.success_threshold,
+        "best_window": agent.best_window,
+        "counters": {
+            "step": run.step,
+            "steps_before": agent.reset_step,
+            "episodes_before": agent.reset_episode,
+            "episode": run.episode,
+            "n_updates": run.n_updates,
+        },
+        "rng": run.rng.bit_generator.state["state"],
+    }
+
+
+def made_from(agent: BaseAgent) -> dict[str, Any] | None:
+    """Returns id and keyword arguments of an agent's environments for a header; None if a file may not hold them."""
+    source = agent.trained_on if agent.run.env is None else agent.run.env.made_from
+    if source is None or not is_plain_id(source[0]) or not are_plain(dict(source[1])):
+        return None
+    return {"env_id": source[0], "env_kwargs": dict(source[1])}
+
+
+def trained_on(header: Mapping[str, Any]) -> tuple[str, dict[str, Any]] | None:
+    """Returns what :func:`made_from` wrote; None if it is missing or not what a file may hold."""
+    said = header.get("made_from")
+    if not isinstance(said, dict) or not is_plain_id(said.get("env_id")) or not are_plain(said.get("env_kwargs")):
+        return None
+    return said["env_id"], said["env_kwargs"]
+
+
+def load(
+    cls: type[A],
+    file: checkpoint.Contents,
+    make_env: Callable[[A], VectorEnv | None],
+    changes: dict[str, Any],
+    threads: int | None = None,
+    prefix: str = "",
+) -> A:
+    """Returns the agent of a file, with an empty buffer. Only arrays that the agent has are read.
+
+    Args:
+        cls: the class of the agent.
+        file: its header holds what :func:`header` returned.
+        make_env: returns the environment to continue training in; None for an agent that only predicts.
+        changes: constructor arguments or hyperparameters that replace the saved ones.
+        threads: of JAX's device; None for the number that suits the agent.
+        prefix: of the names of the agent's arrays in the file.
+
+    Raises:
+        CheckpointError: if something is damaged or of another algorithm or environment.
+    """
+    name, path, header = cls.algorithm.Config.name, file.path, file.header
+    if header.get("algorithm") != name:
+        other = str(header.get("algorithm"))[:40]
+        raise CheckpointError(f"{path} holds a {other} agent, not {name}; use rejeu.load(path) or rejeu.{other}.load")
+    changes = cls.converted(changes)
+    own = {key: changes.pop(key) for key in [*changes] if key in AGENT_ARGUMENTS}
+    try:
+        saved = interpret(header, file.room, cls.algorithm.Config, changes)
+    except CheckpointError as error:
+        raise CheckpointError(f"{path}: {error}") from None
+    agent = cls.__new__(cls)
+    _set_up(agent, saved, own)
+    try:
+        agent.build(saved.observation_space, saved.action_space)
+    except WRONG as error:
+        raise CheckpointError(f"{path}: {brief(error)}") from None
+    checkpoint.match(agent.learner.shapes, checkpoint.within(file.specs, prefix), path)
+    arrays = checkpoint.within(file.read(prefix), prefix)
+    checkpoint.require_finite(arrays, path)
+    state = checkpoint.arrays_to_tree(agent.learner.shapes, arrays, path)
+    agent.trained_on = trained_on(header)
+    vector = make_env(agent)
+    if vector is not None:
+        agent.check_spaces(vector, "the given environment")
+    n_envs = 1 if vector is None else vector.n_envs
+    xla.start_device(agent.n_threads(n_envs) if threads is None else threads)
+    devices.find(agent.device)  # an error of its own
+    try:
+        agent.start_run(vector, agent.learner.pack(state))
+        _restore_counters(agent, saved.header)
+    except (ArithmeticError, MemoryError, ValueError) as error:
+        if changes.keys() & {"buffer_size", "n_steps", "n_episodes"}:
+            raise
+        raise CheckpointError(f"{path}: {brief(error)}") from None
+    return agent
+
+
+def _set_up(agent: BaseAgent, saved: Saved, given: Mapping[str, Any]) -> None:
+    """Sets the attributes of an agent from a model file, and from the user's changes.
+
+    Raises:
+        ValueError: if ``given`` is invalid.
+    """
+    outputs = {key: given[key] for key in OUTPUTS if key in given}
+    others = {key: value for key, value in given.items() if key not in OUTPUTS}
+    agent.configure(config=saved.config, **{key: getattr(saved.header, key) for key in ARGUMENTS} | others)
+    agent.set_outputs(**outputs)
+    spaces.check_policy(agent.policy_name, saved.observation_space, agent.config.policy_kwargs.normalize_images)
+
+
+def _restore_counters(agent: BaseAgent, saved: AgentHeader) -> None:
+    """Sets the counters and random numbers of a loaded agent; its replay buffer is empty until one is loaded."""
+    run, counters = agent.run, saved.counters
+    run.step, run.episode, run.n_updates = counters.step, counters.episode, counters.n_updates
+    run.rng.bit_generator.state = {**run.rng.bit_generator.state, "state": msgspec.structs.asdict(saved.rng)}
+    run.learn_from = agent.first_learning_step(run.step)
+    run.seed = int(np.random.SeedSequence([agent.seed, run.step]).generate_state(1)[0])
+    agent.reset_step, agent.reset_episode = counters.steps_before, counters.episodes_before

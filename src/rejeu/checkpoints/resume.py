@@ -1,0 +1,349 @@
+"""Resumes a run from its newest checkpoint; damaged or hostile files are refused."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, TypeVar
+
+import gymnasium as gym
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from rejeu.agents.base import BaseAgent, Best, Resumed, fill_windows
+from rejeu.checkpoints import model_files
+from rejeu.checkpoints.run_files import PER_ENV, SCALARS, RowFiles, RunHeader, SavedBest, SavedRun, run_folder, versions
+from rejeu.checkpoints.run_folder import run_files
+from rejeu.core import checkpoint, devices, records, spaces, xla
+from rejeu.core.algorithm import PyTree
+from rejeu.core.errors import CheckpointError
+from rejeu.core.records import MAX_ENVS, WRONG, brief, convert
+from rejeu.core.validation import number, whole_seed
+from rejeu.envs.base import DivergedError, seed_of_run
+from rejeu.envs.make import BACKENDS, Backend, VectorEnv
+from rejeu.replay import ring_io
+from rejeu.replay.prioritized import Draw, Priorities
+from rejeu.replay.rollout import RolloutBuffer
+from rejeu.training.checks import is_finite
+from rejeu.training.learner import Readings
+from rejeu.training.run import Run, TrainingCall
+
+A = TypeVar("A", bound=BaseAgent)
+
+
+def resume(cls: type[A], folder: Path, env: Any, changes: dict[str, Any]) -> A:
+    """Returns the agent of the newest complete checkpoint; see :meth:`Agent.resume`."""
+    found = run_files(folder)
+    if not found:
+        raise FileNotFoundError(f"there is no checkpoint in {folder}")
+    skipped: list[str] = []
+    for i, path in enumerate(found):
+        try:
+            agent = _resume(cls, path, env, dict(changes))
+        except CheckpointError as error:
+            if i + 1 == len(found):
+                raise
+            skipped.append(str(error))
+            warnings.warn(f"{error}; resuming from the checkpoint before it", UserWarning, stacklevel=3)
+        else:
+            assert agent.resumed is not None
+            agent.resumed = agent.resumed._replace(skipped=tuple(skipped))
+            return agent
+    raise AssertionError
+
+
+def _resume(cls: type[A], path: Path, env: Any, changes: dict[str, Any]) -> A:
+    with checkpoint.opened(path, "run") as file, ExitStack() as made:
+        agent = _resume_within(made, file, cls, env, changes)
+        made.pop_all()
+    assert agent.resumed is not None
+    if not agent.resumed.exact:
+        warnings.warn(str(agent.resumed), UserWarning, stacklevel=4)
+    return agent
+
+
+def _resume_within(made: ExitStack, file: checkpoint.Contents, cls: type[A], env: Any, changes: dict[str, Any]) -> A:
+    """Returns the agent; ``made`` closes the environments made for it if the checkpoint is refused."""
+    path = file.path
+    try:
+        header = convert(file.header, RunHeader)
+    except WRONG as error:
+        raise refusal(path, error) from error
+
+    def make_env(agent: BaseAgent) -> VectorEnv:
+        if env is not None:
+            vector = agent.make_envs(env, seed=seed_of_run(agent.seed))
+            if vector.n_envs != header.n_envs:
+                raise CheckpointError(f"the run had {header.n_envs} environments, and {vector.n_envs} are given")
+            return vector
+        env_id, backend = environment(path, header)
+        try:
+            several = {} if header.wait_for is None else {"wait_for": header.wait_for}
+            vector = agent.make_envs(env_id, header.n_envs, backend, seed_of_run(agent.seed), **several)
+            made.callback(vector.close)
+            agent.check_spaces(vector, f"{env_id} as it is here")
+        except (ValueError, TypeError, gym.error.Error) as error:
+            raise CheckpointError(
+                f"{path}: the environments of the run cannot be made again ({brief(error)}); give them: "
+                "resume(folder, env=...)"
+            ) from error
+        return vector
+
+    agent = model_files.load(cls, file, make_env, changes, header.threads, "state.")
+    try:
+        check_specs(agent, file)
+        saved = convert(records.decode(header.run, file.read("run.")), SavedRun)
+        best = checkpoint.within(file.read("best."), "best.")
+        parts = [read_rows(path.parent / name, agent) for name in header.rows]
+        with devices.chosen(agent.device):
+            reason = restore(agent, saved, parts, best, path)
+        agent.resumed = Resumed(agent.run.step, not reason, reason) if reason else compared(agent, header)
+        agent.run_id, agent.made_from_id = header.run_id, env is None
+    except FileNotFoundError as error:
+        raise CheckpointError(f"{path} needs a file that is missing: {error}") from None
+    except WRONG as error:
+        raise refusal(path, error) from error
+    if parts:
+        ring = agent.run.replay.ring
+        heads = [part["head"] for part in parts]
+        run_folder(agent, path.parent).row_files = RowFiles(
+            list(zip(header.rows, heads, strict=True)), ring, ring.version
+        )
+    return agent
+
+
+def check_specs(agent: BaseAgent, file: checkpoint.Contents) -> None:
+    """Checks the arrays of a run's file before they are read; those of the agent's state were checked before.
+
+    Raises:
+        CheckpointError: if the best weights are of other networks, or there are arrays that no run has.
+    """
+    if best := checkpoint.within(file.specs, "best."):
+        checkpoint.match(agent.learner.shapes, best, file.path)
+    for name in file.specs:
+        if not name.startswith(("state.", "best.", "run.")):
+            raise CheckpointError(f"{file.path} has {checkpoint.shown(name)}, which no checkpoint of a run has")
+
+
+def read_rows(path: Path, agent: BaseAgent) -> dict[str, np.ndarray]:
+    """Returns the arrays of a file of rows, after checking that they fit the agent's buffer.
+
+    Raises:
+        CheckpointError, ValueError: if they are not.
+    """
+    with checkpoint.opened(path, "rows") as file:
+        ring_io.check_rows(agent.run.replay.ring, file.specs)
+        return file.read()
+
+
+def compared(agent: BaseAgent, header: RunHeader) -> Resumed:
+    """Returns how a run resumes whose environments were restored."""
+    here = xla.threads()
+    before = here if header.threads is None else header.threads
+    if header.versions != versions():
+        why = "by another version of rejeu, JAX or Optax, so"
+    elif header.n_together > 1:
+        why = f"alone: it was one of {header.n_together} runs in one program, whose sums are rounded otherwise, so"
+    elif before != here:
+        why = (
+            f"JAX computes with {here} threads here and had {before}; resume in a new process, with the environment variable "
+            f"{xla.THREADS}={before} if JAX is used before, or"
+        )
+    else:
+        return Resumed(agent.run.step, True, "")
+    return Resumed(agent.run.step, False, f"as it was saved, but {why} results may differ in their last bits")
+
+
+def refusal(path: Path, error: BaseException) -> CheckpointError:
+    """Returns the error for a checkpoint whose values raised ``error``."""
+    if isinstance(error, CheckpointError) and str(path.parent) in str(error):
+        return error
+    return CheckpointError(f"{path}: the checkpoint is damaged or does not fit: {brief(error)}")
+
+
+def environment(path: Path, header: RunHeader) -> tuple[str, Backend]:
+    """Returns id and backend of the environments of a run.
+
+    Raises:
+        CheckpointError: if the checkpoint does not say, or they were not made from an id.
+    """
+    env_id, backend = header.env_id, header.backend
+    if not isinstance(env_id, str) or backend not in BACKENDS or header.n_envs > MAX_ENVS:
+        raise CheckpointError(f"{path} does not say which environments the run had; give them: resume(folder, env=...)")
+    if not header.own_env or ":" in env_id:  # Gymnasium imports what precedes a colon
+        raise CheckpointError(
+            f"the run was given an environment, {env_id[:60]!r}, that no file can hold; give it again: "
+            "resume(folder, env=...)"
+        )
+    return env_id, backend
+
+
+def restore(
+    agent: BaseAgent, saved: SavedRun, rows: Sequence[dict[str, np.ndarray]], best: dict[str, np.ndarray], path: Path
+) -> str:
+    """Restores the run of an agent that was loaded from the same checkpoint.
+
+    Returns why its environments begin new episodes, empty if they continue.
+
+    Raises:
+        LookupError, TypeError, ValueError, AttributeError, ArithmeticError: if something is damaged.
+    """
+    run, n_envs = agent.run, agent.run.env.n_envs
+    carry = agent.learner.initial_carry(n_envs)
+    restore_counters(agent, saved)
+    run.carry = like(carry, saved.carry, "carry")
+    if saved.metrics is not None:
+        metrics = {key: exactly(value, (), np.float32, f"the metric {key}") for key, value in saved.metrics.items()}
+        run.metrics = Readings.of({key: jnp.asarray(value) for key, value in metrics.items()})
+    td_errors = [jnp.asarray(exactly(a, np.shape(a), np.float32, "a TD error")) for a in saved.td_errors]
+    restore_buffer(run, saved.buffer, rows, carry, begun=saved.envs is not None)
+    if saved.buffer.get("priorities") is not None:
+        run.td_errors = with_draws(run.replay.priorities, saved.buffer["priorities"]["drawn"], td_errors)
+    reason = saved.reason
+    if saved.envs is not None:
+        reason = reason or put_envs_back(run, saved, getattr(agent.config, "n_episodes", None))
+    elif saved.seed is not None:
+        run.seed = whole_seed(saved.seed)
+    agent.history.replace(saved.history)
+    fill_windows(agent)
+    if saved.best is not None:
+        restore_best(agent, saved.best, best, path)
+    agent.training_call = None if saved.call is None else TrainingCall.from_json(saved.call)
+    agent.saved_callbacks = list(saved.callbacks)
+    statistics = agent.get_vec_normalize_env()
+    if statistics is not None and saved.vec_normalize is not None:
+        statistics.put_statistics(saved.vec_normalize)
+    return f"at the start of new episodes: {reason}" if reason else ""
+
+
+def restore_counters(agent: BaseAgent, saved: SavedRun) -> None:
+    """Restores counters, durations, random numbers and the logger of a run."""
+    run = agent.run
+    if saved.steps_since_update > run.step:
+        raise ValueError(f"steps_since_update={saved.steps_since_update}, expected at most {run.step}")
+    for key in SCALARS:
+        setattr(run, key, getattr(saved, key))
+    for key in PER_ENV:
+        value = getattr(saved, key)
+        setattr(run, key, exactly(value, (len(value),), getattr(run, key).dtype, key))
+    run.rng.bit_generator.state = saved.rng
+    run.monitor.n_skipped = saved.n_skipped
+    run.seconds = {key: saved.seconds[key] for key in run.seconds}
+    agent.reset_seconds = number("before", saved.seconds.get("before", 0.0), least=0, most=run.seconds["total"])
+    values, agent.logger.name_to_count = saved.logger
+    agent.logger.name_to_value = {key: number(key, value) for key, value in values.items()}
+    agent.n_predictions = saved.n_predictions
+
+
+def restore_best(agent: BaseAgent, saved: SavedBest, arrays: dict[str, np.ndarray], path: Path) -> None:
+    """Restores the best weights.
+
+    Raises:
+        CheckpointError: if they are of other networks, or not finite.
+    """
+    packed = agent.learner.pack(checkpoint.arrays_to_tree(agent.learner.shapes, arrays, path))
+    checkpoint.require_finite(arrays, path)
+    agent.best = Best(saved.score, saved.by, saved.step, packed)
+
+
+def put_envs_back(run: Run, saved: SavedRun, n_episodes: int | None) -> str:
+    """Restores the environments, their observations and the actions chosen for them.
+
+    If rollouts consist of ``n_episodes`` whole episodes, environments that have finished theirs may be at the end of one.
+    Returns why new episodes must begin instead, empty if they need not.
+    """
+    n_envs = run.env.n_envs
+    for key in PER_ENV:
+        if len(getattr(run, key)) != n_envs and (key != "playing" or n_episodes is not None):
+            raise ValueError(f"{key} is not of {n_envs} environments")
+    waiting = None if n_episodes is None else run.playing == 0
+    held = run.replay if isinstance(run.replay, RolloutBuffer) else run.replay.ring
+    parts = zip(saved.obs or (), held.obs_leaves, strict=True)
+    obs = jax.tree.unflatten(
+        held.obs_structure, [exactly(part, (n_envs, *leaf.shape), leaf.dtype, "obs") for part, leaf in parts]
+    )
+    try:
+        must_reset = run.env.restore(saved.envs, obs)
+    except DivergedError as error:
+        return str(error)
+    if over := [i for i in must_reset if waiting is None or not waiting[i]]:
+        raise ValueError(f"the episode of environment {over[0]} is over, and it was not reset")
+    run.obs, run.seed = obs, None
+    if saved.action is not None:
+        expected = np.asarray(spaces.random_action(run.env.action_space, n_envs, np.random.default_rng(0)))
+        run.action = exactly(saved.action, expected.shape, expected.dtype, "action")
+    return ""
+
+
+def restore_buffer(
+    run: Run, saved: dict[str, Any], rows: Sequence[dict[str, np.ndarray]], carry: PyTree, begun: bool
+) -> None:
+    """Restores the experience of a run.
+
+    Args:
+        run: mutated.
+        saved: what :func:`rejeu.checkpoints.run_files.buffer_content` returned.
+        rows: of a ring.
+        carry: the state of exploration, for its structure.
+        begun: whether a rollout has begun; before the first there is no carry of its beginning.
+    """
+    buffer = run.replay
+    if isinstance(buffer, RolloutBuffer):
+        buffer.restore(saved["rollout"])
+        buffer.started = exactly(saved["started"], (buffer.n_envs,), np.dtype(bool), "started")
+        buffer.carry = like(carry, saved["carry"], "carry") if begun or buffer.length or saved["carry"] else ()
+        return
+    ring_io.put_rows(buffer.ring, rows)
+    if not np.array_equal(buffer.ring.head, saved["heads"]):
+        raise ValueError("rows of the replay buffer are missing")
+    if buffer.priorities is not None:
+        buffer.priorities.restore(saved["priorities"])
+
+
+def with_draws(priorities: Priorities, drawn: Sequence[Any], td_errors: list[Array]) -> list[tuple[Draw, Array]]:
+    """Returns TD errors with the draws that they belong to.
+
+    Older versions could save more draws than TD errors, or empty draws, after an error or after ``load_replay_buffer``. The
+    first draws then have no TD errors, and empty draws are dropped.
+
+    Raises:
+        ValueError: if they do not belong together, or to another replay buffer.
+    """
+    draws = [priorities.draw_of(index, time) for index, time in drawn]
+    if len(draws) < len(td_errors):
+        raise ValueError("the TD errors under way are not those of the steps that were drawn")
+    pairs = list(zip(draws[len(draws) - len(td_errors) :], td_errors, strict=True))
+    if any(len(draw.position) not in (0, td_error.size) for draw, td_error in pairs):
+        raise ValueError("the TD errors under way are not those of the steps that were drawn")
+    return [(draw, td_error) for draw, td_error in pairs if len(draw.position)]
+
+
+def like(expected: PyTree, given: list[np.ndarray], name: str) -> PyTree:
+    """Returns a tree with the structure of ``expected`` and the given leaves.
+
+    Raises:
+        ValueError: if shapes or dtypes differ, or a number is not finite.
+    """
+    parts = jax.tree.leaves(expected)
+    if not all(is_finite(part) for part in given):
+        raise ValueError(f"{name} is not finite")
+    return jax.tree.unflatten(
+        jax.tree.structure(expected),
+        [jnp.asarray(exactly(g, e.shape, np.dtype(e.dtype), name)) for g, e in zip(given, parts, strict=True)],
+    )
+
+
+def exactly(array: Any, shape: tuple[int, ...], dtype: Any, name: str) -> np.ndarray:
+    """Returns a copy of an array of a file.
+
+    Raises:
+        ValueError: if its shape or dtype differs from what is expected.
+    """
+    if not isinstance(array, np.ndarray) or array.shape != shape or array.dtype != dtype:
+        found = f"{array.dtype}{list(array.shape)}" if isinstance(array, np.ndarray) else type(array).__name__
+        raise ValueError(f"{name} is {found}, expected {np.dtype(dtype)}{list(shape)}")
+    return array.copy()

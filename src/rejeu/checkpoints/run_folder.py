@@ -1,0 +1,143 @@
+"""The folder of a run: its files, and its models."""
+
+from __future__ import annotations
+
+import os
+import re
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from rejeu.core import checkpoint
+from rejeu.logs.formatting import quoted
+
+RUN_FILE = re.compile(r"run_(\d{12})\.safetensors")
+"""Name of a checkpoint, with its environment step."""
+
+
+@dataclass(frozen=True)
+class File:
+    """The path of a file or folder in a folder, as an attribute of the class of that folder."""
+
+    name: str
+
+    def __get__(self, folder: Any, kind: type) -> Path:
+        path: Path = folder.path
+        return path / self.name
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """The files of one run."""
+
+    path: Path
+    """The folder."""
+
+    config = File("config.json")
+    """Everything needed to repeat the run."""
+    episodes = File("episodes.csv")
+    """One row an episode of training."""
+    metrics = File("metrics.csv")
+    """Means, losses and rates while training."""
+    evaluations = File("evaluations.csv")
+    """One row an evaluation."""
+    agent = File("agent.safetensors")
+    """The last model."""
+    best = File("best.safetensors")
+    """The model that evaluated best."""
+    checkpoints = File("checkpoints")
+    """Folder of the checkpoints from which the run can be resumed."""
+    curve = File("curve.png")
+    """The learning curve."""
+    replays = File("replays.csv")
+    """Episodes of the trained agent, one row each; read by :mod:`rejeu.lab.reporting.runs`."""
+    report = File("report.html")
+    """The page about the run."""
+    warnings = File("warnings.txt")
+    """Warnings of the training, and the error that ended it, one a line; read by :mod:`rejeu.lab.reporting.runs`."""
+    video = File("video.mp4")
+    """A few episodes of the best model."""
+
+    videos = File("videos")
+    """Folder of videos of the policy during training."""
+
+
+def newest_inside(folder: Path) -> str:
+    """Returns the part of a message that names the newest run in a folder of runs; empty if there is none."""
+    configs = [*folder.glob("*/config.json")] if folder.is_dir() else []
+    if not configs:
+        return ""
+    newest = max(configs, key=lambda path: path.stat().st_mtime)
+    return f"; the newest of the {len(configs)} in it is {quoted(newest.parent)}"
+
+
+def create(out: Path | None, env_id: str, algorithm: str, seed: int) -> RunFolder:
+    """Makes an empty folder: ``out``, or a new one under ``runs`` named after the run and the time.
+
+    Raises:
+        FileExistsError: if ``out`` is a file or holds something.
+    """
+    if out is not None:
+        check_free(out)
+        out.mkdir(parents=True, exist_ok=True)
+        return RunFolder(out)
+    stem = re.sub(r"[^\w.-]+", "-", f"{env_id}-{algorithm}-seed{seed}-{time.strftime('%Y%m%d-%H%M%S')}")
+    n = 1
+    while True:
+        path = Path("runs") / (stem if n == 1 else f"{stem}-{n}")
+        try:
+            path.mkdir(parents=True)
+            return RunFolder(path)
+        except FileExistsError:
+            n += 1
+
+
+def check_free(out: Path | None) -> None:
+    """Raises ``FileExistsError`` if a run may not be written there: nothing is ever overwritten."""
+    if out is not None and out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise FileExistsError(f"--out {out} exists and is not an empty folder; name another, or remove it first")
+
+
+def find_model(run: str | Path, which: Literal["best", "last"] = "best") -> Path:
+    """Returns the model of a run folder, or a model file, whose suffix may be left out. All that takes a model takes these.
+
+    The best model of a run that was not evaluated is the last one.
+
+    Raises:
+        FileNotFoundError: if there is none.
+    """
+    path = Path(run)
+    if os.path.isfile(path):  # unlike Path.is_file, False for a name that is too long
+        return path
+    if not os.path.isdir(path) or (path.name not in ("", "..") and checkpoint.resolve(path).is_file()):
+        try:
+            return checkpoint.existing(path)
+        except FileNotFoundError:
+            raise FileNotFoundError(f"there is no run folder or model file {path}") from None
+    folder = RunFolder(path)
+    for model in (folder.best, folder.agent) if which == "best" else (folder.agent,):
+        if model.is_file():
+            return model
+    newest = newest_inside(path) or "; a run folder holds best.safetensors or agent.safetensors"
+    raise FileNotFoundError(f"{str(path)!r} is a folder without a model{newest}")
+
+
+def run_files(folder: Path) -> list[Path]:
+    """Returns the checkpoints in a folder, newest first."""
+    if not folder.is_dir():
+        return []
+    return sorted((path for path in folder.iterdir() if RUN_FILE.fullmatch(path.name)), reverse=True)
+
+
+def step_of(path: Path) -> int:
+    """Returns the environment step of a checkpoint."""
+    found = RUN_FILE.fullmatch(path.name)
+    assert found is not None
+    return int(found[1])
+
+
+def newest_step(folder: Path) -> int:
+    """Returns the environment step of the newest checkpoint in a folder, -1 if there is none."""
+    found = run_files(folder)
+    return step_of(found[0]) if found else -1

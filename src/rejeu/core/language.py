@@ -1,0 +1,42 @@
+"""The language of what students read: windows, grades and leaderboards. Everything else is in English."""
+
+from __future__ import annotations
+
+import os
+import tomllib
+from functools import cache
+from importlib import resources
+from typing import Any, Literal, get_args
+
+Language = Literal["en", "fr"]
+LANGUAGES: tuple[Language, ...] = get_args(Language)
+SETTING = "REJEU_LANGUAGE"
+"""Environment variable with the language, English by default; ``speak`` in the notebooks of the courses sets it."""
+
+
+def chosen(language: str | None = None) -> Language:
+    """Returns a language, by default that of :data:`SETTING`.
+
+    Raises:
+        ValueError: for an unknown one.
+    """
+    language = language or os.environ.get(SETTING) or "en"
+    if language not in LANGUAGES:
+        raise ValueError(f"language {language!r} must be one of {', '.join(LANGUAGES)}")
+    return language
+
+
+@cache
+def french() -> dict[str, str]:
+    """Returns the texts in French by those in English."""
+    return tomllib.loads((resources.files("rejeu.core") / "language.toml").read_text(encoding="utf-8"))
+
+
+def said(text: str, *values: Any, language: Language | None = None) -> str:
+    """Returns a text in a language, by default the chosen one, with values in place of its braces.
+
+    >>> said("step {}", 3, language="fr"), said("a text without a translation", language="fr")
+    ('pas 3', 'a text without a translation')
+    """
+    text = french().get(text, text) if chosen(language) == "fr" else text
+    return text.format(*values) if values else text

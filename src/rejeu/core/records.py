@@ -1,0 +1,202 @@
+"""JSON from files: parsed strictly, and converted to typed records with ``msgspec``, which checks types and bounds.
+
+The states of environments and callbacks consist of numbers, strings, lists, tuples, dicts and arrays. JSON alone would turn
+tuples into lists and has no arrays: :func:`encode` preserves the type of every value, and names arrays.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from rejeu.core.errors import CheckpointError
+
+T = TypeVar("T")
+
+Count = Annotated[int, Meta(ge=0, le=2**62)]
+"""An integer from 0."""
+Positive = Annotated[int, Meta(ge=1, le=2**62)]
+"""An integer from 1."""
+Seed = Annotated[int, Meta(ge=0, le=2**32 - 1)]
+"""The seed of a NumPy generator."""
+MAX_DEPTH = 100
+"""Upper limit on the levels of a JSON document; much deeper ones exceed Python's recursion limit where they are written."""
+MAX_ENVS = 4096
+"""Upper limit on the environments that a file may ask for."""
+EnvCount = Annotated[int, Meta(ge=1, le=MAX_ENVS)]
+Seconds = Annotated[float, Meta(ge=0, le=1e300)]
+Duration = Annotated[float, Meta(gt=0, le=1e300)]
+"""Seconds or minutes, more than none."""
+
+
+WRONG = (ArithmeticError, AttributeError, LookupError, MemoryError, RecursionError, TypeError, ValueError)
+"""Exceptions that invalid values of a file can cause where they are used."""
+
+
+class Malformed(ValueError):
+    """A file does not follow its format; the message says where."""
+
+
+def parse_json(text: str | bytes) -> Any:
+    """Returns the value of a JSON document; NaN, infinities and numbers of more than 300 digits are not JSON.
+
+    Raises:
+        Malformed: if the document is not valid.
+
+    >>> parse_json('{"a": NaN}')
+    Traceback (most recent call last):
+        ...
+    rejeu.core.records.Malformed: it is not valid JSON: JSON is malformed: invalid character (byte 6)
+    """
+    try:
+        value = msgspec.json.decode(text)
+        if is_deep(value, MAX_DEPTH):
+            raise RecursionError
+        return value
+    except RecursionError:
+        raise Malformed("it is nested too deeply") from None
+    except ValueError as error:
+        raise Malformed(f"it is not valid JSON: {str(error)[:80]}") from None
+
+
+def read_json(path: Path, most: int) -> Any:
+    """Returns the value of a JSON file of at most ``most`` bytes.
+
+    Raises:
+        Malformed: if the file is longer, or no valid document.
+        OSError: if it cannot be read.
+    """
+    with path.open("rb") as file:
+        data = file.read(most + 1)
+    if len(data) > most:
+        raise Malformed(f"it has more than {most:,} bytes")
+    return parse_json(data)
+
+
+def json_text(value: Any, indent: int = 1) -> str:
+    """Returns JSON values, also in dataclasses, as the text of a file.
+
+    Raises:
+        TypeError, ValueError: if a value is not one of JSON, or not finite.
+    """
+    return json.dumps(value, indent=indent, allow_nan=False, default=dataclasses.asdict) + "\n"
+
+
+def convert(value: Any, kind: type[T]) -> T:
+    """Returns a JSON value, or one with arrays, as a record of type ``kind``.
+
+    Raises:
+        CheckpointError: if types or bounds differ; it names the field, what was received and what was expected.
+
+    >>> convert([-1], list[Count])
+    Traceback (most recent call last):
+        ...
+    rejeu.core.errors.CheckpointError: [0]=-1: expected `int` >= 0
+    """
+    try:
+        return msgspec.convert(value, kind)
+    except msgspec.ValidationError as error:
+        problem, _, place = str(error).partition(" - at ")
+        raise CheckpointError(f"{_received(value, place)}{problem[:1].lower()}{problem[1:]}") from None
+
+
+def is_deep(value: Any, most: int) -> bool:
+    """Returns whether a JSON value has more than ``most`` levels."""
+    level = [value]
+    for _ in range(most):
+        level = [
+            child
+            for one in level
+            if isinstance(one, dict | list)
+            for child in (one.values() if isinstance(one, dict) else one)
+        ]
+        if not level:
+            break
+    return bool(level)
+
+
+def shown(value: Any, length: int = 100) -> str:
+    """Returns a value from a file as an error message may contain it: on one line, and shortened."""
+    text = str(value)
+    text = text if text.isprintable() else ascii(text)[1:-1]
+    return text if len(text) <= length else text[: length - 3] + "..."
+
+
+def brief(error: BaseException) -> str:
+    """Returns the message of an error on one line, shortened."""
+    text = " ".join((str(error) or type(error).__name__).split())
+    return text if len(text) <= 400 else text[:397] + "..."
+
+
+def _received(value: Any, place: str) -> str:
+    """Returns ``field=value: `` for a place such as ``$.counters.step``, or the place alone where it has no index."""
+    name = place.replace("`", "").removeprefix("$").lstrip(".")
+    if not name or "..." in name or " " in name:
+        return f"{name}: " if name else ""
+    for key, index in re.findall(r"([^.\[\]]+)|\[(\d+)\]", name):
+        value = value[key] if key else value[int(index)]
+    return f"{name}={shown(repr(value), 40)}: "
+
+
+MAX_LEVELS = 32
+"""Upper limit on the levels of nesting."""
+
+
+def encode(value: Any, arrays: dict[str, np.ndarray], name: str) -> Any:
+    """Returns ``value`` as JSON; its arrays are added to ``arrays`` under names that begin with ``name``.
+
+    Raises:
+        TypeError: for a value of another type; it names its place.
+
+    >>> arrays = {}
+    >>> encode({"state": (1, np.float32(2.5))}, arrays, "env")
+    {'dict': {'state': {'tuple': [1, {'scalar': 'env.state.1'}]}}}
+    >>> arrays
+    {'env.state.1': array(2.5, dtype=float32)}
+    """
+    if value is None or isinstance(value, bool | str) or type(value) is int:
+        return value
+    if type(value) is float:
+        return value if math.isfinite(value) else {"float": repr(value)}
+    if isinstance(value, np.generic | np.ndarray) and value.dtype.kind in "biuf":
+        arrays[name] = np.array(value)
+        return {"array" if isinstance(value, np.ndarray) else "scalar": name}
+    if isinstance(value, list | tuple):
+        parts = [encode(part, arrays, f"{name}.{i}") for i, part in enumerate(value)]
+        return parts if isinstance(value, list) else {"tuple": parts}
+    if isinstance(value, Mapping) and all(isinstance(key, str) for key in value):
+        return {"dict": {key: encode(part, arrays, f"{name}.{key}") for key, part in value.items()}}
+    raise TypeError(f"{name} is a {type(value).__name__}; expected numbers, strings, lists, tuples, dicts and arrays")
+
+
+def decode(value: Any, arrays: Mapping[str, np.ndarray], depth: int = 0) -> Any:
+    """Returns the value that :func:`encode` encoded.
+
+    Raises:
+        CheckpointError: if ``value`` cannot come from :func:`encode`.
+    """
+    if depth > MAX_LEVELS:
+        raise CheckpointError(f"the data are nested more than {MAX_LEVELS} deep; the file is damaged")
+    if isinstance(value, list):
+        return [decode(part, arrays, depth + 1) for part in value]
+    if not isinstance(value, dict):
+        return value
+    kind, content = next(iter(value.items())) if len(value) == 1 else (None, None)
+    if kind == "dict" and isinstance(content, dict):
+        return {key: decode(part, arrays, depth + 1) for key, part in content.items()}
+    if kind == "tuple" and isinstance(content, list):
+        return tuple(decode(part, arrays, depth + 1) for part in content)
+    if kind == "float" and content in ("nan", "inf", "-inf"):
+        return float(content)
+    if kind in ("array", "scalar") and isinstance(content, str) and content in arrays:
+        return arrays[content] if kind == "array" else arrays[content][()]
+    raise CheckpointError("the data have an unknown form; the file is damaged")

@@ -1,0 +1,164 @@
+"""The command ``rejeu``: the arguments are in :mod:`rejeu.lab.cli.commands`, what each command does in a module of its name.
+
+That module is imported when the command runs, so that help and errors in the arguments are quick. With ``--json`` a result is
+one document on standard output, and nothing else is there.
+"""
+
+from __future__ import annotations
+
+import importlib
+import io
+import os
+import re
+import signal
+import sys
+import sysconfig
+import traceback
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, redirect_stdout
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+import rejeu
+from rejeu.core import errors, hardware, interrupt
+from rejeu.lab.cli import parsing
+from rejeu.lab.cli.commands import COMMANDS, MODULES, check_options, of_task
+from rejeu.lab.runs.config import read_task
+
+DESCRIPTION = """Trains agents on Gymnasium environments.
+
+The shortest use: rejeu train parking-v0. Version: rejeu --version."""
+
+CLOSED = 141
+"""Exit status if the reader of the output has closed it, as after ``| head``; that of SIGPIPE in shells."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs one command and returns the exit status: 0, 2 after an error, 130 after Ctrl-C, 143 after SIGTERM.
+
+    Args:
+        argv: without the program's name; None takes the process's own.
+
+    Raises:
+        SystemExit: after ``--help``, or if the arguments cannot be read.
+    """
+    argv = sys.argv[1:] if argv is None else argv
+    if [*argv] == ["--version"]:
+        print(f"rejeu {rejeu.__version__}")
+        return 0
+    for stream in (sys.stdout, sys.stderr):  # a pipe may have an encoding without ±
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
+    hardware.quiet_sdl()
+    with interrupt.leaving(), interrupt.by_parent(), warnings.catch_warnings():
+        warnings.showwarning = show_warning
+        status = run_command(argv)
+    if status in (128 + number for number in interrupt.NAMES):
+        interrupt.ignore()
+    return status
+
+
+def run_command(argv: Sequence[str]) -> int:
+    """Parses a command line, runs the command and returns the exit status."""
+    try:
+        is_task = [*argv[:1]] == ["--task"] and len(argv) == 2
+        command, arguments = (
+            of_task(read_task(Path(argv[1]))) if is_task else parsing.parse(argv, COMMANDS, DESCRIPTION)
+        )
+        check_options(arguments)
+        for name in getattr(arguments, "imports", ()):
+            importlib.import_module("rejeu.lab.cli.environment").import_source(name)
+        module = importlib.import_module(f"rejeu.lab.cli.{MODULES.get(command, command)}")
+        with messages(getattr(arguments, "json", False)) as emit:
+            status, result = getattr(module, f"run_{command}")(arguments)
+            emit(result)
+        return status
+    except KeyboardInterrupt as error:
+        print("rejeu: interrupted", file=sys.stderr)
+        return 128 + (error.signal if isinstance(error, interrupt.Stopped) else signal.SIGINT)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # else Python complains when it exits
+        return CLOSED
+    except Exception as error:
+        if not isinstance(error, expected_errors()):
+            raise
+        has_trace = isinstance(error, errors.WorkerError)  # of the environment's code
+        print(f"rejeu: error: {error if has_trace else one_line(error)}{place_of(error)}", file=sys.stderr)
+        return 2
+
+
+def show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
+    """Prints a warning on one line, without the line of code that it comes from."""
+    print(f"warning: {one_line(message).removeprefix('WARN: ')}", file=sys.stderr, flush=True)
+
+
+def expected_errors() -> tuple[type[Exception], ...]:
+    """Returns the errors whose message is meant for the user; the others are bugs and keep their traceback."""
+    import gymnasium  # takes longer than all that --help needs
+
+    own = (errors.BadEnvironmentError, errors.NonFiniteError, errors.RunInUseError, errors.WorkerError)
+    return ValueError, TypeError, ImportError, OSError, MemoryError, *own, gymnasium.error.Error
+
+
+def place_of(error: Exception) -> str:
+    """Returns where the user's own code raised an error, such as an environment, or what it should do; else nothing."""
+    not_own = Path(sysconfig.get_path("stdlib")).resolve(), Path(rejeu.__file__).resolve().parent
+    cause = error.__cause__ or error
+    for frame, line in reversed([*traceback.walk_tb(error.__traceback__), *traceback.walk_tb(cause.__traceback__)]):
+        path = Path(frame.f_code.co_filename).resolve()
+        is_installed = "site-packages" in path.parts or any(path.is_relative_to(folder) for folder in not_own)
+        if path.is_file() and not is_installed:
+            return f" ({path.name}, line {line}, in {frame.f_code.co_name})"
+    if "values to unpack (expected 5" in str(error):  # by a wrapper of Gymnasium
+        return "; step must return observation, reward, terminated, truncated and info"
+    return ""
+
+
+def one_line(error: Exception | Warning | str) -> str:
+    r"""Returns an error's or a warning's message on one line and without colors, or the name of its class if it has none.
+
+    >>> one_line(ValueError("two\n  lines")), one_line(MemoryError())
+    ('two lines', 'MemoryError')
+    """
+    return " ".join(re.sub(r"\x1b\[[\d;]*m", "", str(error)).split()) or type(error).__name__
+
+
+@contextmanager
+def messages(is_json: bool) -> Iterator[Callable[[Any], None]]:
+    """Context that yields a function to call with the result, which prints it with ``is_json`` and else does nothing.
+
+    With ``is_json``, what is printed otherwise goes to standard error.
+    """
+    if not is_json:
+        yield lambda result: None
+        return
+    output = sys.stdout
+    with redirect_stdout(sys.stderr):
+        yield lambda result: print(dumps(result), file=output, flush=True)
+
+
+def dumps(value: Any) -> str:
+    """Returns a value as indented JSON text. NaN and infinities become null, since JSON has none.
+
+    >>> import math, pathlib
+    >>> import numpy as np
+    >>> print(dumps({"steps": np.int64(3), "return": math.nan, "path": pathlib.PurePosixPath("runs/a")}))
+    {
+      "steps": 3,
+      "return": null,
+      "path": "runs/a"
+    }
+    """
+    return msgspec.json.format(msgspec.json.encode(value, enc_hook=plain), indent=2).decode()
+
+
+def plain(value: Any) -> Any:
+    """Returns a NumPy array or number as Python's, a mapping as a dict, and anything else as text."""
+    import numpy as np  # takes longer than all that --help needs
+
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    return dict(value) if isinstance(value, Mapping) else str(value)

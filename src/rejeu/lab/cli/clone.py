@@ -1,0 +1,148 @@
+"""``rejeu clone``: an agent that acts as in recorded episodes, in a run folder."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack, closing
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from rejeu import demonstrations
+from rejeu.agents import Agent, load
+from rejeu.callbacks import Checkpoint
+from rejeu.callbacks.base import stateful
+from rejeu.checkpoints.run_folder import check_free, create, find_model
+from rejeu.core import devices
+from rejeu.core.interrupt import Interrupt
+from rejeu.demonstrations import Demonstrations
+from rejeu.envs.registry import register
+from rejeu.lab.cli import environment
+from rejeu.lab.cli.commands import Clone, Train
+from rejeu.lab.cli.environment import Environment
+from rejeu.lab.cli.output import Stopwatch, echo
+from rejeu.lab.cli.session import Session
+from rejeu.lab.cli.train import begin
+from rejeu.lab.runs import config as runs
+from rejeu.lab.runs.config import RunConfig
+from rejeu.logs.formatting import counted
+
+
+def run_clone(arguments: Clone) -> tuple[int, dict[str, Any]]:
+    """Clones and evaluates; the exit status is that of ``rejeu train``."""
+    stopwatch = Stopwatch()
+    devices.start_with("--device", arguments.device)
+    check_free(arguments.out)
+    shown = demonstrations.read(arguments.dataset)
+    made = environment_of(shown, arguments)
+    seed = int(np.random.default_rng().integers(10_000)) if arguments.seed is None else arguments.seed
+    task = Train(
+        env=made.run.typed,
+        env_kwargs=made.kwargs,
+        wrappers=made.run.wrappers,
+        imports=made.run.imports,
+        algorithm=arguments.algo,
+        hyperparameters=arguments.hyperparameters,
+        evaluate_episodes=arguments.evaluate_episodes,
+        device=arguments.device,
+        no_report=arguments.no_report,
+        no_video=arguments.no_video,
+    )
+    with ExitStack() as stack:
+        session, stop = begin(task, seed, stack), stack.enter_context(Interrupt())
+        expert = None if arguments.expert is None else expert_of(arguments.expert, arguments, made)
+        demonstrations.check(session.agent, shown)
+        if arguments.critic_updates:
+            demonstrations.keeping_policy(session.agent)  # which raises before anything is trained
+        folder = create(arguments.out, session.config.env, session.config.algorithm, seed)
+        session = session._replace(folder=folder)
+        runs.write(folder.config, session.config)
+        echo(f"environment   {made}")
+        echo(f"algorithm     {session.config.algorithm}, seed {seed}")
+        echo(f"shown         {shown}")
+        echo(f"run folder    {folder.path}")
+        with session.training(stop) as learning:
+            if expert is None and not arguments.by_hand:
+                rate = arguments.learning_rate
+                demonstrations.clone(session.agent, shown, arguments.updates, learning_rate=rate, seed=seed)
+            else:
+                learn_from_expert(session, expert, shown, arguments, seed)
+            if arguments.critic_updates:
+                demonstrations.learn_offline(session.agent, shown, arguments.critic_updates, keep_policy=True)
+            session.agent.callbacks = stateful(learning.callbacks)
+        status, result = session.finish(learning, stop, stopwatch)
+        checkpoint = Checkpoint(folder.checkpoints)
+        checkpoint.before_training(session.agent)
+        checkpoint.after_training(session.agent, None)
+    recorded = {"episodes": len(shown.episodes), "steps": shown.n_steps, "mean_return": shown.mean_return}
+    if learning.evaluate.best is not None:
+        found = learning.evaluate.best.evaluation
+        echo(f"clone         return {found.mean_return:,.2f}; the demonstrations have {shown.mean_return:,.2f}")
+    return status, {**result, "demonstrations": recorded}
+
+
+def learn_from_expert(
+    session: Session, expert: Agent | None, shown: Demonstrations, arguments: Clone, seed: int
+) -> None:
+    """Trains the agent by DAgger, and prints how good it is after each round; without an expert a person takes over."""
+
+    def say(i: int, known: Demonstrations) -> None:
+        found = session.agent.evaluate(session.config.evaluate_episodes, env=session.evaluation_env, seed=seed)
+        echo(f"round {i:>2}      {counted(known.n_steps, 'labeled step')}, return {found.mean_return:,.2f}")
+
+    with ExitStack() as stack:
+        if expert is None:
+            from rejeu.teaching.play.assist import Expert
+
+            env = stack.enter_context(closing(session.environment.rendering()))
+            answer: Any = stack.enter_context(closing(Expert(env, fps=arguments.fps)))
+        else:
+            env = stack.enter_context(closing(session.environment.make()))
+            answer = lambda obs: expert.predict(obs, deterministic=True)[0]  # noqa: E731
+        demonstrations.dagger(
+            session.agent,
+            answer,
+            env,
+            shown,
+            takes_over=expert is None,
+            rounds=arguments.rounds,
+            steps=arguments.round_steps,
+            updates=arguments.updates,
+            learning_rate=arguments.learning_rate,
+            seed=seed,
+            after_round=say,
+        )
+
+
+def expert_of(run: Path, arguments: Clone, made: Environment) -> Agent:
+    """Returns the agent that labels.
+
+    Raises:
+        ValueError: if it was trained on another environment, or has a memory.
+    """
+    model = find_model(run, arguments.which)
+    if (trained_on := environment.recorded_id(model)) != made.env_id:
+        raise ValueError(f"--expert {run}: that agent plays {trained_on}, not {made.env_id}")
+    agent = load(model, device=arguments.device)
+    if agent.learner.algorithm.recall is not None:
+        raise ValueError(
+            f"--expert {run}: {agent.name} has a memory, and labels single steps; use one without a memory"
+        )
+    return agent
+
+
+def environment_of(shown: Demonstrations, arguments: Clone) -> Environment:
+    """Returns the environment that the command line names, else that of the dataset.
+
+    Raises:
+        ValueError: if neither says which.
+    """
+    if arguments.env is not None:
+        return environment.from_arguments(arguments.env, arguments)
+    spec = shown.spec
+    if spec is None or spec.additional_wrappers:
+        raise ValueError(f"{arguments.dataset} does not say how to make its environment; name it: --env ENV")
+    registered = gym.registry[spec.id].kwargs if register(spec.id) and spec.id in gym.registry else {}
+    changed = {key: value for key, value in spec.kwargs.items() if key not in registered or registered[key] != value}
+    return environment.from_run(RunConfig(env=spec.id, env_kwargs=changed), arguments.dataset, arguments)

@@ -1,0 +1,79 @@
+"""``rejeu course`` writes the notebooks of the courses and grades notebooks; ``rejeu class`` writes a leaderboard."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from rejeu.core import atomic
+from rejeu.core.language import chosen, said
+from rejeu.core.validation import whole
+from rejeu.lab.cli import dumps, environment
+from rejeu.lab.cli.commands import Class, Course
+from rejeu.lab.cli.output import echo
+from rejeu.teaching.courses import grading, leaderboard, write
+
+MAX_EPISODES = 1_000
+
+
+def run_course(arguments: Course) -> tuple[int, dict[str, Any]]:
+    """Writes or grades notebooks, and prints a line for each file."""
+    if arguments.language == "grade":
+        return grade(arguments)
+    if len(arguments.paths) != 1:
+        raise ValueError(f"rejeu course {arguments.language} needs one FOLDER, got {len(arguments.paths)}")
+    written: list[Path] = []
+    kept: list[Path] = []
+    for path, is_new in write(arguments.language, arguments.paths[0]):
+        (written if is_new else kept).append(path)
+        change = "" if is_new else " exists and was not changed; delete or rename it to get a new copy"
+        echo(f"{path}{change}")
+    return 0, {"written": written, "kept": kept}
+
+
+def grade(arguments: Course) -> tuple[int, dict[str, Any]]:
+    """Prints which checks each notebook passes; the exit status is 2 if a file could not be graded."""
+    grades = []
+    for path in arguments.paths:
+        one = grading.grade(path)
+        grades.append(one)
+        say = partial(said, language=one.language)
+        echo(say("{}: {}", path, one.error or say("{} of {} passed", one.n_passed, len(one.found))))
+        for name, found in one.found.items():
+            if found != "" and not one.error:
+                echo(say("{}: {}", f"  {name}", found or say("its check did not run; is there an error in its cell?")))
+    status = 2 if any(one.error for one in grades) else 0
+    return status, {"notebooks": [one._asdict() | {"passed": one.n_passed} for one in grades]}
+
+
+def run_class(arguments: Class) -> tuple[int, dict[str, Any]]:
+    """Evaluates the models in a folder, prints a line for each, and writes the leaderboard."""
+    episodes = whole("--episodes", arguments.episodes, 1, MAX_EPISODES)
+    formats = {
+        ".html": leaderboard.page,
+        ".md": leaderboard.markdown,
+        ".json": lambda board: dumps(leaderboard.to_dict(board)) + "\n",
+    }
+    out = arguments.out
+    if out.suffix not in formats:
+        raise ValueError(f"--out {out} must end in {', '.join(formats)}")
+    paths, language = leaderboard.models(arguments.folder), chosen(arguments.language)
+    if out.suffix == ".html":
+        leaderboard.template()  # a missing package is named before the evaluations
+    made = environment.from_arguments(arguments.env or leaderboard.usual_env_id(paths), arguments)
+    echo(said("{}, {} episodes of each of {} models", made, episodes, len(paths), language=language))
+    board = leaderboard.build(
+        arguments.folder,
+        paths,
+        made.env_id,
+        lambda n: made.vector(n, "gymnasium", arguments.seed),
+        episodes,
+        arguments.seed,
+        60 * arguments.minutes,
+        arguments.success_threshold,
+        language,
+        echo,
+    )
+    echo(atomic.write(out, formats[out.suffix](board)))
+    return 0, {**leaderboard.to_dict(board), "file": out}

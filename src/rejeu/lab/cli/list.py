@@ -1,0 +1,82 @@
+"""``rejeu list``: the algorithms and presets."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from rejeu.agents import presets
+from rejeu.agents.presets import Preset
+from rejeu.algorithms.catalog import CATALOG
+from rejeu.lab.cli.commands import List
+
+
+def run_list(arguments: List) -> tuple[int, dict[str, Any]]:
+    """Prints the lists."""
+    algorithms = described(is_extended=bool(arguments.imports))
+    if not arguments.json:
+        show(algorithms)
+    return 0, {"algorithms": algorithms, "presets": [as_dict(preset) for preset in presets.every()]}
+
+
+def show(algorithms: Mapping[str, str]) -> None:
+    """Prints the algorithms, and the presets by environment."""
+    print("algorithms")
+    print(columns([*algorithms.items()]))
+    print("\nenvironments with tuned hyperparameters, the preset of rejeu train first; in brackets, names for --preset")
+    rows: dict[str, list[tuple[str, ...]]] = {}
+    for one in presets.every():
+        steps, result = f"{one.total_steps:,} steps", presets.find_result(one.env_id, one.algorithm, one.name)
+        shown = one.source if result is None else str(result)
+        if result is not None and result.budget.endswith(" steps") and result.budget != steps:
+            shown += f", after {result.budget}"
+        of_env = rows.setdefault(one.env_id, [])
+        algorithm = f"{one.algorithm} ({one.name})" if one.name else one.algorithm
+        of_env.append(("" if of_env else one.env_id, algorithm, steps, shown))
+    print(columns([row for of_env in rows.values() for row in of_env]))
+    print("\nIn brackets: 95 % confidence interval of a mean return, lowest and highest success rate of a seed.")
+    print("Any other Gymnasium or EnvPool id is trained without a preset.")
+
+
+def described(is_extended: bool) -> dict[str, str]:
+    """Returns the first lines of the docstrings of all agents by name.
+
+    Args:
+        is_extended: whether imported modules may have registered others; else nothing is imported, which would take seconds.
+    """
+    if is_extended:
+        from rejeu.agents import AGENTS
+
+        return {name: (agent.__doc__ or "").partition("\n")[0] for name, agent in AGENTS.items()}
+    return {name: entry.summary for name, entry in CATALOG.items()}
+
+
+def as_dict(preset: Preset) -> dict[str, Any]:
+    """Returns a preset with its measured result, which is None if there is none."""
+    names = (
+        "env_id",
+        "algorithm",
+        "name",
+        "n_envs",
+        "total_steps",
+        "evaluate_every",
+        "evaluate_episodes",
+        "hyperparameters",
+    )
+    known = {name: getattr(preset, name) for name in (*names, "source")}
+    return {**known, "result": presets.find_result(preset.env_id, preset.algorithm, preset.name)}
+
+
+def columns(rows: Sequence[tuple[str, ...]]) -> str:
+    """Returns a table with aligned columns; entries that begin with a digit are aligned to the right.
+
+    >>> print(columns([("a", "10"), ("bcd", "7")]))
+      a    10
+      bcd   7
+    """
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return "\n".join("  " + "  ".join(map(_padded, row, widths)).rstrip() for row in rows)
+
+
+def _padded(text: str, width: int) -> str:
+    return text.rjust(width) if text[:1].isdigit() else text.ljust(width)

@@ -1,0 +1,198 @@
+"""``rejeu evaluate``, ``record``, ``export``, ``watch``, ``play``, ``import``, ``push`` and ``pull``: models and agents."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from contextlib import closing, nullcontext
+from typing import TYPE_CHECKING, Any
+
+from rejeu.agents import load
+from rejeu.agents.exporting import SUFFIXES, export, target_of
+from rejeu.checkpoints.run_folder import RunFolder, find_model
+from rejeu.core import devices
+from rejeu.core.errors import CheckpointError
+from rejeu.lab.cli import environment
+from rejeu.lab.cli.commands import Evaluate, Export, Import, Play, Pull, Push, Record, Watch
+from rejeu.lab.cli.output import echo
+from rejeu.lab.runs.config import value
+from rejeu.logs.formatting import counted, quoted
+from rejeu.logs.video import record_video
+
+if TYPE_CHECKING:
+    from rejeu.teaching.play import Game
+
+
+def run_evaluate(arguments: Evaluate) -> tuple[int, dict[str, Any]]:
+    """Evaluates an agent on whole episodes and prints the result."""
+    devices.start_with("--device", arguments.device)
+    episodes, minutes = arguments.episodes, arguments.minutes
+    if minutes is None and episodes is None:
+        episodes = 100
+    model = find_model(arguments.run, arguments.which)
+    made = environment.environment_of(model, arguments)
+    agent = load(model, device=arguments.device)
+    n_envs = 16 if episodes is None else min(episodes, 16)
+    with closing(made.vector(n_envs, arguments.backend, arguments.seed)) as env:
+        echo(f"{made} on {env.backend}, {model}")
+        found = agent.evaluate(episodes, env=env, success_threshold=arguments.success_threshold, minutes=minutes)
+        echo(found)
+        about = {"model": model, "env_id": made.env_id, "backend": env.backend}
+    each = {"returns": found.returns, "lengths": found.lengths, "successes": found.successes}
+    return 0, {**about, **found.to_dict(), **each}
+
+
+def run_record(arguments: Record) -> tuple[int, dict[str, Any]]:
+    """Records a video of an agent and prints its path."""
+    model = find_model(arguments.run, arguments.which)
+    default = RunFolder(arguments.run).video if arguments.run.is_dir() else model.with_suffix(".mp4")
+    out = default if arguments.out is None else arguments.out
+    made = environment.environment_of(model, arguments)
+    path = record_video(load(model), out, env=made.rendering, episodes=arguments.episodes, seed=arguments.seed)
+    echo(f"{path}: {counted(arguments.episodes, 'episode')} of {model} in {made}")
+    return 0, {"video": path, "episodes": arguments.episodes, "model": model, "env_id": made.env_id}
+
+
+def run_export(arguments: Export) -> tuple[int, dict[str, Any]]:
+    """Writes the policy of an agent to a file of another format, and prints how it compares with ``predict``."""
+    model = find_model(arguments.run, arguments.which)
+    out, to = arguments.out, arguments.to
+    if out is None or out.is_dir():
+        to = to or "onnx"
+        beside = model.parent / "policy" if arguments.run.is_dir() else model.with_suffix("")
+        out = (beside if out is None else out / beside.name).with_suffix(SUFFIXES[to])
+    target_of(out, to)  # an error before the agent is loaded
+    made = None
+    try:
+        made = environment.environment_of(model, arguments)
+    except (CheckpointError, ImportError, ValueError) as error:
+        if arguments.env is not None:
+            raise
+        echo(f"the observations are sampled from the observation space, because there is no environment: {error}")
+    agent, make_env = load(model), None if made is None else made.make
+    if arguments.env is not None and made is not None and not made.wrappers:
+        agent.trained_on = made.env_id, made.kwargs
+    found = export(
+        agent, out, to, arguments.noise, arguments.batch, make_env, str(arguments.run), arguments.frame_stack
+    )
+    echo(found)
+    return 0, found.to_dict()
+
+
+def run_watch(arguments: Watch) -> tuple[int, dict[str, Any]]:
+    """Shows an agent in a window, and prints its scores."""
+    from rejeu.teaching.play import watch
+
+    model = find_model(arguments.run, arguments.which)
+    made = environment.environment_of(model, arguments)
+    game = watch(load(model), made.make, seed=arguments.seed, fps=arguments.fps, episodes=arguments.episodes)
+    echo(scores(game))
+    return 0, as_dict(game)
+
+
+def run_play(arguments: Play) -> tuple[int, dict[str, Any]]:
+    """Lets a person play, alone or next to an agent, and prints the scores."""
+    from rejeu.teaching.play import play
+    from rejeu.teaching.play.keys import full_name
+
+    made = environment.from_arguments(full_name(arguments.env), arguments)
+    agent = None
+    if arguments.against is not None:
+        model = find_model(arguments.against, arguments.which)
+        trained_on = environment.recorded_id(model)
+        if trained_on != made.env_id:
+            raise ValueError(f"--against {arguments.against}: that agent plays {trained_on}, not {made.env_id}")
+        agent = load(model)
+    game = play(
+        made.make,
+        keys=parse_keys(arguments.keys),
+        seed=arguments.seed,
+        fps=arguments.fps,
+        episodes=arguments.episodes,
+        record=arguments.record,
+        against=agent,
+    )
+    echo(scores(game))
+    if (recording := game.players[0].recording) is not None:
+        echo(recording)
+    return 0, as_dict(game)
+
+
+def parse_keys(assignments: Iterable[str]) -> dict[str, Any]:
+    """Returns the action of each combination of keys.
+
+    Raises:
+        ValueError: for an assignment without ``=``.
+
+    >>> parse_keys(["a=0", "a+w=[1,-0.5]", "none=wait"])
+    {'a': 0, 'a+w': [1, -0.5], 'none': 'wait'}
+    """
+    result = {}
+    for assignment in assignments:
+        keys, equals, text = assignment.rpartition("=")
+        if not equals or not keys:
+            raise ValueError(f"--keys {assignment!r} must be keys=action, such as a=0 or a+w=[1,-1]")
+        result[keys.strip()] = value(text)
+    return result
+
+
+def as_dict(game: Game) -> dict[str, Any]:
+    """Returns the players with their scores."""
+    return {
+        "players": [
+            {"name": one.name, "episodes": len(one.scores), "mean": one.mean, "best": one.best, "scores": one.scores}
+            for one in game.players
+        ]
+    }
+
+
+def scores(game: Game) -> str:
+    """Returns a line for each player: number of complete episodes, mean and best score."""
+    lines = []
+    for player in game.players:
+        n = len(player.scores)
+        episodes = counted(n, "episode")
+        lines.append(f"{player.name}: {episodes}" + (f", mean {player.mean:.2f}, best {player.best:.2f}" if n else ""))
+    return "\n".join(lines)
+
+
+def run_import(arguments: Import) -> tuple[int, dict[str, Any]]:
+    """Converts a model of Stable-Baselines3 and prints what was taken over."""
+    from rejeu.agents.zip_files import load_zip
+    from rejeu.agents.zoo import model_in
+
+    model = arguments.model
+    model = model_in(model, arguments.which) if model.is_dir() else model
+    statistics: Any = False if str(arguments.vecnormalize) == "none" else arguments.vecnormalize
+    out = model.with_suffix(".safetensors") if arguments.out is None else arguments.out
+    if out.exists():
+        raise FileExistsError(f"{out} exists; name another file with --out")
+    made = (
+        None if arguments.env is None else environment.from_arguments(arguments.env, arguments).vector(1, "auto", None)
+    )
+    with nullcontext() if made is None else closing(made):
+        agent = load_zip(model, made, statistics, **arguments.hyperparameters)
+        path = agent.save(out)
+    echo(f"{path}: {agent.name}, {counted(agent.num_timesteps, 'step')}, {counted(agent.n_updates, 'update')}")
+    for note in agent.notes:
+        echo(f"note: {note}")
+    return 0, {"model": path, "algorithm": agent.name, "notes": agent.notes}
+
+
+def run_push(arguments: Push) -> tuple[int, dict[str, Any]]:
+    """Uploads a model and prints its address."""
+    from rejeu.lab import hub
+
+    address = hub.push(arguments.run, arguments.repo, arguments.private, echo)
+    echo(address)
+    return 0, {"address": address}
+
+
+def run_pull(arguments: Pull) -> tuple[int, dict[str, Any]]:
+    """Downloads a model and prints what to do with it."""
+    from rejeu.lab import hub
+
+    folder = hub.pull(arguments.repo, arguments.out)
+    models = sorted([*folder.glob("*.safetensors"), *folder.glob("*.zip")])
+    for model in models:
+        echo(f"rejeu {'import' if model.suffix == '.zip' else 'evaluate'} {quoted(model)}")
+    return 0, {"folder": folder, "models": models}

@@ -1,0 +1,165 @@
+"""What ``rejeu train`` and ``rejeu resume`` print."""
+
+from __future__ import annotations
+
+import math
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rejeu.agents import Agent
+from rejeu.callbacks import Evaluate, Evaluated
+from rejeu.checkpoints.run_folder import RunFolder
+from rejeu.core import atomic, xla
+from rejeu.core.interrupt import NAMES
+from rejeu.lab.cli.environment import Environment
+from rejeu.lab.runs.config import DecidedRun
+from rejeu.logs.formatting import counted, quoted
+from rejeu.logs.logging import Sink
+
+echo = partial(print, flush=True)
+
+
+class Stopwatch:
+    """Measures wall time and compilation time since it was made."""
+
+    def __init__(self) -> None:
+        self._began, self._clock = time.perf_counter(), xla.clock()
+
+    def seconds(self) -> tuple[float, float]:
+        """Returns wall time, and how much of it was compilation."""
+        wall = time.perf_counter() - self._began
+        return wall, max(wall - (xla.clock() - self._clock), 0.0)  # which rounds below 0 where nothing was compiled
+
+
+def header(config: DecidedRun, environment: Environment, backend: str, folder: RunFolder) -> str:
+    """Returns the first lines of a run; ``backend`` describes the backend."""
+    what = "preset" if config.preset else "default hyperparameters"
+    length = f"{config.minutes:g} minutes" if config.steps is None else f"{config.steps:,} steps"
+    every = f"evaluated on {counted(config.evaluate_episodes, 'episode')} every {config.evaluate_every:,} steps"
+    return "\n".join(
+        [
+            f"environment   {environment}, {config.n_envs} at once",
+            f"backend       {backend}",
+            f"algorithm     {config.algorithm}, {what}, seed {config.seed}",
+            f"training      {length}, {every}",
+            f"run folder    {folder.path}",
+        ]
+    )
+
+
+def reporter(agent: Agent, table: Sink, label: str = "") -> Callable[[Evaluated, bool], None]:
+    """Returns a function that prints an evaluation, after ``label``, and adds it to a table."""
+
+    def report(result: Evaluated, is_best: bool) -> None:
+        evaluation = result.evaluation
+        table.write(
+            result.step,
+            {
+                "seconds": agent.seconds["total"],
+                "success_rate": evaluation.success_rate,
+                "mean_return": evaluation.mean_return,
+                "std_return": evaluation.std_return,
+                "mean_length": evaluation.mean_length,
+                "episodes": len(evaluation.returns),
+                "best": int(is_best),
+            },
+        )
+        success = "" if math.isnan(evaluation.success_rate) else f"success {evaluation.success_rate:6.1%}  "
+        echo(
+            f"{label}step {result.step:>9,}  {success}return {evaluation.mean_return:,.2f}{'  (best)' if is_best else ''}"
+        )
+
+    return report
+
+
+def as_dict(
+    agent: Agent, folder: RunFolder, evaluate: Evaluate, signal: int | None, is_complete: bool, stopwatch: Stopwatch
+) -> dict[str, Any]:
+    """Returns how a run ended, for :func:`summary` and ``--json``."""
+    means = ("mean_return", "std_return", "mean_length", "success_rate")
+    last = agent.history.summary(agent.stats_window_size).last
+    best = evaluate.best
+    seconds, compile_seconds = stopwatch.seconds()
+    return {
+        "run": folder.path,
+        "env_id": None if agent.run.env is None else agent.run.env.env_id,
+        "algorithm": agent.name,
+        "seed": agent.seed,
+        "complete": is_complete,
+        "signal": signal,
+        "steps": agent.num_timesteps,
+        "episodes": len(agent.history),
+        "seconds": seconds,
+        "compile_seconds": compile_seconds,
+        "steps_per_second": agent.steps_per_second,
+        "training": {"episodes": last.n, **{name: getattr(last, name) for name in means}},
+        "best": None if best is None else {"step": best.step, **best.evaluation.to_dict()},
+        "files": sorted(path.name for path in folder.path.iterdir()),
+        "not_written": [what for what, failure in agent.failed_writes.failures.items() if not failure.written],
+    }
+
+
+def summary(
+    facts: dict[str, Any], agent: Agent, folder: RunFolder, environment: Environment, evaluate: Evaluate
+) -> str:
+    """Returns the last lines of a run; ``facts`` are those of :func:`as_dict`."""
+    options = environment.run.again()
+    lines = [""]
+    if not facts["complete"]:
+        can_resume = folder.checkpoints.is_dir()
+        how = f"; rejeu resume {quoted(folder.path)}{options} continues" if can_resume else ""
+        what = "paused" if facts["signal"] is None else f"stopped by {NAMES[facts['signal']]}"
+        saved = "; everything is saved" if agent.failed_writes.complete else ""
+        lines.append(f"{what}{saved}{how}")
+    if agent.ep_info_buffer:
+        last = counted(len(agent.ep_info_buffer), "episode")
+        lines.append(f"training      last {last}: {training_statistics(agent)}")
+    if evaluate.best is not None:
+        lines.append(f"best model    step {evaluate.best.step:,}: {evaluate.best.evaluation}")
+    backend = " --backend gymnasium" if environment.is_registered() else ""
+    steps = f"; {agent.num_timesteps:,} steps at {agent.steps_per_second:,.0f} steps/s" if agent.num_timesteps else ""
+    return "\n".join(
+        [
+            *lines,
+            f"files         {folder.path}: {', '.join(facts['files'])}",
+            f"time          {facts['seconds']:.1f} s in all, {facts['compile_seconds']:.1f} s of them compiling{steps}",
+            f"try it        rejeu evaluate {quoted(folder.path)}{options}{backend}",
+        ]
+    )
+
+
+def training_statistics(agent: Agent) -> str:
+    """Returns return, length and, where it is known, success of the last training episodes."""
+    returns, lengths = ([episode[key] for episode in agent.ep_info_buffer] for key in ("r", "l"))
+    text = f"return {np.mean(returns):.2f} ± {np.std(returns):.2f}, length {np.mean(lengths):.1f}"
+    return f"success {np.mean(agent.ep_success_buffer):.1%}, {text}" if agent.ep_success_buffer else text
+
+
+@contextmanager
+def noted_in(path: Path) -> Iterator[None]:
+    """Context whose warnings, and the error that ends it, are also written to a file, one a line."""
+    show = warnings.showwarning
+
+    def note(text: object) -> None:
+        with suppress(OSError), atomic.open_log(path) as file:
+            file.write((" ".join(str(text).split()) + "\n").encode())
+
+    def show_and_note(message: Warning | str, *arguments: Any, **options: Any) -> None:
+        show(message, *arguments, **options)
+        note(message)
+
+    warnings.showwarning = show_and_note
+    try:
+        yield
+    except Exception as error:
+        note(f"{type(error).__name__}: {error}")
+        raise
+    finally:
+        warnings.showwarning = show

@@ -1,0 +1,116 @@
+"""``rejeu resume``: continues a run exactly where it was stopped, or trains a complete one further."""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+from rejeu.agents import Agent, agent_of_file
+from rejeu.algorithms import config as configs
+from rejeu.checkpoints.run_folder import RunFolder
+from rejeu.core import devices
+from rejeu.core.interrupt import Interrupt
+from rejeu.envs.make import WorkerOptions
+from rejeu.lab.cli import environment as environments, sweep, tune
+from rejeu.lab.cli.commands import Resume
+from rejeu.lab.cli.output import Stopwatch, echo
+from rejeu.lab.cli.session import Limits, Session, has_reached_goal, make_evaluation_env
+from rejeu.lab.experiments.folder import is_sweep
+from rejeu.lab.experiments.study import StudyFolder
+from rejeu.lab.runs import config as configs_of_runs
+from rejeu.lab.runs.config import DecidedRun, merged, read_folder
+from rejeu.logs.formatting import quoted
+from rejeu.logs.logging import require
+from rejeu.logs.tables import read_table
+
+
+def run_resume(arguments: Resume) -> tuple[int, dict[str, Any]]:
+    """Trains, as ``rejeu train``, ``rejeu sweep`` or ``rejeu tune`` does.
+
+    Raises:
+        ValueError: for options of a sweep with the folder of a run.
+    """
+    if is_sweep(arguments.run):
+        return sweep.resume(arguments)
+    if StudyFolder(arguments.run).plan.is_file():
+        return tune.resume_study(arguments)
+    if arguments.workers is not None:
+        raise ValueError(f"{arguments.run} is a single run; --workers is for the folder of a sweep or a study")
+    return resume(arguments)
+
+
+def resume(arguments: Resume) -> tuple[int, dict[str, Any]]:
+    """Trains; returns the exit status and the result."""
+    stopwatch = Stopwatch()
+    folder = RunFolder(arguments.run)
+    config = read_folder(folder)
+    if config.backend != "ray" and (arguments.ray is not None or arguments.env_cpus is not None):
+        raise ValueError(f"{folder.path} is no sweep and no run with --backend ray; --ray and --env-cpus are for these")
+    require(config.log)
+    device = arguments.device or ("cpu" if config.device == "cpu" else "auto")  # a GPU may not be here
+    devices.start_with("--device", device)
+    kind = agent_of_file(config.algorithm, folder.config)
+    environment = environments.from_run(config, folder.path, arguments)
+    ray = {"address": arguments.ray, "num_cpus": arguments.env_cpus} if config.backend == "ray" else None
+    workers = WorkerOptions(restart_workers=arguments.restart_workers, wait_for=config.wait_for, ray=ray)
+    with closing(environment.vector(config.n_envs, config.backend, config.seed, workers)) as env:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "resumed at step", UserWarning)  # printed below
+            agent = kind.resume(folder.checkpoints, env, device=device, **changes(arguments, config))
+        if arguments.hyperparameters:
+            config = dataclasses.replace(config, hyperparameters=configs.to_json(agent.config))
+            configs_of_runs.write(folder.config, config)
+        limits = choose_limits(agent, arguments)
+        echo(f"run folder    {folder.path}: {environment}, {config.algorithm}, seed {config.seed}")
+        echo(f"checkpoint    {agent.resumed}")
+        with closing(make_evaluation_env(config, environment)) as evaluation_env, Interrupt() as stop:
+            session = Session(
+                agent,
+                config,
+                folder,
+                environment,
+                evaluation_env,
+                limits,
+                is_new=False,
+                has_report=not arguments.no_report,
+                has_video=not arguments.no_video,
+            )
+            return session.run(stop, stopwatch)
+
+
+def changes(arguments: Resume, config: DecidedRun) -> dict[str, Any]:
+    """Returns the hyperparameters that ``--set`` changes."""
+    names = {name.split(".")[0] for name in arguments.hyperparameters}
+    changed = merged(arguments.hyperparameters, config.hyperparameters)
+    return {name: value for name, value in changed.items() if name in names}
+
+
+def is_evaluated(run: Path, agent: Agent) -> bool:
+    """Returns whether the evaluation at the end of a run was not interrupted."""
+    return agent.num_timesteps in read_table(RunFolder(run).evaluations, ("step",)).column("step")
+
+
+def choose_limits(agent: Agent, arguments: Resume) -> Limits:
+    """Returns how far to train: to the goal of the run, to a pause before it, or further than it.
+
+    Raises:
+        ValueError: if the run is complete and the arguments do not say how much further.
+    """
+    steps, minutes = arguments.steps, arguments.minutes
+    if has_reached_goal(agent):
+        if arguments.finish or (steps is None and minutes is None and not is_evaluated(arguments.run, agent)):
+            return Limits()
+        if steps is None and minutes is None:
+            raise ValueError(
+                f"the run is complete after {agent.num_timesteps:,} steps; to train further: "
+                f"rejeu resume {quoted(arguments.run)} --steps N, or --minutes M"
+            )
+        return Limits(steps, minutes)
+    assert agent.training_call is not None
+    last = agent.training_call.last_step
+    if steps is not None and last is not None and agent.run.step + steps > last:
+        return Limits(steps)
+    return Limits(pause_steps=steps, pause_minutes=minutes)

@@ -1,0 +1,303 @@
+"""``rejeu runs``, ``status``, ``compare`` and ``report``: lists of runs, how far one is, groups side by side, and pages."""
+
+from __future__ import annotations
+
+import math
+import time
+import webbrowser
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rejeu.checkpoints.run_folder import RunFolder, find_model
+from rejeu.core import atomic
+from rejeu.core.interrupt import leaving
+from rejeu.core.records import shown
+from rejeu.core.validation import whole
+from rejeu.lab.cli.commands import Compare, Report, Runs, Status
+from rejeu.lab.reporting import run_list
+from rejeu.lab.reporting.comparison import Comparison, compare
+from rejeu.lab.reporting.report import make_server, write_report
+from rejeu.lab.reporting.runs import Run, best_row
+from rejeu.logs import formatting
+from rejeu.logs.formatting import counted
+
+WINDOW = 100
+"""Training episodes in the mean that is shown."""
+EXIT = {"running": 0, "finished": 0, "unknown": 0, "interrupted": 3, "crashed": 4}
+"""Exit status of ``rejeu status`` by the state of a run."""
+WIDE = 10_000
+"""Columns of a table that is not written to a terminal, so that no cell is folded."""
+
+
+def run_runs(arguments: Runs) -> tuple[int, dict[str, Any]]:
+    """Prints a table of the runs in a folder."""
+    rows, unreadable = [], []
+    if not arguments.folder.exists():
+        raise FileNotFoundError(f"there is no folder {arguments.folder}; rejeu train ENV makes runs in the folder runs")
+    for path in run_list.find(arguments.folder):
+        try:
+            rows.append({"run": str(path), **describe(run_list.read(path))})
+        except (OSError, ValueError, ImportError) as error:
+            unreadable.append(shown(f"{path}: {error}", 300))
+    if not arguments.json:
+        if rows:
+            show_runs(rows)
+        else:
+            print(f"there are no runs in {arguments.folder}; rejeu train ENV makes one")
+        for one in unreadable:
+            print(f"note: {one}")
+    return 0, {"runs": rows, "unreadable": unreadable}
+
+
+def show_runs(rows: Sequence[Mapping[str, Any]]) -> None:
+    """Prints the table."""
+    head = ["run", "environment", "algorithm", "state", "steps", "best result"]
+    names = ("env", "algorithm", "state")
+    cells = ([shown(row["run"], 300), *(row[name] for name in names), steps_of(row), best_of(row)] for row in rows)
+    show_table(head, cells, 3)
+
+
+def steps_of(row: Mapping[str, Any]) -> str:
+    """Returns the steps done, with their share of those asked for, unless all are done."""
+    done, asked = row["steps"], row["steps_asked"]
+    return f"{done:,} ({done / asked:.0%})" if asked and done < asked else f"{done:,}"
+
+
+def best_of(row: Mapping[str, Any]) -> str:
+    """Returns the best evaluation; of a run without one the mean return of the last training episodes."""
+    if row["best"] is None and math.isfinite(row["mean_return"]):
+        return f"{row['mean_return']:,.2f} in training"
+    return best_text(row["best"]).partition(" (")[0]
+
+
+def run_status(arguments: Status) -> tuple[int, dict[str, Any]]:
+    """Prints the state of a run; the exit status is 3 if it was interrupted, 4 if it crashed."""
+    found = run_list.read(arguments.run)
+    facts = describe(found)
+    if not arguments.json:
+        print("\n".join(lines(facts)))
+    return EXIT[found.state], facts
+
+
+def describe(run: Run) -> dict[str, Any]:
+    """Returns what is worth knowing of a run, as plain values."""
+    compiling = run.metrics.column("time/compile_seconds")
+    seconds = run.seconds - (float(compiling[-1]) if len(compiling) and np.isfinite(compiling[-1]) else 0.0)
+    rate = run.steps / seconds if seconds > 0 else math.nan
+    left = max(run.steps_asked - run.steps, 0) / rate if run.steps_asked and rate else math.nan
+    if run.minutes_asked is not None:
+        left = max(60 * run.minutes_asked - seconds, 0.0)
+    returns = run.episodes.returns[-WINDOW:]
+    means = run.metrics.column("rollout/ep_rew_mean")
+    known = returns if len(returns) else means[np.isfinite(means)][-1:]
+    return {
+        "path": run.path,
+        "name": run.name,
+        "format": run.format,
+        "env": run.env_id,
+        "algorithm": run.algorithm,
+        "seed": run.seed,
+        "state": run.state,
+        "steps": run.steps,
+        "steps_asked": run.steps_asked,
+        "seconds": run.seconds,
+        "steps_per_second": rate,
+        "seconds_left": left if run.state == "running" else None,
+        "episodes": len(run.episodes),
+        "mean_return": float(np.mean(known[np.isfinite(known)])) if np.isfinite(known).any() else math.nan,
+        "best": best_evaluation(run),
+        "evaluations": len(run.evaluations),
+        "warnings": run.warnings,
+        "notes": run.notes,
+    }
+
+
+def best_evaluation(run: Run) -> dict[str, float] | None:
+    """Returns the best evaluation; None if there is none."""
+    row = best_row(run.evaluations)
+    if row is None:
+        return None
+    step, value, success = (run.evaluations.column(name)[row] for name in ("step", "mean_return", "success_rate"))
+    return {"step": int(step), "mean_return": float(value), "success_rate": float(success)}
+
+
+def best_text(best: dict[str, float] | None) -> str:
+    """Returns the best evaluation as text, ``-`` for none."""
+    if best is None:
+        return "-"
+    success = "" if math.isnan(best["success_rate"]) else f", {best['success_rate']:.0%} success"
+    return f"{best['mean_return']:,.2f}{success} (step {best['step']:,})"
+
+
+def steps_text(facts: dict[str, Any]) -> str:
+    """Returns the steps done, and of how many where that is known."""
+    asked = facts["steps_asked"]
+    share = f" of {asked:,} ({min(facts['steps'] / asked, 1):.0%})" if asked else ""
+    return f"{facts['steps']:,}{share}"
+
+
+def lines(facts: dict[str, Any]) -> list[str]:
+    """Returns the state of a run as lines of text."""
+    seed = "" if facts["seed"] is None else f", seed {facts['seed']}"
+    found = [
+        f"run           {facts['name']}: {facts['env'] or 'unknown environment'}, {facts['algorithm'] or 'unknown'}{seed}",
+        f"state         {facts['state']}",
+        f"steps         {steps_text(facts)}",
+    ]
+    if math.isfinite(facts["seconds"]):
+        left = facts["seconds_left"]
+        rest = f", about {left:,.0f} s left" if left is not None and math.isfinite(left) else ""
+        found.append(f"time          {facts['seconds']:,.1f} s, {facts['steps_per_second']:,.0f} steps/s{rest}")
+    if math.isfinite(facts["mean_return"]):
+        n = min(facts["episodes"], WINDOW)
+        latest = f"over the last {counted(n, 'episode')}" if n else "in the latest row of metrics.csv"
+        found.append(f"training      return {facts['mean_return']:,.2f} {latest}")
+    found.append(f"best          {best_text(facts['best'])}")
+    found += [f"warning       {one}" for one in facts["warnings"]]
+    return [*found, *(f"note          {one}" for one in facts["notes"])]
+
+
+def run_compare(arguments: Compare) -> tuple[int, dict[str, Any]]:
+    """Compares runs, prints a table, and writes what was asked for."""
+    comparison = compare(
+        arguments.runs,
+        arguments.by,
+        x=arguments.x,
+        score=arguments.score,
+        statistic=arguments.statistic,
+        normalize=references(arguments.reference) or arguments.normalize,
+        threshold=arguments.threshold,
+    )
+    out = arguments.out or (Path("compare.html") if arguments.open else None)
+    written = [] if out is None else comparison.save(out)
+    if not arguments.json:
+        show_comparison(comparison)
+        for path in written:
+            print(path)
+    pages = [path for path in written if path.suffix == ".html"]
+    if arguments.open and pages:
+        webbrowser.open(pages[0].absolute().as_uri())
+    return 0, comparison.to_dict()
+
+
+def references(words: Iterable[str]) -> dict[str, tuple[float, float]]:
+    """Returns the reference returns of environments.
+
+    Raises:
+        ValueError: for a word that is not ENV=LOW,HIGH.
+
+    >>> references(["CartPole-v1=22,500"])
+    {'CartPole-v1': (22.0, 500.0)}
+    """
+    found = {}
+    for word in words:
+        env, _, values = word.rpartition("=")
+        try:
+            low, high = map(float, values.split(","))
+        except ValueError:
+            raise ValueError(f"--reference {word!r} must be ENV=LOW,HIGH, such as CartPole-v1=22,500") from None
+        found[env] = low, high
+    return found
+
+
+def show_comparison(comparison: Comparison) -> None:
+    """Prints the tables and the notes."""
+    from rich.console import Console
+    from rich.markup import escape
+
+    head, *rows = comparison.text_table()
+    show_table(head, rows, 2)
+    console = Console(highlight=False)
+    console.print(comparison.definition, soft_wrap=True)
+    for one in comparison.improvements:
+        better, other, env, text = map(escape, one.cells)
+        console.print(f"{better} scores higher than {other} on {env} with probability {text}", soft_wrap=True)
+    for note in comparison.notes:
+        console.print(f"note: {escape(note)}", soft_wrap=True)
+
+
+def show_table(head: Sequence[str], rows: Iterable[Sequence[str]], n_text: int) -> None:
+    """Prints a table. A narrow terminal folds the first ``n_text`` columns, which are text; numbers are never folded."""
+    from rich import box
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(box=box.SIMPLE, collapse_padding=True, pad_edge=False)
+    for i, name in enumerate(head):
+        is_text = i < n_text
+        table.add_column(name, justify="left" if is_text else "right", overflow="fold", no_wrap=not is_text)
+    for row in rows:
+        table.add_row(*map(escape, row))
+    console = formatting.console(highlight=False)
+    if not console.is_terminal:
+        console = formatting.console(highlight=False, width=WIDE)
+    console.print(table)
+
+
+SUFFIXES = (".html", ".htm")
+
+
+def run_report(arguments: Report) -> tuple[int, None]:
+    """Writes the page, or serves it until Ctrl-C.
+
+    Raises:
+        ValueError: for ``--out`` or ``--replay`` with ``--live``, or for a file that is no page.
+    """
+    if arguments.live:
+        if arguments.out is not None:
+            raise ValueError("--live serves the page and writes no file; leave out --out, or --live")
+        if arguments.replay is not None:
+            raise ValueError("--replay plays the trained agent; leave out --replay, or --live")
+        follow(arguments)
+        return 0, None
+    if arguments.out is not None and arguments.out.suffix.lower() not in SUFFIXES:
+        raise ValueError(f"--out {arguments.out} must end in {' or '.join(SUFFIXES)}")
+    for path in arguments.runs if arguments.replay is not None else ():
+        replay(path, arguments)
+    path = write_report(arguments.runs, arguments.out)
+    print(path, flush=True)
+    if arguments.open:
+        webbrowser.open(path.absolute().as_uri())
+    return 0, None
+
+
+def replay(path: Path, arguments: Report) -> None:
+    """Lets the best model of a run play episodes from the seeds 0, 1, 2 ..., and writes them to its folder.
+
+    Each is what ``rejeu watch`` and ``rejeu record`` show with ``--seed`` and ``--episodes 1``.
+
+    Raises:
+        FileNotFoundError: if the folder holds no model.
+        ValueError: if the environment cannot be made.
+    """
+    from rejeu.agents import load  # JAX takes longer than all that rejeu status needs
+    from rejeu.lab.cli.environment import environment_of
+
+    assert arguments.replay is not None
+    model = find_model(path)
+    agent = load(model)
+    rows = ["seed,return,length,success"]
+    with closing(environment_of(model, arguments).make()) as env:
+        for seed in range(whole("--replay", arguments.replay, least=1)):
+            played = agent.evaluate(1, env=env, seed=seed)
+            rows.append(f"{seed},{played.mean_return},{played.mean_length:.0f},{played.success_rate}")
+    atomic.write(RunFolder(path).replays, "\n".join(rows) + "\n")
+
+
+def follow(arguments: Report) -> None:
+    """Serves the page until Ctrl-C or SIGTERM ends the process; waits for the folders of runs that are about to begin."""
+    awaited = [path for path in arguments.runs if not path.exists()]
+    for path in awaited:
+        print(f"there is no run folder {path} yet; waiting for it (Ctrl-C ends it)", flush=True)
+    while not all(RunFolder(path).config.is_file() for path in awaited):
+        time.sleep(0.5)
+    server, address = make_server(arguments.runs)
+    print(f"{address} (Ctrl-C ends it)", flush=True)
+    if arguments.open:
+        webbrowser.open(address)
+    with server, leaving("the page is no longer served"):
+        server.serve_forever()

@@ -1,0 +1,305 @@
+"""What ``rejeu train`` and ``rejeu resume`` share: a session of training in a run folder, and the files that it leaves."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium
+import numpy as np
+
+from rejeu.agents import Agent, load
+from rejeu.agents.training import run_name, tracker_id
+from rejeu.callbacks import Checkpoint, Evaluate, RecordVideo
+from rejeu.callbacks.base import restore
+from rejeu.checkpoints.run_folder import RunFolder
+from rejeu.core import errors, xla
+from rejeu.core.interrupt import Interrupt, leaving
+from rejeu.envs.make import VectorEnv
+from rejeu.lab.cli.commands import Train
+from rejeu.lab.cli.environment import Environment
+from rejeu.lab.cli.output import Stopwatch, as_dict, echo, noted_in, reporter, summary
+from rejeu.lab.reporting import report
+from rejeu.lab.runs.config import DecidedRun
+from rejeu.logs import plots, video
+from rejeu.logs.formatting import counted, quoted
+from rejeu.logs.history import EpisodeTable
+from rejeu.logs.logging import CsvFile, RetryingSink, Sink, check_logs, guarded, open_log, require
+from rejeu.logs.video import ffmpeg
+from rejeu.training.run import Progress
+
+VIDEO_EPISODES = 3
+VIDEO_STEPS = 600
+"""Most steps of a video: a poor policy's episodes are long, and highway-env renders some 70 frames a second."""
+
+
+def installed_logs(arguments: Train) -> tuple[str, ...]:
+    """Returns the logs of ``--log``.
+
+    Raises:
+        ValueError: for an unknown one.
+        MissingExtra: if what they or ``--video-every`` need is not installed, before anything is trained.
+    """
+    logs = check_logs("--log", arguments.log)
+    require(logs)
+    if arguments.video_every is not None:
+        ffmpeg()
+    return logs
+
+
+class Limits(NamedTuple):
+    """What ends training."""
+
+    steps: int | None = None
+    """Environment steps to take; with ``minutes`` None too, the goal that the run has already."""
+    minutes: float | None = None
+    """Minutes to train for."""
+    pause_steps: int | None = None
+    """Pause after this many further environment steps, without changing the goal."""
+    pause_minutes: float | None = None
+    """Pause after this many further minutes, without changing the goal."""
+
+
+class Learning(NamedTuple):
+    """What a session gives to ``learn``."""
+
+    evaluate: Evaluate
+    callbacks: list[Any]
+    """All of them, with ``evaluate``."""
+    outputs: list[RetryingSink]
+    """Of the rows of statistics, and of the video."""
+    sinks: list[Sink]
+    """The same, and the table of episodes."""
+
+    def close(self) -> None:
+        """Closes the outputs."""
+        for output in self.outputs:
+            output.close()
+
+
+class Session(NamedTuple):
+    """One ``rejeu train`` or ``rejeu resume`` of a run."""
+
+    agent: Agent
+    config: DecidedRun
+    folder: RunFolder
+    environment: Environment
+    evaluation_env: VectorEnv
+    limits: Limits
+    is_new: bool
+    """Whether the run begins here, rather than being resumed."""
+    has_report: bool = True
+    """Whether ``report.html`` is written at the end."""
+    has_video: bool = True
+    """Whether a video is recorded at the end."""
+    backend: str = ""
+    """Description of the backend."""
+    more: tuple[Any, ...] = ()
+    """Further callbacks."""
+    label: str = ""
+    """What the lines about its evaluations begin with, where several runs are trained together."""
+
+    @property
+    def is_over(self) -> bool:
+        """Whether there is nothing left to train, so that only files are written."""
+        return not self.is_new and self.limits == Limits() and has_reached_goal(self.agent)
+
+    def run(self, stop: Interrupt, stopwatch: Stopwatch) -> tuple[int, dict[str, Any]]:
+        """Trains, evaluates, plots and records a video; prints a summary, and returns the exit status and the result.
+
+        The status is 0, 2 if something could not be written, 130 after Ctrl-C and 143 after SIGTERM. Until the models are
+        saved, signals are requests to stop after the current step; afterwards they end the process at once.
+        """
+        with self.training(stop) as learning:
+            if self.is_over:
+                restore(self.agent, learning.callbacks)
+            else:
+                self.agent.learn(
+                    self.limits.steps,
+                    learning.callbacks,
+                    log_interval=self.log_interval,
+                    reset_num_timesteps=self.is_new,
+                    progress_bar=True,
+                    minutes=self.limits.minutes,
+                    sinks=learning.sinks,
+                )
+        return self.finish(learning, stop, stopwatch)
+
+    @property
+    def log_interval(self) -> int:
+        """Episodes between two rows of statistics."""
+        return 4 * self.config.n_envs
+
+    def finish(self, learning: Learning, stop: Interrupt, stopwatch: Stopwatch) -> tuple[int, dict[str, Any]]:
+        """Evaluates, plots and records a video after training; prints a summary, and returns what :meth:`run` does."""
+        agent, folder, environment, evaluate = self.agent, self.folder, self.environment, learning.evaluate
+        is_complete = not stop.requested and has_reached_goal(agent)
+        try:
+            agent.failed_writes.retry()
+            if is_complete:
+                with leaving(f"interrupted after training; the models are saved in {folder.path}"):
+                    evaluate_now(evaluate, agent)
+                    plot_curve(agent, folder, environment, evaluate)
+                    if self.has_video:
+                        record_video(agent, folder, environment, self.config.seed, learning.outputs)
+            else:
+                plot_curve(agent, folder, environment, evaluate)
+                again = f"rejeu record {quoted(folder.path)}{environment.run.again()}"
+                echo(f"no video of a run that was stopped; {again} makes one")
+        except Exception:
+            self.write_report()
+            raise
+        finally:
+            learning.close()
+        self.write_report()
+        result = as_dict(agent, folder, evaluate, stop.signal, is_complete, stopwatch)
+        echo(summary(result, agent, folder, environment, evaluate))
+        if failed := agent.failed_writes.summary():
+            print(f"warning: {failed}", file=sys.stderr)
+        if stop.signal is not None:
+            return 128 + stop.signal, result
+        return (0 if agent.failed_writes.complete else 2), result
+
+    def outputs(self) -> list[RetryingSink]:
+        """Returns the outputs of the rows of statistics."""
+        agent, up_to = self.agent, None if self.is_new else self.agent.num_timesteps
+        sinks = [
+            open_log(kind, self.folder.path, run_name(agent), tracker_id(agent), self.folder.metrics.stem, up_to)
+            for kind in dict.fromkeys(("csv", *self.config.log))
+        ]
+        return [guarded(sink, agent.failed_writes, closes=True) for sink in sinks]
+
+    @contextmanager
+    def training(self, stop: Interrupt) -> Iterator[Learning]:
+        """Context in which the agent learns, with what ``learn`` is to be given; models and tables are written at its end."""
+        agent, folder = self.agent, self.folder
+        outputs = self.outputs()
+        agent.report_folder = folder.path
+        evaluate, callbacks = self.callbacks(stop)
+        episodes = EpisodeTable(lambda: agent.history, folder.episodes)
+        learning = Learning(evaluate, callbacks, outputs, [*outputs, RetryingSink(episodes, agent.failed_writes)])
+        try:
+            with noted_in(folder.warnings), saved_at_exit(agent, folder, evaluate):
+                yield learning
+        except BaseException as error:
+            if isinstance(error, Exception):
+                self.write_report()
+            learning.close()
+            raise
+
+    def callbacks(self, stop: Interrupt) -> tuple[Evaluate, list[Any]]:
+        """Returns the callback that evaluates, and all callbacks of the run."""
+        agent, config, folder = self.agent, self.config, self.folder
+        table = CsvFile(folder.evaluations, None if self.is_new else agent.num_timesteps)
+        report = reporter(agent, RetryingSink(table, agent.failed_writes), self.label)
+        every, episodes = config.evaluate_every, config.evaluate_episodes
+        evaluate = Evaluate(self.evaluation_env, every, episodes, folder.best, report=report)
+        is_pause_due = pause(agent, self.limits)
+
+        def save(agent: Agent, turn: Progress) -> None:
+            if has_reached_goal(agent):  # before the last evaluation, which may take longer than training
+                save_model(agent, folder.agent)
+                echo(f"{self.label}evaluating the final policy on {counted(episodes, 'episode')}; Ctrl-C ends it")
+
+        def finish(agent: Agent, turn: Progress) -> bool:
+            if not stop.requested and has_reached_goal(agent):
+                evaluate_now(evaluate, agent)  # here, and not after learn, so that the last checkpoint contains it
+            return not (stop.requested or is_pause_due(turn))
+
+        callbacks: list[Any] = [save, evaluate, finish, *self.more]
+        if config.video_every is not None:
+            render = self.environment.rendering
+            callbacks.append(RecordVideo(folder.videos, config.video_every, env=render, max_steps=VIDEO_STEPS))
+        if config.checkpoint_minutes:
+            callbacks.append(Checkpoint(folder.checkpoints, minutes=config.checkpoint_minutes))
+        return evaluate, callbacks
+
+    def write_report(self) -> None:
+        """Writes the page about the run, unless the run is to have none."""
+        if self.has_report:
+            write_report(self.folder)
+
+
+def make_evaluation_env(config: DecidedRun, environment: Environment) -> VectorEnv:
+    """Returns up to 16 environments like those of training, with other seeds."""
+    seed = int(np.random.SeedSequence([config.seed, 1]).generate_state(1)[0])
+    backend = config.backend if config.backend in ("envpool", "jax") else "gymnasium"
+    return environment.vector(min(config.evaluate_episodes, 16), backend, seed)
+
+
+def evaluate_now(evaluate: Evaluate, agent: Agent) -> None:
+    """Evaluates an agent, unless that was done at this step."""
+    if not evaluate.results or evaluate.results[-1].step != agent.num_timesteps:
+        evaluate.run(agent, agent.num_timesteps)
+
+
+def has_reached_goal(agent: Agent) -> bool:
+    """Returns whether the current or last ``learn`` reached its limit."""
+    return agent.training_call is None or agent.training_call.is_over(agent.run.step, agent.run.episode)
+
+
+def pause(agent: Agent, limits: Limits) -> Callable[[Progress], bool]:
+    """Returns a function that returns whether a pause is due after a turn of the loop."""
+    last_step = None if limits.pause_steps is None else agent.num_timesteps + limits.pause_steps
+    until = None if limits.pause_minutes is None else xla.clock() + 60 * limits.pause_minutes
+
+    def is_due(turn: Progress) -> bool:
+        by_steps = last_step is not None and agent.num_timesteps >= last_step
+        return by_steps or (until is not None and xla.clock() >= until)
+
+    return is_due
+
+
+@contextmanager
+def saved_at_exit(agent: Agent, folder: RunFolder, evaluate: Evaluate) -> Iterator[None]:
+    """Context at whose end models and tables are written, also after an error of the environment or of the numbers."""
+    try:
+        yield
+        save_model(agent, folder.agent)
+        if not evaluate.results:
+            save_model(agent, folder.best)
+    except (errors.BadEnvironmentError, errors.NonFiniteError, errors.WorkerError):
+        save_model(agent, folder.agent)
+        raise
+    finally:
+        write = partial(agent.history.write_csv, folder.episodes)
+        agent.failed_writes.attempt(f"table {folder.episodes}", write)
+
+
+def save_model(agent: Agent, path: Path) -> None:
+    """Saves a model, or warns and tries again at the end of the command."""
+    agent.failed_writes.attempt(f"model {path}", agent.snapshot(path))
+
+
+def plot_curve(agent: Agent, folder: RunFolder, environment: Environment, evaluate: Evaluate) -> None:
+    """Plots the learning curve, or prints why not."""
+    title = f"{environment.env_id}, {agent.name}"
+    try:
+        plots.learning_curve(agent.history, folder.curve, evaluations=evaluate.results, title=title)
+    except (ImportError, OSError) as error:
+        echo(f"no curve: {' '.join(str(error).split())}")
+
+
+def record_video(
+    agent: Agent, folder: RunFolder, environment: Environment, seed: int, outputs: Iterable[RetryingSink]
+) -> None:
+    """Records a video of the best model and adds it to the outputs, or prints why not."""
+    try:
+        video.record_video(load(folder.best), folder.video, environment.rendering, VIDEO_EPISODES, VIDEO_STEPS, seed)
+    except (ImportError, ValueError, OSError, gymnasium.error.Error) as error:
+        echo(f"no video: {' '.join(str(error).split())}")
+        return
+    for output in outputs:
+        output.write_video(agent.num_timesteps, folder.video)
+
+
+def write_report(folder: RunFolder) -> None:
+    """Writes the page about the run, or prints why not."""
+    try:
+        report.write_report(folder.path, folder.report)
+    except (ImportError, OSError) as error:
+        echo(f"no report: {' '.join(str(error).split())}")

@@ -1,0 +1,264 @@
+"""``rejeu sweep`` and ``rejeu train ENV --seeds N``: many runs, in processes or in one program, and their comparison."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import re
+import time
+from collections.abc import Callable
+from contextlib import ExitStack, closing
+from pathlib import Path
+from typing import Any
+
+from rejeu.agents import find_agent, training
+from rejeu.agents.device import reason_against, require_memory
+from rejeu.agents.together import learn_together, sibling, start_device
+from rejeu.checkpoints.run_folder import RunFolder, check_free
+from rejeu.core import devices
+from rejeu.core.errors import MissingExtra
+from rejeu.core.interrupt import NAMES, Interrupt
+from rejeu.core.validation import choice
+from rejeu.envs.functional import is_functional
+from rejeu.envs.make import BACKENDS
+from rejeu.lab.cli.commands import Resume, Sweep, Train
+from rejeu.lab.cli.environment import find_id
+from rejeu.lab.cli.output import Stopwatch, echo, header
+from rejeu.lab.cli.session import Session, installed_logs, make_evaluation_env
+from rejeu.lab.experiments import folder as folders
+from rejeu.lab.experiments.folder import Job, JobWork, SweepFolder, again, open_folder, read_folder
+from rejeu.lab.experiments.process import LocalLauncher, default_workers, hold, threads_of
+from rejeu.lab.experiments.scheduler import Launcher
+from rejeu.lab.experiments.sweep import Coordinator, Outcome, SweepResult, closing_lines, make_launcher, prepare, shown
+from rejeu.lab.reporting.comparison import By, Comparison, compare
+from rejeu.lab.runs import config as configs
+from rejeu.lab.runs.config import RunConfig
+from rejeu.logs.formatting import quoted
+
+Begin = Callable[[Train, int, ExitStack], Session]
+"""Makes the session of a seed; see :func:`rejeu.lab.cli.train.begin`."""
+
+
+def run_sweep(arguments: Sweep) -> tuple[int, dict[str, Any]]:
+    """Begins or joins a sweep; the exit status is 0, 2 if a run failed, 1 if one was left, 130 or 143 after a signal."""
+    typed = RunConfig(env="", imports=arguments.imports)
+    folder = prepare(arguments.plan, arguments.out, arguments.workers, typed, arguments.ray)
+    return complete(folder, typed, arguments.workers, arguments.ray, retry=False)
+
+
+def resume(arguments: Resume) -> tuple[int, dict[str, Any]]:
+    """Completes the sweep in a folder, failed runs included; returns the exit status and the result.
+
+    Raises:
+        ValueError: for options that only a single run has.
+    """
+    if arguments.steps is not None or arguments.minutes is not None:
+        raise ValueError(
+            f"{arguments.run} is a sweep, which trains to its goals; --steps and --minutes are for a single run"
+        )
+    given = {key: getattr(arguments, key) for key in ("env_kwargs", "wrappers", "imports")}
+    typed = RunConfig(env=arguments.env or "", **given)
+    return complete(read_folder(arguments.run, typed), typed, arguments.workers, arguments.ray, retry=True)
+
+
+def complete(
+    folder: SweepFolder, typed: RunConfig, workers: int | None, ray: str | None, retry: bool
+) -> tuple[int, dict[str, Any]]:
+    """Trains what is missing in a folder, compares the runs, and returns the exit status and the result."""
+    launcher = make_launcher(folder, workers, ray)
+    echo(f"sweep         {folder.path}, {len(folder.jobs)} runs, {launcher.capacity} at once")
+    status, outcomes, comparison = train(folder, launcher, typed, retry)
+    result = SweepResult(folder.path, tuple(outcomes))
+    return status, {"folder": folder.path, **result.counts(), "runs": result.table(), "comparison": comparison}
+
+
+def train(
+    folder: SweepFolder, launcher: Launcher, typed: RunConfig, retry: bool = False, replaces: tuple[str, str] = ("", "")
+) -> tuple[int, list[Outcome], list[dict[str, Any]] | None]:
+    """Trains what is missing in a folder and compares the runs.
+
+    Args:
+        folder: of the runs.
+        launcher: what starts them.
+        typed: what the command line named for import.
+        retry: whether failed runs are tried again.
+        replaces: part of the names of runs, and what stands in its place in lines about them.
+
+    Returns the exit status, the outcomes, and the rows of the comparison, None if there is none.
+    """
+    with Interrupt() as stop, shown() as (watch, say):
+        coordinator = Coordinator(folder, launcher, stop, typed, retry, lambda text: say(text.replace(*replaces, 1)))
+        coordinator.run(watch)
+    for line in closing_lines(coordinator):
+        echo(line)
+    comparison = summarize(folder.path, "setting" if len({job.setting for job in folder.jobs}) > 1 else None)
+    outcomes = coordinator.outcomes()
+    states = {one.state for one in outcomes}
+    status = 2 if "failed" in states else 1 if states & {"waiting", "stopped"} else 0
+    if stop.signal is not None:
+        echo(
+            f"stopped by {NAMES[stop.signal]}; rejeu resume {quoted(folder.path)}{again(folder.jobs, typed)} continues"
+        )
+        status = 128 + stop.signal
+    return status, outcomes, None if comparison is None else comparison.table()
+
+
+def summarize(folder: Path, by: By | None = None) -> Comparison | None:
+    """Writes ``compare.html`` and prints the scores with their intervals, or why there are none; returns the comparison."""
+    try:
+        comparison = compare(folder, by)
+    except (ValueError, FileNotFoundError) as error:
+        echo(f"no comparison: {error}")
+        return None
+    for group in comparison.groups:
+        echo(f"{group.label} on {group.env_id}: {group.interval}")
+    echo(comparison.definition)
+    for note in comparison.notes:
+        echo(f"note: {note}")
+    try:
+        echo(f"comparison    {comparison.save(folder / 'compare.html')[0]}")
+    except (MissingExtra, OSError) as error:
+        echo(f"no compare.html: {error}; rejeu compare {quoted(folder)} --out compare.md writes the tables")
+    return comparison
+
+
+def train_all(arguments: Train) -> tuple[int, dict[str, Any]]:
+    """Trains all seeds and compares them; returns the exit status and the result."""
+    jobs = make_jobs(arguments)
+    at_once = min(arguments.jobs or default_workers(), len(jobs))
+    path = choose_folder(arguments)
+    folder = open_folder(path, folders.Sweep(jobs=jobs, threads=threads_of(at_once)), None, arguments)
+    echo(f"run folders   {path}, {len(jobs)} seeds from {jobs[0].run.seed}, {at_once} at once")
+    launcher = LocalLauncher(at_once, folder.sweep.threads)
+    status, outcomes, comparison = train(folder, launcher, arguments, replaces=("seed_", "seed "))
+    keys = ("path", "log", "exit_status", "state")
+    runs = [{"seed": one.job.run.seed, **{key: getattr(one, key) for key in keys}} for one in outcomes]
+    return status, {"folder": path, "runs": runs, "comparison": comparison}
+
+
+def make_jobs(arguments: Train) -> tuple[Job, ...]:
+    """Returns one job for each seed.
+
+    Raises:
+        ValueError: for an unknown algorithm, backend, device or log.
+        MissingExtra: if what ``--log`` or ``--video-every`` need is not installed.
+    """
+    assert arguments.seeds is not None
+    first = arguments.seed or 0
+    given = {one.name: getattr(arguments, one.name) for one in dataclasses.fields(RunConfig)}
+    installed_logs(arguments)
+    devices.named(arguments.device, "--device")
+    choice("--backend", arguments.backend or "auto", BACKENDS)
+    if arguments.algorithm is not None:
+        given["algorithm"] = find_agent(arguments.algorithm).algorithm.Config.name
+    if arguments.ray not in (None, "auto"):
+        os.environ["RAY_ADDRESS"] = arguments.ray  # no file may name an address
+    run = RunConfig(**{**given, "ray": None if arguments.ray is None else "auto", "imports": ()})
+    return tuple(
+        Job(
+            name=f"seed_{seed}",
+            run=dataclasses.replace(run, seed=seed),
+            no_report=arguments.no_report,
+            no_video=arguments.no_video,
+        )
+        for seed in range(first, first + arguments.seeds)
+    )
+
+
+def choose_folder(arguments: Train) -> Path:
+    """Returns a new or empty folder for the run folders: ``--out``, or one under ``runs``."""
+    check_free(arguments.out)
+    name = "-".join(filter(None, [arguments.env, arguments.algorithm, "seeds", time.strftime("%Y%m%d-%H%M%S")]))
+    return arguments.out or Path("runs") / re.sub(r"[^\w.-]+", "-", name)
+
+
+def fit_together(arguments: Train) -> bool:
+    """Returns whether seeds are trained in one program: in a JAX environment without wrappers, and without ``--jobs``.
+
+    Imports the environment if it is one of the user's own.
+    """
+    return arguments.jobs is None and not arguments.wrappers and is_functional(find_id(arguments.env))
+
+
+def train_together(arguments: Train, begin: Begin) -> tuple[int, dict[str, Any]]:
+    """Trains all seeds and compares them; returns the exit status and the result.
+
+    Settings that cannot be trained on the device are trained in processes.
+    """
+    stopwatch, jobs = Stopwatch(), make_jobs(arguments)
+    devices.start_with("--device", arguments.device)
+    path = choose_folder(arguments)
+    start_device(len(jobs))
+    with ExitStack() as stack:
+        first = begin(arguments, jobs[0].seed, stack)
+        if reason := reason_against(first.agent, ()):
+            echo(f"the seeds are trained in processes of their own, not in one program: {reason}")
+            return train_all(arguments)
+        require_memory(first.agent, len(jobs))
+        folder = open_folder(path, folders.Sweep(jobs=jobs, threads=threads_of(1)), None, arguments)
+        sessions = [first, *(with_seed(first, job.seed, stack) for job in jobs[1:])]
+        works = folder.works()
+        sessions = [with_folder(session, work) for session, work in zip(sessions, works, strict=True)]
+        echo(
+            header(
+                first.config, first.environment, f"{first.backend}, {len(jobs)} seeds in one program", RunFolder(path)
+            )
+        )
+        for work in works:
+            claim = hold(work.claim)
+            assert claim is not None, "another process uses a new folder"
+            stack.callback(claim.release)
+        with Interrupt() as stop:
+            statuses = train_sessions(sessions, stop, stopwatch)
+        if stop.signal is None:
+            for work, status in zip(works, statuses, strict=True):
+                work.write_exit(status)
+    comparison = summarize(path)
+    runs = [
+        {"seed": work.job.seed, "path": work.run, "exit_status": status}
+        for work, status in zip(works, statuses, strict=True)
+    ]
+    result = {"folder": path, "runs": runs, "comparison": None if comparison is None else comparison.table()}
+    if stop.signal is not None:
+        echo(
+            f"stopped by {NAMES[stop.signal]}; rejeu resume {quoted(path)}{again(jobs, arguments)} continues, each seed in a "
+            "process of its own"
+        )
+        return 128 + stop.signal, result
+    return max(statuses), result
+
+
+def with_seed(first: Session, seed: int, stack: ExitStack) -> Session:
+    """Returns the session of another seed, whose agent shares the compiled functions of the first; ``stack`` closes it."""
+    config = dataclasses.replace(first.config, seed=seed)
+    env = stack.enter_context(closing(first.environment.vector(config.n_envs, config.backend, seed)))
+    evaluation_env = stack.enter_context(closing(make_evaluation_env(config, first.environment)))
+    return first._replace(agent=sibling(first.agent, env, seed), config=config, evaluation_env=evaluation_env)
+
+
+def with_folder(session: Session, work: JobWork) -> Session:
+    """Returns a session with its new run folder."""
+    work.run.mkdir(parents=True, exist_ok=True)
+    session = session._replace(folder=RunFolder(work.run), label=f"seed {work.job.seed}: ")
+    configs.write(session.folder.config, session.config)
+    return session
+
+
+def train_sessions(sessions: list[Session], stop: Interrupt, stopwatch: Stopwatch) -> list[int]:
+    """Trains the runs together and finishes each; returns their exit statuses."""
+    agents = [session.agent for session in sessions]
+    with ExitStack() as stack:
+        learnings = [stack.enter_context(session.training(stop)) for session in sessions]
+        calls = [
+            training.start_call(one.agent, one.limits.steps, None, one.limits.minutes, one.log_interval, True)
+            for one in sessions
+        ]
+        learn_together(
+            agents,
+            calls,
+            [learning.callbacks for learning in learnings],
+            [learning.sinks for learning in learnings],
+            progress_bar=True,
+        )
+    finished = zip(sessions, learnings, strict=True)
+    return [session.finish(learning, stop, stopwatch)[0] for session, learning in finished]

@@ -1,0 +1,180 @@
+"""``rejeu tune``: searches of hyperparameters, which ``rejeu resume`` continues."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from rejeu.agents import AGENTS, find_agent, find_preset, modules_of
+from rejeu.algorithms.search import Dimension
+from rejeu.core.interrupt import NAMES, Interrupt
+from rejeu.lab.cli import environment
+from rejeu.lab.cli.commands import Resume, Tune
+from rejeu.lab.cli.environment import Environment
+from rejeu.lab.cli.output import echo
+from rejeu.lab.experiments import space, study as studies, study_plan as plans, tune as tuning
+from rejeu.lab.experiments.search import Watch
+from rejeu.lab.experiments.study import Outcome, Study, StudyFolder
+from rejeu.lab.experiments.study_plan import Plan
+from rejeu.lab.experiments.sweep import Row, bars
+from rejeu.lab.runs.config import RunConfig, apply
+from rejeu.logs import formatting
+from rejeu.logs.formatting import counted, number, quoted
+
+
+def run_tune(arguments: Tune) -> tuple[int, dict[str, Any]]:
+    """Searches; the exit status is 0, 1 if a trial could not be started, 130 after Ctrl-C, 143 after SIGTERM.
+
+    It is 2 if no trial is complete or a training of the comparison failed.
+    """
+    made = usable_environment(arguments)
+    plan = plans.make(
+        made.env_id,
+        trials=arguments.trials,
+        steps=arguments.steps,
+        evaluate_every=arguments.evaluate_every,
+        trial_seeds=arguments.trial_seeds,
+        final_seeds=arguments.final_seeds,
+        pruner=arguments.pruner,
+        **shared(arguments, made),
+    )
+    return complete(tuning.open_study(plan, arguments.out), made, arguments.workers)
+
+
+def resume_study(arguments: Resume) -> tuple[int, dict[str, Any]]:
+    """Continues the study of a folder; returns the exit status and the result.
+
+    Raises:
+        ValueError: for ``--steps`` or ``--minutes``, or an environment that is not that of the study.
+    """
+    if arguments.steps is not None or arguments.minutes is not None:
+        raise ValueError(
+            f"{arguments.run} is a study of rejeu tune, whose trials have a length; leave out --steps and --minutes"
+        )
+    study = studies.join(StudyFolder(arguments.run))
+    return complete(study, environment_of(study.plan, "a study", arguments), arguments.workers)
+
+
+def usable_environment(arguments: Tune) -> Environment:
+    """Returns the environment that the command line names, after one was made."""
+    made = environment.from_arguments(arguments.env, arguments)
+    made.vector(1, arguments.backend or "auto", arguments.seed).close()
+    return made
+
+
+def environment_of(plan: Plan, what: str, arguments: Resume) -> Environment:
+    """Returns the environment of a study.
+
+    Raises:
+        CheckpointError: if the command line must name it again.
+        ValueError: if the command line names another.
+    """
+    made = environment.from_run(plan.run, arguments.run, arguments)
+    if made.env_id != plan.env_id:
+        raise ValueError(f"{arguments.run} is {what} of {plan.env_id}, not of {made.env_id}")
+    return made
+
+
+def shared(arguments: Tune, made: Environment) -> dict[str, Any]:
+    """Returns the arguments of a plan that come from the options."""
+    name = None if arguments.algo is None else find_agent(arguments.algo).algorithm.Config.name
+    preset = find_preset(made.env_id, name, arguments.preset)
+    algorithm = name if preset is None else preset.algorithm
+    return {
+        "algorithm": algorithm,
+        "env_argument": made.run.env,
+        "env_kwargs": made.kwargs,
+        "wrappers": made.run.wrappers,
+        "preset": preset,
+        "fixed": apply(arguments.assignments, {}),
+        "search": read_search(arguments.search, algorithm),
+        "only": arguments.only,
+        "n_envs": arguments.envs,
+        "backend": arguments.backend,
+        "evaluate_episodes": arguments.evaluate_episodes,
+        "seed": arguments.seed,
+        "measure": arguments.measure,
+        "checkpoint_minutes": arguments.checkpoint_minutes,
+    }
+
+
+def read_search(assignments: Iterable[str], algorithm: str | None) -> dict[str, Dimension]:
+    """Returns the dimensions of ``--search``."""
+    declared = {} if algorithm is None else getattr(AGENTS[algorithm].algorithm.Config, "search_space", {})
+    return dict(space.parse(one, declared) for one in assignments)
+
+
+def complete(study: Study, made: Environment, workers: int | None) -> tuple[int, dict[str, Any]]:
+    """Runs a study to its end; returns the exit status and the result."""
+    echo("\n".join(header(study, made)))
+    with Interrupt() as stop, display(study) as watch:
+        result = tuning.run(study, common(made, study.plan.algorithm), workers, stop, watch, echo)
+    echo()
+    if stop.signal is not None:
+        echo(f"stopped by {NAMES[stop.signal]}; rejeu resume {quoted(study.folder.path)}{made.run.again()} continues")
+    echo(str(result))
+    if stop.signal is not None:
+        return 128 + stop.signal, result.to_dict()
+    if not study.is_searched():
+        return 1, result.to_dict()
+    return (0 if result.complete and result.best is not None else 2), result.to_dict()
+
+
+def common(made: Environment, algorithm: str) -> RunConfig:
+    """Returns what all trainings have in common: the environment and what they import, which the command line named."""
+    return dataclasses.replace(made.run, imports=tuple(modules_of(algorithm, made.run.imports)))
+
+
+@contextmanager
+def display(study: Study) -> Iterator[Watch]:
+    """Returns a function that prints a line for each trial that has ended and, on a terminal, shows those that run."""
+    lines, console = tuning.lines(echo, study), formatting.console()
+    if not console.is_terminal:
+        yield lines
+        return
+    with bars(console) as show:
+
+        def watch(outcomes: list[Outcome]) -> None:
+            lines(outcomes)
+            show(rows(outcomes, study.plan))
+
+        yield watch
+
+
+def rows(outcomes: list[Outcome], plan: Plan) -> list[Row]:
+    """Returns a row for the whole study, and one for each trial that runs.
+
+    >>> rows([], plans.make("Pendulum-v1"))
+    [Row(name='trials', done=0, total=30, text='0 of 30 trials have ended')]
+    """
+    ended = sum(one.state in ("complete", "pruned", "failed") for one in outcomes)
+    text = f"{ended} of {plan.trials} trials have ended"
+    if (best := studies.best_of(outcomes)) is not None:
+        text += f", best {plan.measure} {number(best.value)} (trial {best.index})"
+    found = [Row("trials", ended, plan.trials, text)]
+    for one in outcomes:
+        if one.state == "running":
+            step = max(one.evaluations, default=0)
+            about = f"{step:,} of {plan.steps:,} steps, {plan.measure} {number(one.value)}  {tuning.settings(one)}"
+            found.append(Row(f"trial {one.index}", step, plan.steps, about))
+    return found
+
+
+def header(study: Study, made: Environment) -> list[str]:
+    """Returns the first lines of a study."""
+    plan = study.plan
+    done = sum(one.state not in ("waiting", "running") for one in study.outcomes())
+    seeds = f", {plan.trial_seeds} seeds each" if plan.trial_seeds > 1 else ""
+    return [
+        f"environment   {made}, {plan.n_envs} at once",
+        f"algorithm     {plan.algorithm}, seed {plan.seed}, pruner {plan.pruner}",
+        f"trials        {plan.trials} of {plan.steps:,} steps{seeds}, evaluated on "
+        f"{counted(plan.evaluate_episodes, 'episode')} every {plan.evaluate_every:,} steps"
+        + f"; {done} have ended"
+        * bool(done),
+        *(f"{'search' if i == 0 else '':<14}{name}: {one}" for i, (name, one) in enumerate(plan.search_space.items())),
+        *([f"at the end    the best trial and the default: {tuning.announcement(plan)}"] if plan.final_seeds else []),
+        f"study folder  {study.folder.path}",
+    ]

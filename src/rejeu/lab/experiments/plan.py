@@ -1,0 +1,321 @@
+"""Plans of sweeps: a TOML file, or the same as a dict, becomes a list of checked jobs.
+
+Nothing that a plan names is imported. A mistake is one line that says where it is.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import tomllib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import gymnasium as gym
+from msgspec import Meta
+
+from rejeu.agents import AGENTS, choose_algorithm, find_agent, find_preset, presets
+from rejeu.core import devices, spaces
+from rejeu.core.records import Seed, convert, shown
+from rejeu.core.validation import build, check_names, choice, field_names
+from rejeu.envs.make import BACKENDS, make_vector
+from rejeu.envs.registry import are_plain, is_plain_id, maker, register
+from rejeu.lab.experiments.folder import FILES, MAX_JOBS, Job, Resources, job_name
+from rejeu.lab.runs.config import RunConfig, merged, options
+from rejeu.logs.logging import check_logs, require
+from rejeu.logs.tables import flat
+
+MAX_BYTES = 2**16
+"""Upper limit on the size of a plan."""
+OWN_OF_JOBS = ("env", "env_kwargs", "wrappers", "imports", "algorithm", "seed", "hyperparameters")
+"""Fields of a run that a plan names in another way, or not at all."""
+OF_RUNS = {one.shown.name or one.field: one.field for one in options(RunConfig) if one.field not in OWN_OF_JOBS}
+"""Fields of a run by the names of their options, which are those of ``rejeu train``."""
+OPTIONS = (*OF_RUNS, *FILES)
+"""All options of the runs of a plan."""
+
+Algorithms = str | Annotated[tuple[str, ...], Meta(min_length=1)]
+Kwargs = dict[str, Any]
+
+
+class PlanError(ValueError):
+    """A plan is invalid. The message has the file, the place, what was received and what was expected."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Environments:
+    """What a plan says of one environment, or of all, besides the options of their runs."""
+
+    id: str | None = None
+    algorithms: Algorithms | None = None
+    env_kwargs: Kwargs = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Content:
+    """What a plan holds besides the options of its runs."""
+
+    environments: Algorithms | dict[str, Kwargs]
+    """Ids, or tables of :class:`Environments` and options."""
+    algorithms: Algorithms | None = None
+    env_kwargs: Kwargs = field(default_factory=dict)
+    settings: Annotated[dict[str, Kwargs], Meta(min_length=1)] = field(default_factory=lambda: {"": {}})
+    """Hyperparameters, those of one algorithm in a table of its name; ``algorithms`` says for which."""
+    seeds: Annotated[int, Meta(ge=1, le=1000)] | Annotated[tuple[Seed, ...], Meta(min_length=1)] = 1
+    first_seed: Annotated[int, Meta(ge=0, le=2**32 - 1 - MAX_JOBS)] | None = None
+    threads: Annotated[int, Meta(ge=1, le=1024)] | None = None
+    resources: Kwargs = field(default_factory=dict)
+
+
+class Environment(NamedTuple):
+    """An environment of a plan, and its spaces."""
+
+    label: str
+    run: RunConfig
+    """What its runs have in common."""
+    files: dict[str, bool]
+    """Options about the files of the runs."""
+    algorithms: tuple[str | None, ...]
+    observation: gym.Space
+    action: gym.Space
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """The jobs of a sweep, and what each needs."""
+
+    jobs: tuple[Job, ...]
+    threads: int | None = None
+    """Threads of each run; None for its share of the cores."""
+    resources: Resources = field(default_factory=Resources)
+
+
+@contextmanager
+def at(plan: object, *place: str) -> Iterator[None]:
+    """Context in which an invalid value becomes a :class:`PlanError` with its place, such as ``plan.toml, settings.fast``."""
+    try:
+        yield
+    except PlanError:
+        raise
+    except (ValueError, TypeError, ArithmeticError, ImportError, OSError, gym.error.Error, AssertionError) as error:
+        where = f"{plan}, {'.'.join(place)}" if place else plan
+        problem = " ".join(str(error or type(error).__name__).split())
+        raise PlanError(f"{where}: {shown(problem, 1000)}") from None
+
+
+def read_plan(plan: str | Path | Mapping[str, Any]) -> tuple[Plan, str | None]:
+    """Returns a checked plan, and its text if it is a file.
+
+    Args:
+        plan: path of a TOML file, or its content as a dict.
+
+    Raises:
+        PlanError: for a mistake, with its place.
+        OSError: if the file cannot be read.
+    """
+    if isinstance(plan, Mapping):
+        return parse(plan, "plan"), None
+    path = Path(plan)
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no plan {path}")
+    with at(path):
+        if path.stat().st_size > MAX_BYTES:
+            raise ValueError(f"it has more than {MAX_BYTES:,} bytes, the most of a plan")
+        try:
+            text = path.read_bytes().decode("utf-8-sig").replace("\r\n", "\n")
+            content = tomllib.loads(text)
+        except (ValueError, RecursionError) as error:
+            raise ValueError(f"{str(error)[:200]}; expected TOML, such as steps = 20000") from None
+    return parse(content, str(path)), text
+
+
+def parse(content: Mapping[str, Any], plan: str) -> Plan:
+    """Returns the jobs of a plan: environments x algorithms x settings x seeds.
+
+    Args:
+        content: as in the file.
+        plan: its name in messages.
+
+    Raises:
+        PlanError: for a mistake.
+    """
+    with at(plan):
+        json.dumps(content, allow_nan=False)  # a date or NaN is no value of a run
+        check_names(content, (*field_names(Content), *OPTIONS), "a plan")
+        if not content.get("environments"):
+            raise ValueError("a plan needs environments = ['Pendulum-v1', ...]")
+        found = convert({key: value for key, value in content.items() if key not in OPTIONS}, Content)
+        common = {key: value for key, value in content.items() if key in OPTIONS}
+        seeds = seeds_of(found)
+        read_run("", {}, common)
+    with at(plan, "resources"):
+        check_names(found.resources, field_names(Resources), "resources")
+        resources = convert(found.resources, Resources)
+    environments = list(read_environments(found, common, plan))
+    count = sum(len(one.algorithms) for one in environments) * len(found.settings) * len(seeds)
+    with at(plan):
+        if count > MAX_JOBS:
+            raise ValueError(f"there are {count:,} runs, expected up to {MAX_JOBS:,}")
+        jobs: dict[str, Job] = {}
+        for job in expanded(environments, found.settings, seeds, plan):
+            if jobs.setdefault(job.name.lower(), job) is not job:
+                raise ValueError(f"two runs would be called {job.name}; give settings and environments other names")
+        if not jobs:
+            raise ValueError("there is nothing to train; does every setting exclude every algorithm?")
+        require({log: None for job in jobs.values() for log in job.run.log})
+    return Plan(jobs=tuple(jobs.values()), threads=found.threads, resources=resources)
+
+
+def expanded(
+    environments: list[Environment], settings: Mapping[str, Kwargs], seeds: list[int], plan: str
+) -> Iterator[Job]:
+    """Yields the job of each combination, after all values were checked, and then that each agent can be built.
+
+    Values take little time, so that a mistake at the end of a long plan is found at once.
+    """
+    checked = []
+    for environment in environments:
+        for algorithm, (name, setting) in itertools.product(environment.algorithms, settings.items()):
+            place = ("settings", name) if setting else ("environments", environment.label)
+            with at(plan, *place):
+                if "algorithms" in setting and algorithm not in read_algorithms(setting["algorithms"]):
+                    continue
+                own = convert(setting.get(str(algorithm), {}), Kwargs)
+                path = None if environment.run.preset is None else str(environment.run.preset)
+                preset = find_preset(environment.run.env, algorithm, path)
+                chosen = algorithm or choose_algorithm(preset, environment.run.env, environment.action)
+                common = {key: value for key, value in setting.items() if key != "algorithms" and key not in AGENTS}
+                base = preset or presets.default(environment.run.env, chosen)
+                config = read_hyperparameters(chosen, base.hyperparameters, {**common, **own})
+            checked.append((environment, place, name, config, {**common, **own}))
+    for environment, place, name, config, given in checked:
+        with at(plan, *place):
+            check_spaces(environment, config)
+        run = replace(environment.run, algorithm=config.name, hyperparameters=dict(flat(given)))
+        for seed in seeds:
+            job = job_name(environment.label, config.name, name, seed)
+            yield Job(name=job, run=replace(run, seed=seed), setting=name, **environment.files)
+
+
+def read_run(env_id: str, kwargs: Kwargs, given: Kwargs) -> tuple[RunConfig, dict[str, bool]]:
+    """Returns a run with options, whole numbers of which may be written as 1e6, and the options about its files.
+
+    Raises:
+        ValueError, TypeError: for an invalid value.
+    """
+    values = {OF_RUNS.get(key, key): one for key, one in given.items()}
+    whole: Kwargs = {
+        key: int(one) if isinstance(one, float) and one.is_integer() else one for key, one in values.items()
+    }
+    if isinstance(whole.get("log"), str | tuple | list):
+        whole["log"] = check_logs("log", whole["log"])
+    files = convert({key: one for key, one in whole.items() if key in FILES}, dict[str, bool])
+    run = convert(
+        {"env": env_id, "env_kwargs": kwargs, **{key: whole[key] for key in whole.keys() - {*FILES}}}, RunConfig
+    )
+    choice("backend", run.backend or "auto", BACKENDS)
+    choice("device", run.device, devices.NAMES)
+    if isinstance(run.preset, bool):
+        raise TypeError(f"preset={run.preset} must be the path of a file")
+    return run, files
+
+
+def read_algorithms(value: Any) -> tuple[str, ...]:
+    """Returns the names of algorithms.
+
+    Raises:
+        ValueError: for an unknown one, with the nearest, or one that is named twice.
+    """
+    names: Any = convert(value, Algorithms)  # type: ignore[arg-type]
+    given = (names,) if isinstance(names, str) else names
+    found = tuple(find_agent(one, is_typed=False).algorithm.Config.name for one in given)
+    if len({*found}) < len(found):
+        raise ValueError(f"algorithms={shown(found)} names one twice")
+    return found
+
+
+def read_environments(content: Content, common: Kwargs, plan: str) -> Iterator[Environment]:
+    """Yields the environments of a plan: a list of ids, or a table of tables with options of their own."""
+    tables = content.environments
+    with at(plan, "algorithms"):
+        algorithms = (None,) if content.algorithms is None else read_algorithms(content.algorithms)
+    with at(plan, "environments"):
+        if not isinstance(tables, dict):
+            ids = (tables,) if isinstance(tables, str) else tables
+            if len({*ids}) < len(ids):
+                raise ValueError(f"environments={shown(ids)} names one twice")
+            tables = {one: {} for one in ids}
+    for label, table in tables.items():
+        with at(plan, "environments", label):
+            check_names(table, (*field_names(Environments), *OPTIONS), f"the environment {label}")
+            own = {key: value for key, value in table.items() if key in OPTIONS}
+            about = convert({key: value for key, value in table.items() if key not in own}, Environments)
+            env_id = about.id or label
+            if not is_plain_id(env_id) or env_id.endswith(".py"):
+                raise ValueError(
+                    f"{shown(env_id)} is not the id of an environment, and no file may name a module; import it on the "
+                    "command line, rejeu sweep PLAN --import MODULE, and write its id here"
+                )
+            kwargs = {**content.env_kwargs, **about.env_kwargs}
+            for key, value in kwargs.items():
+                if not are_plain({key: value}):
+                    raise ValueError(f"{key}={shown(value)} must be a number up to a million, a word, true or false")
+            dropped = ("steps", "minutes") if own.keys() & {"steps", "minutes"} else ()
+            given = {key: value for key, value in common.items() if key not in dropped} | own
+            run, files = read_run(env_id, kwargs, given)
+            chosen = algorithms if about.algorithms is None else read_algorithms(about.algorithms)
+            yield Environment(label, run, files, chosen, *find_spaces(run))
+
+
+def seeds_of(content: Content) -> list[int]:
+    """Returns the seeds: a list, or as many as ``seeds`` says from ``first_seed`` on."""
+    seeds = content.seeds
+    if isinstance(seeds, int):
+        first = content.first_seed or 0
+        return [*range(first, first + seeds)]
+    if content.first_seed is not None:
+        raise ValueError("first_seed and a list of seeds exclude each other; give one of them")
+    if len({*seeds}) < len(seeds):
+        raise ValueError(f"seeds={shown(seeds)} must be a number, or a list of different seeds")
+    return [*seeds]
+
+
+def find_spaces(run: RunConfig) -> tuple[gym.Space, gym.Space]:
+    """Makes an environment once, and returns its spaces of observations and actions."""
+    if register(run.env):
+        env: Any = maker(run.env, **run.env_kwargs)()
+    else:
+        env = make_vector(run.env, 1, "envpool" if run.backend == "envpool" else "auto", **run.env_kwargs)
+    try:
+        return env.observation_space, env.action_space
+    finally:
+        env.close()
+
+
+def read_hyperparameters(algorithm: str, base: Mapping[str, Any], given: Mapping[str, Any]) -> Any:
+    """Returns the configuration of an algorithm from ``base`` and the given values, as ``rejeu train`` would.
+
+    Raises:
+        ValueError, TypeError: for an unknown or invalid hyperparameter.
+    """
+    config = AGENTS[algorithm].algorithm.Config
+    check_names(given, field_names(config), algorithm)
+    return build(config, merged(dict(flat(given)), base))
+
+
+def check_spaces(environment: Environment, config: Any) -> None:
+    """Builds the algorithm for the spaces of an environment.
+
+    Raises:
+        ValueError, TypeError: if it does not take such spaces.
+    """
+    kind = AGENTS[config.name]
+    nested = isinstance(environment.observation, gym.spaces.Dict | gym.spaces.Tuple)
+    agent = kind.__new__(kind)
+    agent.configure("MultiInputPolicy" if nested else "MlpPolicy", config, seed=0)
+    agent.build(environment.observation, environment.action)
+    if getattr(config, "hindsight", None) is not None:
+        spaces.check_goal_space(environment.observation)

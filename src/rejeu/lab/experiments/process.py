@@ -1,0 +1,130 @@
+"""Runs as processes of this machine. This module is imported on the nodes of a cluster, so it does not import JAX."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from contextlib import suppress
+from pathlib import Path
+
+from filelock import FileLock, Timeout
+
+from rejeu.core import atomic, hardware, interrupt
+
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+LOST = -1
+"""Exit status of a process that vanished."""
+
+
+class Process:
+    """A process that trains, supervised by this one: it stops, with a checkpoint, when this one does. Mutable."""
+
+    def __init__(self, task: Path, log: Path, lock: Path, environ: dict[str, str], folder: Path | None = None) -> None:
+        """Starts it.
+
+        Args:
+            task: file with what it is asked to do.
+            log: file to which what it prints is appended.
+            lock: file that it keeps locked while it lives.
+            environ: its environment variables.
+            folder: its current folder; None for that of this process.
+
+        Raises:
+            OSError: if the log cannot be written.
+        """
+        with atomic.open_log(log) as file:
+            self._process = subprocess.Popen(
+                program(task),
+                stdin=subprocess.PIPE,
+                stdout=file,
+                stderr=subprocess.STDOUT,
+                cwd=folder,
+                env={**environ, interrupt.LOCK: str(lock)},
+                process_group=0 if os.name == "posix" else None,  # Ctrl-C reaches it once, through stop
+                creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),
+            )
+
+    @property
+    def pid(self) -> int:
+        """Id of the process."""
+        return self._process.pid
+
+    def poll(self) -> int | None:
+        """Returns the exit status, negative if a signal ended it; None while it runs."""
+        status = self._process.poll()
+        if status is not None:
+            self.stop()
+        return status
+
+    def stop(self) -> None:
+        """Asks it to stop after the current step, with a checkpoint."""
+        if self._process.stdin is not None:
+            with suppress(OSError):
+                self._process.stdin.close()
+
+    def kill(self) -> None:
+        """Ends it at once and waits for its end."""
+        self._process.kill()
+        self._process.wait()
+        self.stop()
+
+
+def program(task: Path) -> list[str]:
+    """Returns the command line of a process."""
+    return [sys.executable, "-m", "rejeu", "--task", str(task)]
+
+
+def last_line(log: Path) -> str:
+    """Returns the last line of a log that is not empty."""
+    try:
+        with log.open("rb") as file:
+            file.seek(max(log.stat().st_size - 4096, 0))
+            lines = file.read().decode("utf-8", "replace").split("\n")
+    except OSError:
+        return "there is no log"
+    found = next((line.strip() for line in reversed(lines) if line.strip()), "it printed nothing")
+    return found.removeprefix("rejeu: error: ")
+
+
+def default_workers() -> int:
+    """Returns how many runs are trained at once: half as many as there are cores."""
+    return max(hardware.cores() // 2, 1)
+
+
+def threads_of(workers: int) -> int:
+    """Returns the threads of each of so many runs, so that they do not slow each other."""
+    return max(hardware.cores() // workers, 1)
+
+
+def environment(threads: int) -> dict[str, str]:
+    """Returns the environment variables of a process that uses so many threads."""
+    found = {**os.environ, **{name: os.environ.get(name, str(threads)) for name in THREADS}}
+    return {**found, hardware.CORES: str(threads)}
+
+
+class LocalLauncher:
+    """Starts runs on this machine."""
+
+    def __init__(self, workers: int, threads: int | None = None) -> None:
+        """Starts nothing; each of the ``workers`` runs at once has so many threads, by default its share of the cores."""
+        self.capacity = workers
+        self._environ = environment(threads or threads_of(workers))
+
+    def start(self, task: Path, log: Path, lock: Path) -> Process:
+        """Starts a run."""
+        return Process(task, log, lock, self._environ)
+
+    def close(self) -> None:
+        """Does nothing: the processes end with this one."""
+
+
+def hold(path: Path) -> FileLock | None:
+    """Returns the lock on a file, held by this process; None if another process holds it."""
+    atomic.make_folder(path.parent)
+    lock = FileLock(path)
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        return None
+    return lock

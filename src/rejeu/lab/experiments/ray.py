@@ -1,0 +1,310 @@
+"""Runs as tasks on a Ray cluster whose machines share the folder of the sweep. Only Ray Core is used.
+
+This module is imported on the nodes, so it does not import JAX.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import platform
+import secrets
+import time
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from rejeu.core import atomic, hardware
+from rejeu.core.errors import ClusterError
+from rejeu.envs.workers import cluster
+from rejeu.lab.experiments.process import LOST, THREADS, Process
+from rejeu.lab.runs.config import read_task, write_task
+
+if TYPE_CHECKING:
+    from rejeu.lab.experiments.folder import Resources
+
+POLL = 0.5
+"""Seconds between two looks at the process on a node."""
+GRACE = 300.0
+"""Seconds after which a process that was asked to stop is killed."""
+REFRESH = 5.0
+"""Seconds between two looks at the nodes of the cluster."""
+ANSWER = 60.0
+"""Seconds that a node has to answer when the sweep begins."""
+PATIENCE = 120.0
+"""Seconds after which a run that was asked to stop, but waits for a node or hangs, is canceled."""
+END = 30.0
+"""Seconds that the tasks have to end when the sweep ends early."""
+PACKAGES = ("jax", "jaxlib", "optax")
+"""Further packages whose versions results depend on."""
+
+
+class Marker(NamedTuple):
+    """A file by which a node sees whether it shares a folder."""
+
+    path: str
+    token: str
+    """Content of the file."""
+
+    def is_seen(self) -> bool:
+        """Returns whether this machine sees the file."""
+        try:
+            return Path(self.path).read_text(encoding="utf-8") == self.token
+        except (OSError, UnicodeDecodeError):
+            return False
+
+
+class Spec(NamedTuple):
+    """A run as a node trains it. Paths are strings, which are the same on all machines."""
+
+    task: str
+    """File with what the process is asked to do."""
+    log: str
+    lock: str
+    stop: str
+    """File that asks the run to stop."""
+    marker: Marker
+    folder: str
+    """Current folder."""
+    environ: dict[str, str]
+    """Further environment variables."""
+    versions: dict[str, str]
+    """Versions that the node must have."""
+
+
+def look(marker: Marker) -> tuple[dict[str, str], bool]:
+    """Returns the versions of this node, and whether it sees the folder of the sweep."""
+    return cluster.versions(PACKAGES), marker.is_seen()
+
+
+def train(spec: Spec) -> int:
+    """Trains on this node until the process ends, and returns its exit status. A Ray task.
+
+    The process stops with a checkpoint when it is asked to, and when this function is left by an error.
+
+    Raises:
+        ClusterError: if this node has other versions, or does not see the folder of the sweep.
+    """
+    where = f"the node {platform.node()}"
+    cluster.check_versions(cluster.versions(PACKAGES), where, spec.versions)
+    check_shared(spec.marker.is_seen(), where, spec.marker)
+    folder, stop = Path(spec.folder), Path(spec.stop)
+    environ = {**os.environ, **spec.environ}
+    process = Process(Path(spec.task), Path(spec.log), Path(spec.lock), environ, folder if folder.is_dir() else None)
+    kill_at = math.inf
+    try:
+        while (status := process.poll()) is None:
+            time.sleep(POLL)
+            if kill_at == math.inf and stop.exists():
+                kill_at = time.monotonic() + GRACE
+                process.stop()
+            if time.monotonic() > kill_at:
+                process.kill()
+        return status
+    finally:
+        process.stop()
+
+
+def check_shared(is_seen: bool, where: str, marker: Marker) -> None:
+    """Raises ``ClusterError`` if a machine, called ``where``, does not see the folder of the sweep."""
+    if not is_seen:
+        raise ClusterError(
+            f"{where} does not see {Path(marker.path).parents[1]}, the folder of the sweep; name one with --out that all "
+            "machines share under the same path"
+        )
+
+
+class RayRun:
+    """A run on a cluster. Mutable."""
+
+    def __init__(self, ray: Any, result: Any, log: Path, stop: Path) -> None:
+        self._ray, self._result, self._log, self._stop = ray, result, log, stop
+        self._cancel_at = math.inf
+
+    def poll(self) -> int | None:
+        """Returns the exit status, ``LOST`` if the node or the worker process was lost; None while it runs."""
+        ray = self._ray
+        ready, _ = ray.wait([self._result], timeout=0)
+        if not ready:
+            if time.monotonic() > self._cancel_at:
+                self._cancel_at = math.inf
+                ray.cancel(self._result)
+            return None
+        try:
+            return int(ray.get(self._result))
+        except ray.exceptions.RayTaskError as error:
+            self._note(error.cause if isinstance(error.cause, Exception) else error)
+            return 2
+        except ray.exceptions.RayError as error:
+            self._note(error)
+            return LOST
+
+    def stop(self) -> None:
+        """Asks it to stop after the current step, with a checkpoint."""
+        with suppress(OSError):
+            self._stop.touch()
+        self._cancel_at = time.monotonic() + PATIENCE
+
+    def _note(self, error: Exception) -> None:
+        """Writes an error of the cluster to the log."""
+        with suppress(OSError), atomic.open_log(self._log) as file:
+            file.write(f"{type(error).__name__}: {cluster.one_line(error)}\n".encode())
+
+
+class RayLauncher:
+    """Starts runs on a Ray cluster. Mutable."""
+
+    def __init__(self, address: str, hidden: Path, resources: Resources, threads: int, workers: int | None) -> None:
+        """Connects to the cluster and looks at its nodes.
+
+        Args:
+            address: ``"auto"`` or ``"HOST:PORT"``.
+            hidden: folder for files about the runs, in that of the sweep.
+            resources: what a run needs.
+            threads: of each run.
+            workers: most runs at once; None for as many as fit.
+
+        Raises:
+            MissingExtra: if Ray is not installed.
+            ClusterError: if the cluster cannot be reached, a node has other versions or does not see the folder, or none has
+                room for a run.
+        """
+        self._connection = cluster.connect(address, "rejeu sweep --ray", shows_output=False)
+        self._ray = self._connection.ray
+        self._resources, self._workers = resources, workers
+        self._environ = {**dict.fromkeys(THREADS, str(threads)), hardware.CORES: str(threads)}
+        self._capacity, self._look_at = 0, -math.inf
+        self._handles: list[RayRun] = []
+        self._marker = write_marker(hidden.resolve())
+        try:
+            self._versions = cluster.versions(PACKAGES)
+            self._check_nodes()
+            if not self.capacity:
+                raise ClusterError(
+                    f"no node of the Ray cluster has room for a run with {described(resources)}; lower [resources]"
+                )
+            options = {"max_retries": 0, "scheduling_strategy": "SPREAD", **requested(resources)}
+            self._task = self._ray.remote(train).options(**options)
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def capacity(self) -> int:
+        """Runs at once: as many as the nodes that are there now have room for."""
+        now = time.monotonic()
+        if now >= self._look_at:
+            self._look_at = now + REFRESH
+            room = sum(places(node["Resources"], self._resources) for node in self._ray.nodes() if node["Alive"])
+            self._capacity = room if self._workers is None else min(room, self._workers)
+        return self._capacity
+
+    def start(self, task: Path, log: Path, lock: Path) -> RayRun:
+        """Starts a run."""
+        given = read_task(task)
+        write_task(task, replace(given, folder=str(Path(given.folder).resolve())))
+        stop = lock.with_suffix(".stop")
+        stop.unlink(missing_ok=True)
+        spec = Spec(
+            task=str(task.resolve()),
+            log=str(log.resolve()),
+            lock=str(lock.resolve()),
+            stop=str(stop.resolve()),
+            marker=self._marker,
+            folder=os.getcwd(),
+            environ=self._environ,
+            versions=self._versions,
+        )
+        self._handles.append(RayRun(self._ray, self._task.remote(spec), log, stop))
+        return self._handles[-1]
+
+    def close(self) -> None:
+        """Waits a little for runs that were asked to stop, and disconnects; what still runs then stops by itself."""
+        until = time.monotonic() + END
+        with suppress(Exception):
+            while any(one.poll() is None for one in self._handles) and time.monotonic() < until:
+                time.sleep(0.2)
+        with suppress(OSError):
+            Path(self._marker.path).unlink()
+        self._connection.close()
+
+    def _check_nodes(self) -> None:
+        """Looks at all nodes, but not at those that are lost meanwhile.
+
+        Raises:
+            ClusterError: if a node has other versions, does not see the folder, or does not answer.
+        """
+        ray = self._ray
+        from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+        nodes = [node for node in ray.nodes() if node["Alive"]]
+        answers = [
+            ray.remote(look)
+            .options(
+                num_cpus=0,
+                max_retries=0,
+                scheduling_strategy=NodeAffinitySchedulingStrategy(node["NodeID"], soft=False),
+            )
+            .remote(self._marker)
+            for node in nodes
+        ]
+        lost = ray.exceptions.NodeDiedError, ray.exceptions.TaskUnschedulableError, ray.exceptions.WorkerCrashedError
+        for node, answer in zip(nodes, answers, strict=True):
+            where = f"the node {node['NodeManagerHostname']}"
+            try:
+                there, is_seen = ray.get(answer, timeout=ANSWER)
+            except ray.exceptions.GetTimeoutError:
+                raise ClusterError(f"{where} has not answered for {ANSWER:g} s; look at its raylet") from None
+            except lost:
+                continue  # since the cluster was asked for its nodes
+            except ray.exceptions.RayError as error:
+                cause = getattr(error, "cause", None) or error
+                raise ClusterError(
+                    f"{where} cannot run rejeu: {cluster.one_line(cause)}; install the same packages on all machines"
+                ) from None
+            cluster.check_versions(there, where, self._versions)
+            check_shared(is_seen, where, self._marker)
+
+
+def write_marker(folder: Path) -> Marker:
+    """Writes a marker to a folder."""
+    token = secrets.token_hex(16)
+    path = folder / f"marker-{token[:8]}"
+    path.write_text(token, encoding="utf-8")
+    return Marker(str(path), token)
+
+
+def requested(resources: Resources) -> dict[str, Any]:
+    """Returns resources as Ray's options."""
+    found: dict[str, Any] = {"num_cpus": resources.cpus, "num_gpus": resources.gpus}
+    found |= {} if resources.memory is None else {"memory": resources.memory}
+    return {**found, "resources": resources.custom} if resources.custom else found
+
+
+def wanted(resources: Resources) -> dict[str, float]:
+    """Returns resources by Ray's names, those of which there are none left out."""
+    memory = float(resources.memory or 0)
+    found = {"CPU": resources.cpus, "GPU": resources.gpus, "memory": memory, **resources.custom}
+    return {name: value for name, value in found.items() if value}
+
+
+def places(there: Mapping[str, float], resources: Resources) -> int:
+    """Returns how many runs a node has room for.
+
+    >>> from rejeu.lab.experiments.folder import Resources
+    >>> places({"CPU": 8.0, "GPU": 1.0}, Resources(cpus=2, gpus=0.5))
+    2
+    """
+    return min(math.floor(there.get(name, 0.0) / value + 1e-6) for name, value in wanted(resources).items())
+
+
+def described(resources: Resources) -> str:
+    """Returns resources as text.
+
+    >>> from rejeu.lab.experiments.folder import Resources
+    >>> described(Resources(gpus=1))
+    'CPU=1, GPU=1'
+    """
+    return ", ".join(f"{name}={value:g}" for name, value in wanted(resources).items())

@@ -1,0 +1,272 @@
+"""What a study searches: environment, algorithm, search space and limits, as ``study.json`` in the study folder."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from msgspec import Meta
+
+from rejeu.agents import AGENTS, agent_of_file, find_agent, presets
+from rejeu.agents.presets import Preset
+from rejeu.algorithms import config as configs
+from rejeu.algorithms.search import HINDSIGHT, Dimension, SearchSpace
+from rejeu.core import validation
+from rejeu.core.errors import CheckpointError
+from rejeu.core.records import EnvCount, Positive, Seed, convert, json_text, read_json, shown
+from rejeu.lab.experiments import space as spaces
+from rejeu.lab.runs.config import RunConfig
+
+MAX_BYTES = 2**20
+"""Upper limit on the size of a ``study.json``."""
+MAX_TRIALS = 100_000
+MIN_FINAL_SEEDS = 5
+"""Least number of seeds of a comparison. Bootstrap intervals of fewer are too narrow: with three seeds, one in five
+comparisons of equal settings would find a difference."""
+EVALUATIONS = 10
+"""Evaluations of a trial, unless their interval is given."""
+SAMPLING, TRIALS, FINAL = range(3)
+"""Streams of random numbers: of the sampler, of the seeds of trials, of the seeds of the final comparison."""
+
+Pruner = Literal["median", "halving", "none"]
+Measure = Literal["return", "success"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """The settings of a study. Everything that a repetition needs, except for the number of workers."""
+
+    env_id: Annotated[str, Meta(pattern=r"^[\w./:-]{1,200}$")]
+    """Id of the environment."""
+    env_argument: str = ""
+    """How it was named on the command line; never imported because a file says so."""
+    env_kwargs: dict[str, Any] = field(default_factory=dict)
+    """Keyword arguments of the environment."""
+    wrappers: tuple[str, ...] = ()
+    """Names of its wrappers, innermost first."""
+    algorithm: str
+    default: dict[str, Any]
+    """Hyperparameters that the winner is compared with: of rejeu's preset, or empty for the algorithm's defaults."""
+    fixed: dict[str, Any]
+    """Hyperparameters of every trial, before those that are searched: ``default`` with what the user set."""
+    space: dict[str, dict[str, Any]]
+    """Where the others are searched; see :func:`rejeu.lab.experiments.space.to_json`."""
+    steps: Positive
+    """Environment steps of a trial."""
+    n_envs: EnvCount
+    backend: Annotated[str, Meta(pattern="^(auto|envpool|gymnasium|gymnasium-async|jax)$")]
+    evaluate_every: Positive
+    evaluate_episodes: Annotated[int, Meta(ge=1, le=10_000)]
+    trials: Annotated[int, Meta(ge=1, le=MAX_TRIALS)] = 30
+    trial_seeds: Annotated[int, Meta(ge=1, le=1000)] = 1
+    """Seeds of each trial, whose evaluations are averaged."""
+    final_seeds: Annotated[int, Meta(ge=0, le=1000)] = 5
+    """Fresh seeds on which the winner is compared with the default; 0 for no comparison."""
+    seed: Seed = 0
+    """Determines what is sampled and the seeds of all trainings."""
+    pruner: Pruner = "median"
+    measure: Measure = "return"
+    """What is maximized: the mean return of the last evaluation, or its success rate."""
+    checkpoint_minutes: Annotated[float, Meta(ge=0, le=1e6)] = 5.0
+
+    @property
+    def run(self) -> RunConfig:
+        """The environment of all trainings."""
+        kwargs, wrappers = self.env_kwargs, self.wrappers
+        return RunConfig(env=self.env_id, env_argument=self.env_argument, env_kwargs=kwargs, wrappers=wrappers)
+
+    @property
+    def search_space(self) -> dict[str, Dimension]:
+        """Where hyperparameters are searched, by name."""
+        return {name: spaces.from_json(name, one) for name, one in self.space.items()}
+
+    @property
+    def column(self) -> str:
+        """The column of ``evaluations.csv`` that is maximized."""
+        return {"return": "mean_return", "success": "success_rate"}[self.measure]
+
+    def sampler_seed(self, index: int) -> int:
+        """Returns the seed with which the parameters of a trial are sampled."""
+        return self._numbers(1, SAMPLING, index)[0]
+
+    def seeds(self, index: int) -> list[int]:
+        """Returns the seeds of the trainings of a trial. They are even."""
+        return [number & ~1 for number in self._numbers(self.trial_seeds, TRIALS, index)]
+
+    def fresh_seeds(self) -> list[int]:
+        """Returns the seeds of the final comparison. They are odd, so that no trial has one of them."""
+        n = max(self.final_seeds, MIN_FINAL_SEEDS) if self.final_seeds else 0  # earlier versions took 3
+        return [number | 1 for number in self._numbers(n, FINAL)]
+
+    def _numbers(self, n: int, *key: int) -> list[int]:
+        return np.random.SeedSequence([self.seed, *key]).generate_state(max(n, 1)).tolist()[:n]
+
+    def preset(self, hyperparameters: Mapping[str, Any], source: str) -> Preset:
+        """Returns a preset with these hyperparameters and what all trainings of the study have in common."""
+        return Preset(
+            env_id=self.env_id,
+            algorithm=self.algorithm,
+            hyperparameters=hyperparameters,
+            n_envs=self.n_envs,
+            total_steps=self.steps,
+            evaluate_every=self.evaluate_every,
+            evaluate_episodes=self.evaluate_episodes,
+            backend=self.backend,
+            source=source,
+        )
+
+
+def make(
+    env_id: str,
+    algorithm: str | None = None,
+    *,
+    env_argument: str = "",
+    env_kwargs: Mapping[str, Any] | None = None,
+    wrappers: tuple[str, ...] = (),
+    preset: Preset | None = None,
+    fixed: Mapping[str, Any] | None = None,
+    search: SearchSpace | None = None,
+    only: tuple[str, ...] = (),
+    steps: int | None = None,
+    n_envs: int | None = None,
+    backend: str | None = None,
+    evaluate_every: int | None = None,
+    evaluate_episodes: int | None = None,
+    **others: Any,
+) -> Plan:
+    """Returns the plan of a study, completed by the preset or the defaults, after all checks that need no training.
+
+    ``fixed`` are hyperparameters that are set instead of searched, and ``others`` are further fields of the plan. The rest is
+    as for :func:`rejeu.tune`, with None for what the preset or the default decides.
+
+    Raises:
+        ValueError: for an unknown algorithm, an empty space, or a value out of range.
+        TypeError: for a hyperparameter that the algorithm does not have, with the nearest one, or one that JSON does not have.
+    """
+    base = starting_point(env_id, algorithm, preset)
+    fixed = {key: configs.value_to_json(value) for key, value in (fixed or {}).items()}
+    values = {**base.hyperparameters, **fixed}
+    space = choose_space(base.algorithm, values, fixed, search or {}, only)
+    total = validation.whole("steps", steps or base.total_steps, least=1)
+    plan = Plan(
+        env_id=env_id,
+        env_argument=env_argument or env_id,
+        env_kwargs=dict(env_kwargs or {}),
+        wrappers=wrappers,
+        algorithm=base.algorithm,
+        default=dict(base.hyperparameters),
+        fixed=values,
+        space={key: spaces.to_json(one) for key, one in space.items()},
+        steps=total,
+        n_envs=n_envs or base.n_envs,
+        backend=backend or ("auto" if env_kwargs or wrappers else base.backend),
+        evaluate_every=evaluate_every or max(total // EVALUATIONS, 1),
+        evaluate_episodes=evaluate_episodes or base.evaluate_episodes,
+        **others,
+    )
+    if 0 < plan.final_seeds < MIN_FINAL_SEEDS:
+        raise ValueError(
+            f"final_seeds={plan.final_seeds} cannot tell luck from a difference; give {MIN_FINAL_SEEDS} or more, or 0"
+        )
+    try:  # as it is read again, so that a study begins and goes on with the same
+        return convert(json.loads(json_text(plan)), Plan)
+    except CheckpointError as error:
+        raise ValueError(str(error)) from None
+    except TypeError as error:
+        raise TypeError(f"a study takes only hyperparameters that JSON can express: {error}") from None
+
+
+def starting_point(env_id: str, algorithm: str | None, preset: Preset | None) -> Preset:
+    """Returns the preset that trials start from: the given one, rejeu's own, or one of the algorithm's defaults.
+
+    Raises:
+        ValueError: for an unknown algorithm, or if there is none and the environment has no preset.
+    """
+    name = None if algorithm is None else find_agent(algorithm).algorithm.Config.name
+    base = preset or presets.find(env_id, name)
+    if base is None and name is None:
+        raise ValueError(f"{env_id} has no preset; name the algorithm to tune, such as --algo PPO")
+    return base or presets.default(env_id, str(name))
+
+
+def choose_space(
+    algorithm: str,
+    values: Mapping[str, Any],
+    fixed: Mapping[str, Any],
+    search: SearchSpace,
+    only: tuple[str, ...],
+) -> dict[str, Dimension]:
+    """Returns the search space of a study, in which every extreme value is known to be valid.
+
+    Raises:
+        ValueError: if nothing is left to search, or a value is out of range.
+        TypeError: for a name that the algorithm does not have.
+    """
+    config_class = AGENTS[algorithm].algorithm.Config
+    own: dict[str, Dimension] = dict(getattr(config_class, "search_space", {}))
+    if getattr(validation.build(config_class, values), "hindsight", None) is not None:
+        own |= HINDSIGHT
+    own = {name: one for name, one in own.items() if not is_set(fixed, name)} | dict(search)
+    for name in only:
+        if name not in own:
+            raise ValueError(validation.unknown_name(name, own, f"the search space of {algorithm}"))
+    own = {name: one for name, one in own.items() if not only or name in only}
+    for name, dimension in own.items():
+        for value in dimension.ends():
+            validation.build(config_class, spaces.applied(values, {name: value}))
+    if not own:
+        raise ValueError(f"there is nothing to search for {algorithm}; give a range, such as learning_rate=1e-4..1e-2")
+    return own
+
+
+def is_set(fixed: Mapping[str, Any], name: str) -> bool:
+    """Returns whether the user set the hyperparameter of a dotted name."""
+    head, _, rest = name.partition(".")
+    inner = fixed.get(head)
+    return head in fixed and (not rest or not isinstance(inner, Mapping) or is_set(inner, rest))
+
+
+def read(path: Path) -> Plan:
+    """Returns the plan of a ``study.json``, which is untrusted.
+
+    Raises:
+        FileNotFoundError: if it is not there.
+        CheckpointError: if it is damaged, or names an algorithm that is not registered.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path.parent} is no study folder: it holds no {path.name}")
+    try:
+        plan = convert(read_json(path, MAX_BYTES), Plan)
+        check(plan, path)
+        return plan
+    except (ValueError, TypeError) as error:
+        raise CheckpointError(f"{path} is damaged: {shown(error, 1000)}") from None
+
+
+def check(plan: Plan, path: Path) -> None:
+    """Raises ``ValueError`` or ``TypeError`` if the algorithm of a plan from a file does not take its hyperparameters."""
+    config_class = agent_of_file(plan.algorithm, path).algorithm.Config
+    for name, dimension in plan.search_space.items():
+        for value in dimension.ends():
+            validation.build(config_class, spaces.applied(plan.fixed, {name: value}))
+
+
+def default_values(plan: Plan) -> dict[str, Any]:
+    """Returns the values of the searched hyperparameters in the default, as far as they lie in the search space."""
+    config = validation.build(AGENTS[plan.algorithm].algorithm.Config, plan.fixed)
+    values = spaces.values_at(configs.to_json(config), plan.search_space)
+    return {name: value for name, value in values.items() if plan.search_space[name].contains(value)}
+
+
+def difference(plan: Plan, other: Plan) -> str:
+    """Returns the first setting in which two plans differ and which a study cannot change, as text; empty if none does."""
+    for one in dataclasses.fields(Plan):
+        ours, theirs = getattr(plan, one.name), getattr(other, one.name)
+        if one.name not in ("trials", "final_seeds", "checkpoint_minutes") and ours != theirs:
+            return f"{one.name} is {str(ours)[:100]} there, not {str(theirs)[:100]}"
+    return ""

@@ -1,0 +1,363 @@
+"""``rejeu.sweep``: from a plan to trained runs, with a table of their progress.
+
+Each job of the sweep is a task of the scheduler. On a terminal there are bars, and lines where there is none.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from rejeu.agents import modules_of
+from rejeu.core.interrupt import Interrupt
+from rejeu.lab.experiments.folder import (
+    HIDDEN,
+    Job,
+    JobProgress,
+    JobWork,
+    State,
+    Sweep,
+    SweepFolder,
+    again,
+    open_folder,
+    read_folder,
+)
+from rejeu.lab.experiments.plan import read_plan
+from rejeu.lab.experiments.process import LocalLauncher, default_workers, threads_of
+from rejeu.lab.experiments.scheduler import Launcher, Scheduler
+from rejeu.lab.runs.config import RunConfig
+from rejeu.logs import formatting
+from rejeu.logs.formatting import counted, quoted
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.progress import Progress
+
+STATES = ("running", "done", "failed", "stopped", "waiting")
+REFRESH, LINES = 2.0, 30.0
+"""Seconds between two readings of the tables of the runs: for bars on a terminal, and for lines elsewhere."""
+MAX_NAMED = 4
+"""Most runs that are named in a line."""
+
+echo = partial(print, flush=True)
+Watch = Callable[["Coordinator"], None]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The outcome of one job."""
+
+    job: Job
+    state: State
+    exit_status: int | None
+    path: Path
+    log: Path
+
+
+class Coordinator:
+    """Works through the jobs of a folder until none is left that it may take. Mutable."""
+
+    def __init__(
+        self,
+        folder: SweepFolder,
+        launcher: Launcher,
+        stop: Interrupt,
+        typed: RunConfig,
+        retry: bool = False,
+        say: Callable[[str], object] = lambda text: None,
+    ) -> None:
+        """Starts nothing yet.
+
+        Args:
+            folder: of the sweep.
+            launcher: what starts runs.
+            stop: a requested stop ends all runs, with checkpoints.
+            typed: what the command line named for import.
+            retry: whether jobs that have failed are tried again, once.
+            say: called with a line for each event.
+
+        Raises:
+            ValueError: if the processes of the runs could not find an algorithm.
+        """
+        algorithms = {job.run.algorithm: None for job in folder.jobs if job.run.algorithm is not None}
+        modules = {name: None for algorithm in algorithms for name in modules_of(algorithm, typed.imports)}
+        self.folder, self.launcher = folder, launcher
+        self.typed = dataclasses.replace(typed, imports=tuple(modules) or typed.imports)
+        self.tasks = folder.works(self.typed.imports, retry)
+        self.scheduler = Scheduler(launcher, stop, say)
+        self.scheduler.waiting.extend(task for task in self.tasks if task.is_open())
+
+    def run(self, watch: Callable[[Coordinator], None] = lambda coordinator: None) -> None:
+        """Works until nothing is left; ``watch`` is called several times a second."""
+        self.scheduler.run(lambda: watch(self))
+
+    def running(self) -> list[JobWork]:
+        """Returns the jobs that this process looks after and that train."""
+        attended = {attempt.task for attempt in self.scheduler.running}
+        return [task for task in self.tasks if task in attended]
+
+    def outcomes(self) -> list[Outcome]:
+        """Returns the state of every job."""
+        running = self.running()
+        return [
+            Outcome(
+                task.job,
+                "running" if task in running else task.state(),
+                task.exit_status() if task.status is None else task.status,
+                task.run,
+                task.log,
+            )
+            for task in self.tasks
+        ]
+
+
+def count(states: Iterable[str]) -> dict[str, int]:
+    """Returns how often each state occurs.
+
+    >>> count(["done", "failed", "done"])
+    {'running': 0, 'done': 2, 'failed': 1, 'stopped': 0, 'waiting': 0}
+    """
+    return dict.fromkeys(STATES, 0) | Counter(states)
+
+
+@dataclass(frozen=True)
+class SweepResult:
+    """What :func:`sweep` returns. ``rejeu.compare(result.path)`` compares its runs."""
+
+    path: Path
+    """Folder of the sweep."""
+    outcomes: tuple[Outcome, ...]
+    """The outcome of each job."""
+
+    @property
+    def runs(self) -> list[Path]:
+        """Folders of the runs that are done."""
+        return [one.path for one in self.outcomes if one.state == "done"]
+
+    @property
+    def failed(self) -> list[Outcome]:
+        """The jobs that failed; the log of each says why."""
+        return [one for one in self.outcomes if one.state == "failed"]
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether all jobs are done."""
+        return all(one.state == "done" for one in self.outcomes)
+
+    def counts(self) -> dict[str, int]:
+        """Returns how many jobs are in each state."""
+        return count(one.state for one in self.outcomes)
+
+    def table(self) -> list[dict[str, Any]]:
+        """Returns one row for each job, ready for ``pandas.DataFrame``."""
+        of_run, of_outcome = ("env", "algorithm", "seed"), ("state", "exit_status", "path", "log")
+        return [
+            {
+                **{"name": one.job.name, "setting": one.job.setting},
+                **{key: getattr(one.job.run, key) for key in of_run},
+                **{key: getattr(one, key) for key in of_outcome},
+            }
+            for one in self.outcomes
+        ]
+
+
+def prepare(
+    plan: str | Path | Mapping[str, Any],
+    folder: str | Path | None,
+    workers: int | None,
+    typed: RunConfig,
+    ray: str | None = None,
+) -> SweepFolder:
+    """Returns the folder of a checked plan, new or joined.
+
+    Args:
+        plan: path of a TOML file, or its content as a dict.
+        folder: of the sweep; None makes one under ``runs``, named after the plan and the time.
+        workers: runs at once, which determines their threads; None for half as many as there are cores.
+        typed: what the command line named for import.
+        ray: address of a Ray cluster, on which runs have as many threads as CPUs.
+
+    Raises:
+        PlanError: for a mistake in the plan, with its line.
+        ValueError, FileExistsError: if the folder belongs to something else.
+    """
+    found, text = read_plan(plan)
+    at_once = min(workers or default_workers(), len(found.jobs))
+    share = threads_of(at_once) if ray is None else max(int(found.resources.cpus), 1)
+    sweep_of_plan = Sweep(jobs=found.jobs, threads=found.threads or share, resources=found.resources)
+    if folder is None:
+        stem = "sweep" if isinstance(plan, Mapping) else Path(plan).stem
+        folder = Path("runs") / f"{stem}-{time.strftime('%Y%m%d-%H%M%S')}"
+    return open_folder(Path(folder), sweep_of_plan, text, typed)
+
+
+def make_launcher(folder: SweepFolder, workers: int | None, ray: str | None) -> Launcher:
+    """Returns what starts runs: processes on this machine, or tasks on a Ray cluster.
+
+    Raises:
+        MissingExtra: if Ray is needed and not installed.
+        ConnectionError, ValueError: if the cluster cannot be used.
+    """
+    if ray is not None:
+        from rejeu.lab.experiments.ray import RayLauncher  # Ray is an extra
+
+        return RayLauncher(ray, folder.path / HIDDEN, folder.sweep.resources, folder.sweep.threads, workers)
+    return LocalLauncher(min(workers or default_workers(), len(folder.jobs)), folder.sweep.threads)
+
+
+def sweep(
+    plan: str | Path | Mapping[str, Any],
+    folder: str | Path | None = None,
+    *,
+    workers: int | None = None,
+    ray: str | None = None,
+    retry: bool = False,
+    imports: Sequence[str] = (),
+    progress: bool = True,
+) -> SweepResult:
+    """Trains every run of a plan, each in a process and a folder of its own, and returns their outcomes.
+
+    Runs of an existing folder of the same plan that are done are not repeated; those that were interrupted continue exactly
+    from their newest checkpoint. Several processes and machines may work on one folder at the same time.
+
+    Args:
+        plan: path of a TOML file, or its content as a dict; see ``docs/scaling.md``. The folder of a sweep continues it.
+        folder: of the sweep; None makes one under ``runs``.
+        workers: runs at once; by default half as many as there are cores, on a cluster as many as fit.
+        ray: ``"auto"`` or the address of a Ray cluster, on which the runs are trained.
+        retry: try failed runs again.
+        imports: modules and Python files that each run imports first.
+        progress: show a table of the runs on a terminal, and lines elsewhere.
+
+    Raises:
+        PlanError: for a mistake in the plan, before anything starts.
+        KeyboardInterrupt: after Ctrl-C or SIGTERM, when all runs have stopped with a checkpoint.
+
+    ::
+
+        result = rejeu.sweep({"environments": ["CartPole-v1"], "algorithms": ["DQN", "PPO"], "seeds": 5, "steps": 50_000})
+        print(rejeu.compare(result.path))
+    """
+    typed = RunConfig(env="", imports=tuple(imports))
+    is_folder = not isinstance(plan, Mapping) and Path(plan).is_dir()
+    found = read_folder(Path(plan), typed) if is_folder else prepare(plan, folder, workers, typed, ray)  # type: ignore[arg-type]
+    with Interrupt() as stop:
+        with shown(progress) as (watch, say):
+            coordinator = Coordinator(found, make_launcher(found, workers, ray), stop, typed, retry, say)
+            coordinator.run(watch)
+        stop.check()
+    return SweepResult(found.path, tuple(coordinator.outcomes()))
+
+
+class Row(NamedTuple):
+    """A bar about a run, or about all of them."""
+
+    name: str
+    done: int
+    total: int | None
+    text: str
+
+
+@contextmanager
+def shown(progress: bool = True) -> Iterator[tuple[Watch, Callable[[str], None]]]:
+    """Context in which progress is shown; returns a function to call often, and one to call with each event."""
+    console = formatting.console()
+    if not progress:
+        yield (lambda coordinator: None), (lambda text: None)
+    elif not console.is_terminal:
+        yield seldom(lambda coordinator: echo(line(coordinator)), LINES, time.monotonic() + LINES), echo
+    else:
+        with bars(console) as show:
+            say = partial(console.print, highlight=False, markup=False)
+            yield seldom(lambda coordinator: show(rows(coordinator)), REFRESH), say
+
+
+@contextmanager
+def bars(console: Console) -> Iterator[Callable[[Sequence[Row]], None]]:
+    """Context in which a terminal shows bars; returns a function to call with all of them, the first of which is for all."""
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    names, texts = TextColumn("{task.description}", markup=False), TextColumn("{task.fields[text]}", markup=False)
+    with Progress(
+        names, BarColumn(), texts, TimeRemainingColumn(), console=console, speed_estimate_period=600
+    ) as drawn:
+        yield partial(draw, drawn)
+
+
+def draw(drawn: Progress, found: Sequence[Row]) -> None:
+    """Draws a bar for each row, and removes those that have none."""
+    known = {task.description: task.id for task in drawn.tasks}
+    for name in known.keys() - {row.name for row in found}:
+        drawn.remove_task(known[name])
+    for row in found:
+        task = known[row.name] if row.name in known else drawn.add_task(row.name, text="")
+        drawn.update(task, total=row.total, completed=row.done, text=row.text)
+
+
+def seldom(function: Watch, seconds: float, begin: float = 0.0) -> Watch:
+    """Returns a function that calls another if the last call was so many seconds ago, and runs train."""
+    due = begin
+
+    def call(coordinator: Coordinator) -> None:
+        nonlocal due
+        if time.monotonic() >= due and coordinator.running():
+            due = time.monotonic() + seconds
+            function(coordinator)
+
+    return call
+
+
+def rows(coordinator: Coordinator) -> list[Row]:
+    """Returns a row for all steps of the sweep, by which the remaining time is estimated, and one for each run that trains."""
+    found, taken = [], 0
+    for task in coordinator.running():
+        at, steps = task.progress(), task.job.run.steps
+        taken += at.step
+        found.append(Row(task.name, at.step, steps, text_of(at, steps)))
+    outcomes = coordinator.outcomes()
+    asked = sum(one.job.run.steps or 0 for one in outcomes if one.state != "failed")
+    taken += sum(one.job.run.steps or 0 for one in outcomes if one.state == "done")
+    return [Row("all steps", taken, asked or None, states(coordinator)), *found]
+
+
+def line(coordinator: Coordinator) -> str:
+    """Returns one line: the steps and the return of the runs that train, and how many are in each state."""
+    tasks = coordinator.running()[:MAX_NAMED]
+    parts = [f"{task.name} {text_of(task.progress(), task.job.run.steps)}" for task in tasks]
+    return "; ".join([*parts, states(coordinator)])
+
+
+def text_of(progress: JobProgress, steps: int | None) -> str:
+    """Returns how far a run is.
+
+    >>> text_of(JobProgress(1500, mean_return=12.5), 20000)
+    '1,500 of 20,000 steps, return 12.50'
+    """
+    asked = f" of {steps:,}" if steps else ""
+    values = {"return": progress.mean_return, "best evaluation": progress.best}
+    known = [f", {name} {value:,.2f}" for name, value in values.items() if math.isfinite(value)]
+    return f"{progress.step:,}{asked} steps{''.join(known)}"
+
+
+def states(coordinator: Coordinator) -> str:
+    """Returns how many runs are in each state, such as ``2 running, 3 done``."""
+    found = count(one.state for one in coordinator.outcomes())
+    return ", ".join(f"{number} {state}" for state, number in found.items() if number)
+
+
+def closing_lines(coordinator: Coordinator) -> list[str]:
+    """Returns the lines that are printed at the end: how many jobs are in each state, and how failed ones are repeated."""
+    folder, outcomes = coordinator.folder, coordinator.outcomes()
+    lines = [f"{counted(len(outcomes), 'run')}: {states(coordinator)}"]
+    if any(one.state == "failed" for one in outcomes) and not coordinator.running():
+        resume = f"rejeu resume {quoted(folder.path)}{again(folder.jobs, coordinator.typed)}"
+        lines.append(f"{resume} tries failed runs again")
+    return lines

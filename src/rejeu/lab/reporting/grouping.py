@@ -1,0 +1,220 @@
+"""Runs that are compared: their returns over steps or time, cut and scaled, and what makes a group of them.
+
+Groups are made by algorithm, by the settings in which the runs differ, or by environment.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
+
+import numpy as np
+
+from rejeu.core.records import shown
+from rejeu.lab.reporting.runs import Run
+from rejeu.logs.tables import HUGE, flat
+
+By = Literal["algorithm", "setting", "env"]
+MAX_LABEL = 200
+"""Characters of a label that are shown."""
+
+
+def group_labels(runs: Sequence[Run], by: By | None) -> tuple[By, list[str]]:
+    """Returns what makes a group, and the label of the group of each run."""
+    labels: dict[By, list[str]] = {
+        "algorithm": [algorithm_label(run) for run in runs],
+        "setting": settings(runs),
+        "env": [env_label(run) for run in runs],
+    }
+    # tuned settings differ from environment to environment, and are then nothing to compare
+    settings_differ = len({*zip(labels["env"], labels["setting"], strict=True)}) > len({*labels["env"]})
+    usual: By = "env" if len({*labels["env"]}) > 1 else "algorithm"
+    if len({*labels["algorithm"]}) > 1:
+        usual = "algorithm"
+    elif settings_differ:
+        usual = "setting"
+    chosen = usual if by is None else by
+    return chosen, labels[chosen]
+
+
+def settings(runs: Sequence[Run]) -> list[str]:
+    """Returns for each run the algorithm, and the settings in which the runs of this algorithm differ."""
+    values = [dict(flat(run.hyperparameters)) | {"n_envs": run.n_envs} for run in runs]
+    written = [{name: whole_text(value) for name, value in one.items()} for one in values]
+    members: dict[str, list[dict[str, str]]] = {}
+    for run, one in zip(runs, written, strict=True):
+        members.setdefault(algorithm_label(run), []).append(one)
+    differing = {algorithm: differing_names(ones) for algorithm, ones in members.items()}
+    labels = []
+    for run, one in zip(runs, written, strict=True):
+        algorithm = algorithm_label(run)
+        parts = [algorithm, *(f"{name}={one[name]}" for name in differing[algorithm] if name in one)]
+        labels.append(shortened(", ".join(parts)))
+    return labels
+
+
+def differing_names(settings: Sequence[Mapping[str, str]]) -> list[str]:
+    """Returns the names whose values are not all the same."""
+    names = sorted({name for one in settings for name in one})
+    return [name for name in names if len({one.get(name, "") for one in settings}) > 1]
+
+
+def algorithm_label(run: Run) -> str:
+    """Returns the algorithm of a run; of one that does not say, the name of the folder above."""
+    return run.algorithm or run.path.parent.name
+
+
+def env_label(run: Run) -> str:
+    """Returns the environment of a run with its keyword arguments."""
+    kwargs = ", ".join(f"{name}={whole_text(value)}" for name, value in sorted(run.env_kwargs.items()))
+    return shortened(f"{run.env_id}({kwargs})" if kwargs else run.env_id)
+
+
+def whole_text(value: Any) -> str:
+    """Returns a value of a configuration as text, empty for None."""
+    if value is None:
+        return ""
+    return value if isinstance(value, str) else json.dumps(value)
+
+
+def shortened(label: str) -> str:
+    """Returns a label; a long one is cut, with a digest that keeps it apart from others that begin alike."""
+    if len(label) <= MAX_LABEL:
+        return shown(label, MAX_LABEL)
+    digest = hashlib.blake2b(label.encode("utf-8", "backslashreplace"), digest_size=4).hexdigest()
+    return f"{shown(label, MAX_LABEL)} #{digest}"
+
+
+Axis = Literal["steps", "time"]
+Score = Literal["training", "evaluation"]
+N_POINTS = 101
+"""Points of a curve."""
+SMOOTHING = 0.05
+"""Width of the moving mean of a curve, as a share of what is compared."""
+FINAL = 0.1
+"""Share of training, at its end, whose episodes make the final score."""
+
+
+class Curve:
+    """The returns of one run over steps or time. Mutable while a comparison is made."""
+
+    def __init__(self, run: Run, x: np.ndarray, y: np.ndarray, problem: str = "") -> None:
+        self.run, self.x, self.y, self.problem = run, x, y, problem
+        self.env = env_label(run)
+        self.label = ""
+        self.end = float(x[-1]) if len(x) else 0.0
+        """Where the curve ends: the steps, or the time, that all runs of the environment have."""
+        self.evaluation: tuple[np.ndarray, np.ndarray] | None = None
+
+    @classmethod
+    def of(cls, run: Run, axis: Axis, score: Score) -> Curve:
+        """Returns the curve of a run, or one with a ``problem``."""
+        name, table = run.name, run.evaluations
+        when, value = table.column("step" if axis == "steps" else "seconds"), table.column("mean_return")
+        good = np.isfinite(when) & (np.abs(value) < HUGE)
+        if len(run.episodes):
+            x, y = (run.episodes.step if axis == "steps" else run.episodes.seconds), run.episodes.returns
+        elif run.hyperparameters.get("offline"):
+            x, y = when[good], value[good]
+        else:  # of a run that is in progress or crashed only the means are known
+            x = run.metrics.column("step" if axis == "steps" else "time/time_elapsed")
+            y = run.metrics.column("rollout/ep_rew_mean")
+        known = np.isfinite(x) & (np.abs(y) < HUGE)
+        x, y = x[known], y[known]
+        if not len(x) or x[-1] <= 0:
+            return cls(run, x[:0], y[:0], f"{name} has no episode yet and is left out")
+        if (np.diff(x) < 0).any():  # time that was set back
+            order = np.argsort(x, kind="stable")
+            x, y = x[order], y[order]
+        curve = cls(run, x, y)
+        whole = run.steps if axis == "steps" else run.seconds
+        curve.end = max(curve.end, whole if math.isfinite(whole) else 0.0)  # the last episode ends before the run does
+        if score == "evaluation":
+            if not good.any():
+                return cls(run, x[:0], y[:0], f"{name} has no evaluation and is left out")
+            curve.evaluation = when[good], value[good]
+        return curve
+
+    def mean_between(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        """Returns the mean return of the episodes that ended in each interval ``(low, high]``.
+
+        Where there is none, the return of the last one before it; NaN before the first.
+        """
+        sums = np.concatenate([[0.0], np.cumsum(self.y)])
+        first, last = (np.searchsorted(self.x, bound, "right") for bound in (low, high))
+        first = np.where(first == last, np.maximum(last - 1, 0), first)
+        with np.errstate(invalid="ignore"):
+            return (sums[last] - sums[first]) / np.where(last > first, last - first, np.nan)
+
+    def points(self) -> np.ndarray:
+        """Returns the smoothed curve, ``(N_POINTS,)``."""
+        grid = np.linspace(0, self.end, N_POINTS)
+        return self.mean_between(grid - SMOOTHING * self.end, grid)
+
+    def final(self) -> float:
+        """Returns the final score."""
+        if self.evaluation is not None:
+            when, value = self.evaluation
+            return float(value[int(np.searchsorted(when, self.end, "right")) - 1])
+        return float(self.mean_between(np.array([(1 - FINAL) * self.end]), np.array([self.end]))[0])
+
+
+def cut_to_shortest(curves: list[Curve], axis: Axis, notes: list[str]) -> None:
+    """Cuts the curves of each environment to the shortest of them, and notes it if they differ by more than a tenth."""
+    for env, group in itertools.groupby(sorted(curves, key=lambda one: one.env), key=lambda one: one.env):
+        members = list(group)
+        shortest = min(members, key=lambda one: one.end)
+        longest = max(one.end for one in members)
+        if shortest.end < (1 - FINAL) * longest:
+            unit = axis if axis == "steps" else "seconds"
+            notes.append(
+                f"the runs on {env or 'the environment'} have between {shortest.end:,.0f} and {longest:,.0f} {unit}; all are "
+                f"compared up to those of {shortest.run.name} ({shortest.run.state})"
+            )
+        for one in members:
+            one.end = shortest.end
+
+
+def scale(curves: Sequence[Curve], normalize: str | Mapping[str, tuple[float, float]]) -> None:
+    """Scales the returns of each environment.
+
+    Raises:
+        ValueError: if an environment has no reference returns, or they are equal.
+    """
+    finals: dict[str, list[float]] = {}
+    for one in curves:
+        finals.setdefault(one.env, []).append(one.final())
+    for one in curves:
+        if isinstance(normalize, Mapping):
+            if one.env not in normalize:
+                raise ValueError(
+                    f"normalize has no reference returns for {one.env!r}; add {{{one.env!r}: (low, high)}}"
+                )
+            low, high = references(one.env, normalize[one.env])
+        elif normalize == "range":
+            low, high = min(finals[one.env]), max(finals[one.env])
+        else:
+            raise ValueError(f"normalize={normalize!r} must be 'range' or a mapping of environments to (low, high)")
+        span = (high - low) or 1.0
+        one.y = (one.y - low) / span
+        if one.evaluation is not None:
+            one.evaluation = one.evaluation[0], (one.evaluation[1] - low) / span
+
+
+def references(env: str, pair: Any) -> tuple[float, float]:
+    """Returns the two reference returns of an environment.
+
+    Raises:
+        ValueError: if they are not two finite numbers, the lower first.
+    """
+    try:
+        low, high = map(float, pair)
+    except (TypeError, ValueError):
+        low = high = math.nan
+    if not -math.inf < low < high < math.inf:
+        raise ValueError(f"normalize[{env!r}]={pair!r} must be two returns, the lower first")
+    return low, high

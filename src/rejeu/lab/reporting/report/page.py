@@ -1,0 +1,88 @@
+"""HTML pages in one file: templates, styles, scripts and data. Shared by reports and comparisons."""
+
+from __future__ import annotations
+
+import base64
+import secrets
+import zlib
+from functools import cache
+from importlib import resources
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rejeu.core.errors import MissingExtra
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
+
+TEMPLATES = Path(__file__).parent / "templates"
+
+
+def render(template: str, data: Any, *, live: bool = False, **context: Any) -> str:
+    """Returns a page that extends ``base.html``.
+
+    Args:
+        template: name of the template.
+        data: JSON data for the script: ``{"charts": {id: chart}, "histograms": {id: histogram}, ...}``.
+        live: allow the page to ask its server for new data.
+        context: variables of the template.
+
+    Raises:
+        MissingExtra: if plotly or jinja2 is not installed.
+        ValueError: if the data contains NaN or an infinity.
+    """
+    page = environment().get_template(template)  # first, so that a missing jinja2 is named
+    from markupsafe import Markup
+
+    nonce = secrets.token_urlsafe(18)
+    network = "'self'" if live else "'none'"
+    policy = (
+        f"default-src 'none'; script-src 'nonce-{nonce}'; style-src 'unsafe-inline'; img-src data:; media-src data:; "
+        f"connect-src {network}; base-uri 'none'; form-action 'none'"
+    )
+    own = {name: Markup((TEMPLATES / name).read_text(encoding="utf-8")) for name in ("page.css", "page.js")}
+    return page.render(
+        nonce=nonce,
+        policy=policy,
+        data=data,
+        live=live,
+        style=own["page.css"],
+        script=own["page.js"],
+        plotly=Markup(plotly_script()),
+        **context,
+    )
+
+
+def part(name: str, run: Any) -> str:
+    """Returns one part of the page as HTML, such as ``"headline"``."""
+    return str(getattr(environment().get_template("parts.html").module, name)(run))
+
+
+@cache
+def environment() -> Environment:
+    """Returns the templates, which escape everything."""
+    try:
+        import jinja2
+    except ImportError:
+        raise MissingExtra("a report", "jinja2", "report") from None
+    return jinja2.Environment(
+        loader=jinja2.FileSystemLoader(TEMPLATES),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+
+
+@cache
+def plotly_script() -> str:
+    """Returns Plotly's script, compressed and in base64: two megabytes instead of five. The page unpacks it.
+
+    Raises:
+        MissingExtra: if plotly is not installed.
+    """
+    try:
+        script = resources.files("plotly").joinpath("package_data", "plotly.min.js").read_bytes()
+    except (ImportError, OSError):
+        raise MissingExtra("a report", "plotly", "report") from None
+    return base64.b64encode(zlib.compress(script, 6)).decode("ascii")

@@ -1,0 +1,394 @@
+"""The content of a report on each run, as texts for the templates and data for the script.
+
+A few videos are embedded within a budget, the others are linked.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+import os
+import re
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, NamedTuple
+from urllib.parse import quote
+
+import numpy as np
+
+from rejeu.core.records import shown
+from rejeu.lab.reporting.runs import MAX_WORD, Run, best_row
+from rejeu.lab.runs.config import RunConfig
+from rejeu.logs import charts as chart_data
+from rejeu.logs.formatting import counted, quoted
+from rejeu.logs.tables import flat, read_bytes
+
+LAST = 100
+"""Training episodes that stand in for a final evaluation."""
+MAX_EVALUATIONS = 200
+"""Most rows of the table of evaluations."""
+MAX_SETTINGS = 300
+CURVES, TIME = "Learning curves", "Time"
+"""Headings."""
+TITLES = {"return": "Return", "success": "Success rate", "length": "Episode length"}
+"""Titles of the learning curves by the column that they show."""
+MINUS = "\N{MINUS SIGN}"
+
+
+class Tile(NamedTuple):
+    """A figure of the headline."""
+
+    title: str
+    value: str
+    note: str = ""
+    more: str = ""
+
+
+class Parts(NamedTuple):
+    """The content of a page."""
+
+    runs: list[dict[str, Any]]
+    """For the template."""
+    data: dict[str, Any]
+    """For the script."""
+
+
+def title_of(runs: Sequence[Run]) -> str:
+    """Returns the title of a page."""
+    if len(runs) > 1:
+        return f"{len(runs)} runs"
+    return f"{runs[0].env_id or runs[0].name}, {runs[0].algorithm or 'unknown algorithm'}"
+
+
+@np.errstate(all="ignore")  # files may hold any number
+def build(runs: Sequence[Run], folder: Path | None) -> Parts:
+    """Returns the content of a report; ``folder`` as for :func:`rejeu.lab.reporting.report.render`."""
+    parts, budget = [], BUDGET
+    charts: dict[str, Any] = {}
+    histograms: dict[str, Any] = {}
+    for i, run in enumerate(runs):
+        own_charts, groups = charts_of(run, f"run{i}")
+        charts |= own_charts
+        own = {"episodes": histogram_of(run), "replays": replays_of(run)}
+        histograms |= {f"run{i}-{name}": one for name, one in own.items() if one is not None}
+        found, notes, spent = collect(run, folder, budget)
+        budget -= spent
+        parts.append(describe(run, f"run{i}", groups, found, notes, {name for name, one in own.items() if one}))
+    return Parts(parts, {"charts": charts, "histograms": histograms})
+
+
+def charts_of(run: Run, prefix: str) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """Returns the charts of a run by id, and groups of their ids and titles for the template."""
+    found: list[tuple[str, str, str, Any]] = [
+        (CURVES, column, title, chart_data.episode_chart(run.episodes, run.evaluations, column))
+        for column, title in TITLES.items()
+    ]
+    for i, (name, chart) in enumerate(chart_data.metric_charts(run.metrics).items()):
+        found.append((chart_data.group_of(name), f"metric{i}", shown(name), chart))
+    found.append((TIME, "time", "Shares of the time", chart_data.time_chart(run.metrics)))
+    charts: dict[str, Any] = {}
+    groups: dict[str, list[dict[str, str]]] = {heading: [] for heading in (CURVES, *chart_data.GROUPS, TIME)}
+    for heading, key, title, chart in found:
+        if chart is not None:
+            charts[f"{prefix}-{key}"] = chart
+            groups[heading].append({"id": f"{prefix}-{key}", "title": title, "note": chart["note"]})
+    return charts, [{"title": heading, "charts": entries} for heading, entries in groups.items() if entries]
+
+
+def histogram_of(run: Run) -> dict[str, Any] | None:
+    """Returns the histogram of the training episodes."""
+    episodes = run.episodes
+    columns = {
+        "episode": np.arange(1, len(episodes) + 1),
+        "step": episodes.step,
+        "environment": episodes.env,
+        "return": episodes.returns,
+        "length": episodes.length,
+        "success": episodes.success,
+    }
+    return chart_data.histogram(episodes.returns, columns)
+
+
+def replays_of(run: Run) -> dict[str, Any] | None:
+    """Returns the histogram of the episodes that the trained agent played from known seeds; None without any."""
+    columns = {name: run.replays.column(name) for name in ("seed", "return", "length", "success")}
+    return chart_data.histogram(columns["return"], columns, replay_command(run))
+
+
+def describe(
+    run: Run, key: str, groups: list[dict[str, Any]], found: list[Video], notes: list[str], histograms: set[str]
+) -> dict[str, Any]:
+    """Returns what the template shows of a run."""
+    rows = hyperparameters(run)
+    return {
+        "id": key,
+        "name": run.name,
+        "env": run.env_id or "unknown environment",
+        "algorithm": run.algorithm or "unknown algorithm",
+        "state": run.state,
+        "state_text": "state unknown" if run.state == "unknown" else run.state,
+        "tiles": tiles(run),
+        "facts": facts(run),
+        "groups": groups,
+        "videos": found,
+        "other_videos": max(len(run.videos) - len(found), 0),
+        "histograms": histograms,
+        "evaluations": evaluation_rows(run),
+        "has_success": bool(np.isfinite(run.evaluations.column("success_rate")).any()),
+        "evaluations_note": evaluations_note(run),
+        "settings": settings(run),
+        "changed": [row for row in rows if row["changed"]],
+        "unchanged": [row for row in rows if not row["changed"]],
+        "versions": [(shown(name), shown(value)) for name, value in run.versions.items()],
+        "warnings": [*run.warnings],
+        "notes": [*run.notes, *notes],
+        "command": run.command,
+        "replay_command": f"rejeu report {path_word(run.path)} --replay 100{env_options(run)}"
+        if run.format == "rejeu" and run.models
+        else "",
+    }
+
+
+def number(value: float, digits: int = 2) -> str:
+    """Returns a number for people: with separators and a typographic minus sign, a dash if it is unknown.
+
+    >>> number(-1234.5), number(math.nan), number(1e12)
+    ('−1,234.50', '–', '1e+12')
+    """
+    if not math.isfinite(value):
+        return "\N{EN DASH}"
+    text = f"{value:,.{digits}f}" if abs(value) < 1e9 else f"{value:.4g}"
+    return text.replace("-", MINUS, 1)
+
+
+def percent(value: float) -> str:
+    """Returns a share as a percentage, a dash if it is unknown."""
+    return f"{number(100 * value, 1)} %" if math.isfinite(value) else "\N{EN DASH}"
+
+
+def between(low: float, high: float, as_text: Any = number) -> str:
+    """Returns an interval, empty if it is unknown."""
+    return f"{as_text(low)} to {as_text(high)}" if math.isfinite(low) and math.isfinite(high) else ""
+
+
+def duration(seconds: float) -> str:
+    """Returns a time in words, a dash if it is unknown.
+
+    >>> duration(75), duration(4000), duration(7.25)
+    ('1 min 15 s', '1 h 6 min', '7.2 s')
+    """
+    if not math.isfinite(seconds) or seconds < 0:
+        return "\N{EN DASH}"
+    if seconds < 60:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours:,} h {minutes} min" if hours else f"{minutes} min {rest} s"
+
+
+def tiles(run: Run) -> list[Tile]:
+    """Returns the figures of the headline."""
+    mean, found = run.evaluations.column("mean_return"), []
+    best = best_row(run.evaluations)
+    if best is not None:
+        found += evaluation_tiles(run, "Best evaluation", best)
+        newest = "Newest evaluation" if run.state == "running" else "Final evaluation"
+        found += evaluation_tiles(run, newest, int(np.flatnonzero(np.isfinite(mean))[-1]))
+    else:
+        found += training_tiles(run)
+    done = f"of {run.steps_asked:,}" if run.steps_asked else ""
+    time = f"of {duration(60 * run.minutes_asked)}" if run.minutes_asked else ""
+    return [
+        *found,
+        Tile("Environment steps", f"{run.steps:,}", done),
+        Tile("Training time", duration(run.seconds), time),
+    ]
+
+
+def evaluation_tiles(run: Run, title: str, row: int) -> list[Tile]:
+    """Returns the figures of one evaluation: the success rate, if it is known, with the return below, else the return."""
+    table = run.evaluations
+    mean, rate = table.column("mean_return")[row], table.column("success_rate")[row]
+    at = f"step {number(table.column('step')[row], 0)}"
+    low, high = (end[row] for end in chart_data.interval(table, "return"))
+    interval = between(low, high)
+    if math.isfinite(rate):
+        least, most = (end[row] for end in chart_data.interval(table, "success"))
+        note = f"success, 95 % interval {between(least, most, percent)}" if math.isfinite(least) else "success"
+        more = f"return {number(mean)}" + (f" ({interval})" if interval else "")
+        return [Tile(f"{title}, {at}", percent(rate), note, more)]
+    note = f"return, 95 % interval {interval}" if interval else "return"
+    return [Tile(f"{title}, {at}", number(mean), note)]
+
+
+def training_tiles(run: Run) -> list[Tile]:
+    """Returns the figures of the last training episodes of a run without evaluations."""
+    returns = run.episodes.returns[-LAST:]
+    returns = returns[np.isfinite(returns)]
+    if not len(returns):
+        return [Tile("Evaluation", "\N{EN DASH}", "none yet")]
+    title = f"Last {counted(len(returns), 'training episode')}"
+    return [Tile(title, number(float(np.mean(returns))), "return; no evaluation yet")]
+
+
+def facts(run: Run) -> list[str]:
+    """Returns the line below the headline."""
+    backend = None if run.config is None else run.config.backend
+    found = [counted(len(run.episodes), "episode")]
+    found += [f"seed {run.seed}"] if run.seed is not None else []
+    found += [f"{counted(run.n_envs, 'environment')} at once"] if run.n_envs else []
+    found += [f"{shown(backend)} backend"] if backend else []
+    found += [f"{run.steps / run.seconds:,.0f} steps/s"] if run.seconds > 0 else []
+    return found
+
+
+def evaluation_rows(run: Run) -> list[dict[str, Any]]:
+    """Returns the table of evaluations; of many rows the best and others, evenly spaced."""
+    table = run.evaluations
+    (low, high), (least, most) = chart_data.interval(table, "return"), chart_data.interval(table, "success")
+    best = best_row(table)
+    return [
+        {
+            "step": number(table.column("step")[row], 0),
+            "success": percent(table.column("success_rate")[row]),
+            "success_interval": between(least[row], most[row], percent),
+            "return": number(table.column("mean_return")[row]),
+            "return_interval": between(low[row], high[row]),
+            "deviation": number(table.column("std_return")[row]),
+            "length": number(table.column("mean_length")[row], 1),
+            "episodes": number(table.column("episodes")[row], 0),
+            "time": duration(table.column("seconds")[row]),
+            "best": row == best,
+        }
+        for row in chart_data.thinned(len(table), MAX_EVALUATIONS).tolist()
+    ]
+
+
+def evaluations_note(run: Run) -> str:
+    """Returns which evaluations are listed; empty if all are."""
+    n = len(run.evaluations)
+    return f"{MAX_EVALUATIONS} of {n:,} evaluations, evenly spaced" if n > MAX_EVALUATIONS else ""
+
+
+def value_text(value: Any) -> str:
+    """Returns a value of a configuration as text; a schedule in words.
+
+    >>> value_text({"schedule": "linear", "start": 0.2, "end": 0.0, "fraction": 1.0}), value_text(None)
+    ('linear: start 0.2, end 0.0, fraction 1.0', 'None')
+    """
+    if isinstance(value, dict) and isinstance(kind := value.get("schedule", value.get("noise")), str):
+        rest = ", ".join(
+            f"{name} {value_text(part)}" for name, part in value.items() if name not in ("schedule", "noise")
+        )
+        return shown(f"{kind}: {rest}", 200)
+    if value is None or isinstance(value, bool):
+        return str(value)
+    return shown(value if isinstance(value, str) else json.dumps(value), 200)
+
+
+def hyperparameters(run: Run) -> list[dict[str, Any]]:
+    """Returns all hyperparameters, and which differ from the default."""
+    return [
+        {
+            "name": shown(name),
+            "value": value_text(value),
+            "changed": name in run.changed,
+            "default": value_text(run.changed[name][1]) if name in run.changed else "",
+        }
+        for name, value in list(flat(run.hyperparameters))[:MAX_SETTINGS]
+    ]
+
+
+def settings(run: Run) -> list[tuple[str, str]]:
+    """Returns the configuration of the run without the hyperparameters, where it differs from what is usual."""
+    if run.config is None:
+        return []
+    usual = asdict(RunConfig(env=""))
+    hidden = ("hyperparameters", "env", "algorithm")
+    rows = [(name, value) for name, value in asdict(run.config).items() if name not in hidden and value != usual[name]]
+    return [(name, value_text(value)) for name, value in rows]
+
+
+def replay_command(run: Run) -> str:
+    """Returns the command that shows episodes of the trained agent; empty if there is no model."""
+    if run.format != "rejeu" or not run.models:
+        return ""
+    which = "" if "best.safetensors" in run.models else " --which last"
+    return f"rejeu watch {path_word(run.path)}{which} --seed N --episodes 1{env_options(run)}"
+
+
+def env_options(run: Run) -> str:
+    """Returns what commands about the run need to make its environment again, and to import; empty if its id is enough."""
+    return "".join(f" {quoted(shown(word, MAX_WORD))}" for word in run.environment_words())
+
+
+def path_word(path: Path) -> str:
+    """Returns a path as a word of a command line, relative to the current folder if it is inside."""
+    here = Path.cwd()
+    return quoted(shown(path.relative_to(here) if path.is_relative_to(here) else path, 500))
+
+
+BUDGET = 5 * 2**19
+"""Bytes of videos in a page; in base64 they take a third more."""
+BEST = "video.mp4"
+
+
+class Video(NamedTuple):
+    """A video as a page shows it."""
+
+    title: str
+    name: str
+    source: str
+    """A data URL, empty if it is not embedded."""
+    link: str
+    """A relative link, empty if there is none."""
+    megabytes: float
+
+
+def collect(run: Run, folder: Path | None, budget: int) -> tuple[list[Video], list[str], int]:
+    """Returns first, last and best video of a run, notes on damaged ones, and the bytes that were embedded.
+
+    Args:
+        run: the run.
+        folder: where the page will be, for relative links; None for no links.
+        budget: most bytes to embed.
+    """
+    during = [path for path in run.videos if path.name != BEST]
+    chosen = {path: "Best model" for path in run.videos if path.name == BEST}  # first, as the budget may not be enough
+    chosen |= dict.fromkeys(during[-1:], "Last") | dict.fromkeys(during[:-1][:1], "First")
+    found, notes, spent = [], [], 0
+    for path, title in chosen.items():
+        try:
+            size = path.stat().st_size
+            content = read_bytes(path, min(size, budget - spent + 1))
+        except OSError as error:
+            notes.append(f"{shown(path.name)} cannot be read: {shown(error.strerror or error)}")
+            continue
+        if content[4:8] != b"ftyp":
+            notes.append(f"{shown(path.name)} is no mp4 video")
+            continue
+        source = ""
+        if size <= budget - spent:
+            source = "data:video/mp4;base64," + base64.b64encode(content).decode("ascii")
+            spent += size
+        step = re.fullmatch(r"step_(\d{1,15})\.mp4", path.name)
+        label = f"{title} (step {int(step[1]):,})" if step else title
+        found.append(Video(label, shown(path.name), source, link_to(path, folder), size / 2**20))
+    return found[::-1], notes, spent
+
+
+def link_to(path: Path, folder: Path | None) -> str:
+    """Returns a relative link to a file, empty if there is none.
+
+    >>> link_to(Path("/runs/a/javascript:x.mp4"), Path("/runs"))
+    './a/javascript%3Ax.mp4'
+    """
+    if folder is None:
+        return ""
+    try:
+        relative = Path(os.path.relpath(path, folder.resolve()))
+    except ValueError:  # on another drive
+        return ""
+    return "./" + quote(relative.as_posix().encode("utf-8", "surrogateescape"))

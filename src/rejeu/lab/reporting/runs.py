@@ -1,0 +1,318 @@
+"""Run folders as records that reports and comparisons are made from.
+
+Everything in a run folder is untrusted: sizes are bounded, symbolic links are not followed, nothing is imported or
+evaluated, and whatever is missing or damaged becomes a note. A folder can be read while it is being written.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import stat
+import time
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Literal
+
+import numpy as np
+from filelock import FileLock, Timeout
+
+from rejeu.agents import presets
+from rejeu.algorithms.catalog import CATALOG
+from rejeu.checkpoints.run_folder import RunFolder, newest_inside, newest_step
+from rejeu.core.errors import CheckpointError
+from rejeu.core.records import Malformed, convert, is_deep, parse_json, shown
+from rejeu.lab.runs.config import MAX_BYTES, RunConfig
+from rejeu.logs.formatting import quoted
+from rejeu.logs.tables import EMPTY, NO_EPISODES, Episodes, Table, flat, read_bytes, read_table
+
+CONFIG, EPISODES, METRICS, EVALUATIONS = "config.json", "episodes.csv", "metrics.csv", "evaluations.csv"
+WARNINGS = "warnings.txt"
+MAX_DEPTH = 20
+"""Upper limit on the levels of a ``config.json``."""
+MAX_WARNINGS = 100
+MAX_WARNINGS_BYTES = 2**16
+MAX_VIDEOS = 1000
+MAX_NAME = 200
+"""Upper limit on the length of a name or an id, in characters."""
+MAX_WORD = 10_000
+"""Upper limit on the length of a word of the command that repeats a run, in characters."""
+MAX_STEP = 2**53
+"""Upper limit on environment steps; larger numbers are damage."""
+RECENT = 60.0
+"""Seconds since the last write up to which a run without a lock counts as running."""
+
+State = Literal["running", "finished", "interrupted", "crashed", "unknown"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Run:
+    """What is known of one run; see :func:`read_run`."""
+
+    path: Path
+    name: str
+    format: Literal["rejeu", "monitor", "tensorboard"] = "rejeu"
+    """Which program's files they are: ``"monitor"`` are Stable-Baselines3's ``monitor.csv``."""
+    algorithm: str = ""
+    """Empty if unknown."""
+    env_id: str = ""
+    """Empty if unknown."""
+    env_kwargs: Mapping[str, Any] = field(default_factory=dict)
+    seed: int | None = None
+    n_envs: int | None = None
+    config: RunConfig | None = None
+    """The description of the run in ``config.json``; None if that is missing or damaged."""
+    hyperparameters: Mapping[str, Any] = field(default_factory=dict)
+    """All hyperparameters, as JSON values."""
+    versions: Mapping[str, str] = field(default_factory=dict)
+    state: State = "unknown"
+    steps: int = 0
+    """Environment steps done, by the tables and the newest checkpoint."""
+    steps_asked: int | None = None
+    """Environment steps to do; None if unknown, or if the run is limited by ``minutes_asked``."""
+    minutes_asked: float | None = None
+    seconds: float = math.nan
+    """Training time so far."""
+    episodes: Episodes = NO_EPISODES
+    evaluations: Table = EMPTY
+    """Columns ``step``, ``seconds``, ``success_rate``, ``mean_return``, ``std_return``, ``mean_length``, ``episodes``,
+    ``best``."""
+    metrics: Table = EMPTY
+    """Columns ``step``, ``rollout/...``, ``time/...``, ``train/...``."""
+    replays: Table = EMPTY
+    """Columns ``seed``, ``return``, ``length``, ``success``: episodes of the trained agent, each from its seed."""
+    warnings: tuple[str, ...] = ()
+    videos: tuple[Path, ...] = ()
+    """Paths of mp4 files inside the folder, oldest first; the video of the best model is last."""
+    models: tuple[str, ...] = ()
+    """Names of the model files, ``best.safetensors`` first."""
+    notes: tuple[str, ...] = ()
+    """One line for each thing that was missing or damaged."""
+
+    @cached_property
+    def changed(self) -> dict[str, tuple[Any, Any]]:
+        """Value and default of each hyperparameter that differs from the algorithm's default, by dotted name.
+
+        Empty if the algorithm is neither rejeu's nor registered.
+        """
+        defaults = default_hyperparameters(self.algorithm)
+        if not defaults:
+            return {}
+        default, value = dict(flat(defaults)), dict(flat(self.hyperparameters))
+        return {name: (value[name], default.get(name)) for name in value if value[name] != default.get(name)}
+
+    def environment_words(self) -> list[str]:
+        """Returns the options with which commands about the run make its environment again; empty if its id is enough."""
+        return [] if self.config is None else self.config.environment_words(option=True)
+
+    @cached_property
+    def command(self) -> str:
+        """The command that repeats the run, made from its configuration; empty if that is not known."""
+        if self.config is None or not self.algorithm:
+            return ""
+        preset = presets.find(self.env_id, self.algorithm)
+        usual = default_hyperparameters(self.algorithm, preset.hyperparameters if preset else {})
+        taken = dict(flat(usual))  # by rejeu train if nothing is set
+        values = dict(flat(self.hyperparameters))
+        same = {
+            name
+            for name in values
+            if usual and name not in self.changed and taken.get(name, values[name]) == values[name]
+        }
+        given = {name: value for name, value in values.items() if name not in same}
+        minutes = self.config.checkpoint_minutes or 0.0
+        words = replace(self.config, hyperparameters=given, checkpoint_minutes=minutes).words()
+        return " ".join(quoted(shown(word, MAX_WORD)) for word in ["rejeu", *words])
+
+
+def read_run(path: str | Path, columns: Collection[str] | None = None) -> Run:
+    """Returns what is known of the run in a folder that ``rejeu train`` wrote or is writing.
+
+    Args:
+        path: the folder.
+        columns: of the table of episodes, for speed; None for all. The others are NaN.
+
+    Raises:
+        FileNotFoundError: if there is no such folder, or it holds nothing of a run.
+    """
+    folder = Path(path)
+    if not folder.is_dir():
+        is_something = folder.exists()
+        said = f"{shown(folder, 300)} is no folder" if is_something else f"there is no run folder {shown(folder, 300)}"
+        raise FileNotFoundError(said)
+    folder = folder.resolve()
+    files = RunFolder(folder)
+    if not any((folder / name).is_file() for name in (CONFIG, EPISODES, METRICS, EVALUATIONS)):
+        raise FileNotFoundError(f"{shown(folder, 300)} is no run folder: it holds no {CONFIG}{newest_inside(folder)}")
+    config, versions, notes = read_config(files.config)
+    metrics, evaluations = (ordered(read_table(folder / name)) for name in (METRICS, EVALUATIONS))
+    metrics = statistics_rows(metrics)
+    table = ordered(read_table(folder / EPISODES, columns))
+    replays = read_table(files.replays) if is_file(files.replays) else EMPTY
+    tables = (table, metrics, evaluations)
+    times = (table.column("seconds"), metrics.column("time/time_elapsed"), evaluations.column("seconds"))
+    run = Run(
+        path=folder,
+        name=shown(folder.name, MAX_NAME),
+        versions={shown(name): shown(version) for name, version in versions.items() if version is not None},
+        steps=max(0, newest_step(files.checkpoints), *(int(part.column("step")[-1]) for part in tables if len(part))),
+        seconds=max((one[-1] for one in times if len(one) and math.isfinite(one[-1])), default=math.nan),
+        episodes=Episodes.of(table),
+        evaluations=evaluations,
+        metrics=metrics,
+        replays=replays,
+        warnings=read_warnings(files.warnings),
+        videos=tuple(find_videos(files)),
+        models=tuple(name for name in ("best.safetensors", "agent.safetensors") if is_file(folder / name)),
+        notes=(*notes, *(note for part in (*tables, replays) for note in part.notes)),
+    )
+    if config is not None:
+        run = replace(
+            run,
+            algorithm=shown(config.algorithm or "", MAX_NAME),
+            env_id=shown(config.env, MAX_NAME),
+            env_kwargs=config.env_kwargs,
+            seed=config.seed,
+            n_envs=config.n_envs,
+            config=config,
+            hyperparameters=config.hyperparameters,
+            steps_asked=config.steps,
+            minutes_asked=config.minutes,
+        )
+    return replace(run, state=state_of(run))
+
+
+def best_row(evaluations: Table) -> int | None:
+    """Returns the row of the best evaluation, by success rate and then by mean return; None if there is none."""
+    mean, rate = evaluations.column("mean_return"), evaluations.column("success_rate")
+    known = np.flatnonzero(np.isfinite(mean)).tolist()
+    return max(known, key=lambda row: (np.nan_to_num(rate[row], nan=-1.0), mean[row]), default=None)
+
+
+def statistics_rows(table: Table) -> Table:
+    """Returns a table of metrics without the rows of evaluations, which have no time.
+
+    >>> table = Table({"step": np.arange(2.0), "time/time_elapsed": np.array([0.5, np.nan]), "eval/mean_reward": np.ones(2)})
+    >>> statistics_rows(table).columns
+    {'step': array([0.]), 'time/time_elapsed': array([0.5])}
+    """
+    columns = table.columns
+    known = np.isfinite(columns.get("time/time_elapsed", np.zeros(len(table))))
+    return Table({name: values[known] for name, values in columns.items() if not name.startswith("eval/")}, table.notes)
+
+
+def read_config(path: Path) -> tuple[RunConfig | None, dict[str, str | None], list[str]]:
+    """Returns the description of a run, the versions of what ran, and notes; None and none if they are missing or damaged."""
+    try:
+        content = parse_json(read_bytes(path, MAX_BYTES))
+        if is_deep(content, MAX_DEPTH):
+            raise Malformed("it is nested too deeply")
+        return convert(content, RunConfig), convert(content.get("versions", {}), dict[str, str | None]), []
+    except FileNotFoundError:
+        return None, {}, [f"there is no {CONFIG}, so the configuration is not known"]
+    except (OSError, Malformed, CheckpointError) as error:
+        return None, {}, [f"{CONFIG} is damaged: {shown(error)}"]
+
+
+def ordered(table: Table) -> Table:
+    """Returns a table without the rows whose step is not a valid number, in the order of the steps."""
+    if "step" not in table.columns:
+        return Table({}, table.notes if not len(table) else (*table.notes, "a table lacks the column step"))
+    step = table.columns["step"]
+    columns = {name: np.where(np.isfinite(values), values, np.nan) for name, values in table.columns.items()}
+    notes = table.notes
+    valid = (step >= 0) & (step <= MAX_STEP)
+    if not valid.all():
+        columns = {name: values[valid] for name, values in columns.items()}
+        notes += (f"{np.sum(~valid):,} rows without a valid step were left out",)
+    step = columns["step"]
+    if (np.diff(step) < 0).any():
+        order = np.argsort(step, kind="stable")
+        columns = {name: values[order] for name, values in columns.items()}
+        notes += ("the steps of a table decreased; its rows were sorted",)
+    return Table(columns, notes)
+
+
+def state_of(run: Run) -> State:
+    """Returns the state of a run, from its lock and from what was written; no file is believed to say it."""
+    has_model = "agent.safetensors" in run.models
+    locks = [is_locked(path) for path in (run.path / "lock", run.path / "checkpoints" / "lock") if is_file(path)]
+    if any(locks) or (not locks and not has_model and is_recent(run.path)):
+        return "running"
+    reached_steps = run.steps_asked is not None and run.steps >= run.steps_asked
+    reached_minutes = run.minutes_asked is not None and run.seconds >= 0.98 * 60 * run.minutes_asked
+    if has_model and run.steps in run.evaluations.column("step") and (reached_steps or reached_minutes):
+        return "finished"
+    return "interrupted" if has_model else "crashed"
+
+
+def is_locked(path: Path) -> bool:
+    """Returns whether another process holds the lock on a file; the file is not changed."""
+    if os.name != "posix":
+        if not path.is_file():  # FileLock would create it
+            return False
+        try:
+            with FileLock(path).acquire(timeout=0):
+                return False
+        except Timeout:
+            return True
+        except OSError:
+            return False
+    import fcntl
+
+    try:
+        handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        return False
+    except OSError:
+        return True
+    finally:
+        os.close(handle)
+
+
+def is_recent(folder: Path) -> bool:
+    """Returns whether a table of a run was written in the last minute."""
+    files = [folder / name for name in (CONFIG, METRICS, EVALUATIONS, EPISODES)]
+    return any(0 <= time.time() - path.lstat().st_mtime < RECENT for path in files if is_file(path))
+
+
+def read_warnings(path: Path) -> tuple[str, ...]:
+    """Returns the lines of a file of warnings."""
+    try:
+        lines = read_bytes(path, MAX_WARNINGS_BYTES).decode("utf-8", "replace").splitlines()
+    except OSError:
+        return ()
+    return tuple(shown(line, 1000) for line in lines[:MAX_WARNINGS] if line.strip())
+
+
+def find_videos(folder: RunFolder) -> Iterator[Path]:
+    """Yields the mp4 files of a run folder that are not symbolic links and not in linked folders."""
+    if folder.videos.is_dir() and not folder.videos.is_symlink():
+        found = [one for one in folder.videos.iterdir() if one.suffix == ".mp4" and one.name[0] != "." and is_file(one)]
+        yield from sorted(found)[:MAX_VIDEOS]
+    if is_file(folder.video):
+        yield folder.video
+
+
+def is_file(path: Path) -> bool:
+    """Returns whether a path inside a run folder is a regular file, and no symbolic link."""
+    try:
+        return stat.S_ISREG(path.lstat().st_mode) and not path.parent.is_symlink()
+    except (OSError, ValueError):
+        return False
+
+
+def default_hyperparameters(algorithm: str, given: Mapping[str, Any] = MappingProxyType({})) -> dict[str, Any]:
+    """Returns ``given`` and the defaults of an algorithm as JSON values; empty if it is neither rejeu's nor registered."""
+    from rejeu.algorithms import config
+
+    kinds = dict(config.registered)
+    if algorithm in CATALOG:
+        kinds[algorithm] = CATALOG[algorithm].load().Config
+    return config.to_json(kinds[algorithm](**given)) if algorithm in kinds else {}

@@ -1,0 +1,179 @@
+"""Tables of numbers in CSV files. The files are untrusted: sizes are bounded, damaged rows are left out."""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+import stat
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rejeu.core.records import shown
+from rejeu.logs.formatting import counted
+
+MAX_BYTES = 2**28
+"""Upper limit on what is read of one table, in bytes; four million episodes fit."""
+MAX_COLUMNS = 512
+HUGE = 1e100
+"""Magnitude from which a return is taken for damage."""
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """Columns of numbers of the same length, and what was wrong with the file."""
+
+    columns: dict[str, np.ndarray]
+    """``float64 (n_rows,)`` by name; NaN where a cell is empty or not a number."""
+    notes: tuple[str, ...] = ()
+    """One line for each thing that was missing or damaged."""
+
+    def __len__(self) -> int:
+        return len(next(iter(self.columns.values()), ()))
+
+    def column(self, name: str) -> np.ndarray:
+        """Returns a column, NaN everywhere if the file lacks it."""
+        return self.columns[name] if name in self.columns else np.full(len(self), np.nan)
+
+
+EMPTY = Table({})
+
+
+@dataclass(frozen=True, eq=False)
+class Episodes:
+    """Episodes of training, in the order in which they ended; arrays ``float64 (n_episodes,)``."""
+
+    step: np.ndarray
+    """Environment steps, over all environments, at the end of the episode; never decreases."""
+    env: np.ndarray
+    returns: np.ndarray
+    """NaN where the file had no finite number."""
+    length: np.ndarray
+    success: np.ndarray
+    """1 for a success, 0 for none, NaN where unknown."""
+    seconds: np.ndarray
+    """Training time at the end of the episode."""
+
+    def __len__(self) -> int:
+        return len(self.step)
+
+    @classmethod
+    def of(cls, table: Table) -> Episodes:
+        """Returns the episodes of a table with the columns of ``episodes.csv``."""
+        return cls(*(table.column(name) for name in ("step", "env", "return", "length", "success", "seconds")))
+
+
+NO_EPISODES = Episodes(*[np.zeros(0)] * 6)
+
+
+def evaluation_table(evaluations: Iterable[tuple[int, Any]], episodes: Episodes = NO_EPISODES) -> Table:
+    """Returns evaluations as the table of a run, at the times that training episodes ended at.
+
+    Args:
+        evaluations: steps and :class:`rejeu.Evaluation`.
+        episodes: of training; without any the times are unknown.
+    """
+    pairs = list(evaluations)
+    steps = np.array([step for step, _ in pairs], np.float64)
+    results = [result for _, result in pairs]
+    names = ("success_rate", "mean_return", "std_return", "mean_length")
+    columns = {name: np.array([getattr(one, name) for one in results], np.float64) for name in names}
+    columns["episodes"] = np.array([len(one.returns) for one in results], np.float64)
+    if len(episodes):
+        columns["seconds"] = np.interp(steps, episodes.step, episodes.seconds)
+    return Table({"step": steps, **columns})
+
+
+def flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yields the values of nested mappings by dotted name. A schedule is one value.
+
+    >>> dict(flat({"gamma": 0.9, "policy_kwargs": {"net_arch": [8]}}))
+    {'gamma': 0.9, 'policy_kwargs.net_arch': [8]}
+    """
+    for name, value in values.items():
+        if isinstance(value, Mapping) and value and not {"schedule", "noise"} & value.keys():
+            yield from flat(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value
+
+
+def read_bytes(path: Path, limit: int) -> bytes:
+    """Returns up to ``limit`` bytes of a regular file; never follows a symbolic link and never waits.
+
+    Raises:
+        OSError: if it cannot be read, or is something else than a regular file.
+    """
+    if not stat.S_ISREG(path.lstat().st_mode):
+        raise OSError(f"{path.name} is not a regular file")
+    flags = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+    with os.fdopen(os.open(path, flags), "rb") as file:
+        return file.read(limit)
+
+
+def read_table(path: Path, only: Collection[str] | None = None, skip_lines: int = 0) -> Table:
+    """Returns the columns of a CSV file with a header line; an empty table, with a note, if there is none.
+
+    Args:
+        path: path of the file.
+        only: names of the columns to read; None for all.
+        skip_lines: lines before the header.
+    """
+    name = path.name
+    try:
+        data = read_bytes(path, MAX_BYTES + 1)
+    except FileNotFoundError:
+        return Table({}, (f"there is no {name}",))
+    except OSError as error:
+        return Table({}, (f"{name} cannot be read: {shown(error.strerror or error)}",))
+    notes = []
+    if len(data) > MAX_BYTES:
+        data = data[: data.rfind(b"\n", 0, MAX_BYTES) + 1]
+        notes.append(f"only the first {MAX_BYTES >> 20} MiB of {name} were read")
+    for _ in range(skip_lines):
+        data = data[data.find(b"\n") + 1 :]
+    header, _, body = data.partition(b"\n")
+    if not header.strip():
+        return Table({}, (*notes, f"{name} is empty"))
+    try:
+        names = next(csv.reader([header.decode("utf-8-sig", "replace").strip("\r")]), [])
+    except csv.Error:  # a carriage return, or a name of 100,000 characters
+        return Table({}, (*notes, f"the header of {name} is damaged"))
+    if len(names) > MAX_COLUMNS or len({*names}) < len(names):
+        return Table({}, (*notes, f"{name} has {len(names)} columns, expected up to {MAX_COLUMNS} of different names"))
+    if body and not body.endswith(b"\n"):
+        body = body[: body.rfind(b"\n") + 1]
+        notes.append(f"the last row of {name} is incomplete and was left out")
+    wanted = [i for i, one in enumerate(names) if only is None or one in only]
+    columns, n_bad = numbers(body, len(names), wanted)
+    if n_bad:
+        notes.append(f"left out of {name}: {counted(n_bad, 'damaged row')}")
+    return Table({names[i]: column for i, column in zip(wanted, columns, strict=True)}, tuple(notes))
+
+
+def numbers(body: bytes, n_columns: int, wanted: Sequence[int]) -> tuple[np.ndarray, int]:
+    """Returns the numbers in some columns of a CSV text, and how many rows have another number of cells than ``n_columns``.
+
+    Tables without empty or damaged cells, such as those of episodes, are read by NumPy, four times as fast.
+    """
+    if not body:
+        return np.zeros((len(wanted), 0)), 0
+    with suppress(ValueError):
+        values = np.loadtxt(io.BytesIO(body), delimiter=",", comments=None, ndmin=2)
+        if values.shape[1] == n_columns:
+            return values[:, wanted].T, 0
+    lines = body.decode("utf-8", "replace").split("\n")[:-1]
+    rows = [row for line in lines if len(row := line.rstrip("\r").split(",")) == n_columns]
+    return np.array([[number(row[i]) for row in rows] for i in wanted], np.float64), len(lines) - len(rows)
+
+
+def number(word: str) -> float:
+    """Returns a number, NaN for what is none."""
+    try:
+        return float(word)
+    except ValueError:
+        return float("nan")

@@ -1,0 +1,376 @@
+"""Hindsight experience replay: past steps, relabeled with goals that the agent reached.
+
+Source: Andrychowicz et al. 2017, "Hindsight Experience Replay" (arXiv 1707.01495). Relabeling happens when a batch is
+drawn: the share ``k / (k + 1)`` of every batch gets, in place of its own goal, an achieved goal from (section 4.5)
+
+- ``future``: a later moment of the same episode,
+- ``final``: the episode's last moment,
+- ``episode``: any moment of the same episode,
+- ``random``: any moment in the buffer,
+- ``closest``: of some later moments of the same episode the one whose achieved goal is closest to the goal (proximity, of
+  Fang et al. 2019, "Curriculum-guided Hindsight Experience Replay"),
+- ``next_future``: of every four, one the very next moment, which succeeds in one step, and three as ``future`` (Ozgur et al.
+  2025, "Next-Future", arXiv 2504.11247),
+
+and the environment's reward for that goal. Of episodes that still run, or whose beginning was overwritten, the stored
+part is used. ``terminated`` is recomputed if the environment has ``compute_terminated``, and kept otherwise: a crash
+remains a crash. Each strategy is one definition for host and device.
+"""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Callable
+from copy import deepcopy
+from dataclasses import dataclass
+from enum import Enum
+from functools import cache, partial
+from typing import Any
+
+import numpy as np
+
+from rejeu.core.algorithm import Transition
+from rejeu.envs.goals import GoalFunctions
+from rejeu.replay.prioritized import Draw, Priorities
+from rejeu.replay.ring import Ring
+from rejeu.replay.uniform import BaseReplayBuffer, NewGoals
+
+N_CANDIDATES = 8
+"""Later moments of which ``closest`` takes one. All of an episode would always choose the same."""
+N_GOALS = 4
+"""Goals of a transition of which ``next_future`` takes one from the next moment; those of the paper."""
+
+
+@dataclass(frozen=True)
+class HindsightSteps:
+    """The transitions of a batch that get new goals, as a strategy sees them; each array has an entry for each, ``(n, ...)``.
+
+    Arrays are those of NumPy with the loop of the host and those of JAX in the program on the device. Times count the
+    observations of one environment over the whole run, so only their differences matter.
+    """
+
+    np: Any
+    """The module that computes with the arrays: ``numpy`` or ``jax.numpy``."""
+    time: Any
+    """Times of the observations; ``time + 1`` is that of the next ones."""
+    first: Any
+    """The first times of the same episodes that may be chosen: those after the oldest observations that are stored. None for
+    strategies of :data:`FROM_LATER` on the host."""
+    last: Any
+    """The last times that may be chosen: those of the newest observations."""
+    achieved: Callable[[Any], Any]
+    """``achieved(times)`` returns the achieved goals of the same episodes at times ``(n,)`` or ``(n, k)``."""
+    desired: Callable[[], Any]
+    """``desired()`` returns the goals that the transitions have."""
+    integers: Callable[[Any, Any], Any]
+    """``integers(low, high)`` returns random whole numbers from ``low`` to ``high - 1``, arrays ``(n,)`` or ``(n, k)``."""
+
+    @classmethod
+    def of(
+        cls,
+        np: Any,
+        index: Callable[[Any, Any], Any],
+        env: Any,
+        times: tuple[Any, Any, Any],
+        goals_at: tuple[Callable[[Any], Any], Callable[[Any], Any]],
+        integers: Callable[[Any, Any], Any],
+    ) -> HindsightSteps:
+        """Returns transitions of the environments ``env`` ``(n,)``.
+
+        Args:
+            np: the module of the arrays.
+            index: returns positions in a ring, given environments and times.
+            env: the environments.
+            times: ``time``, ``first`` and ``last``.
+            goals_at: return the achieved and the desired goals at positions.
+            integers: as above.
+        """
+        achieved_at, desired_at = goals_at
+        achieved = lambda at: achieved_at(index(env.reshape(-1, *[1] * (at.ndim - 1)), at))  # noqa: E731
+        return cls(np, *times, achieved, lambda: desired_at(index(env, times[0])), integers)
+
+    def chosen_by(self, strategy: str | GoalStrategy) -> Any:
+        """Returns the times of the new goals that a strategy, or the one of this name, chooses."""
+        return (STRATEGIES[strategy] if isinstance(strategy, str) else strategy)(self)
+
+
+GoalStrategy = Callable[[HindsightSteps], Any]
+"""A goal strategy of your own: ``strategy(steps) -> times``, for the loop of the host and for the program on the device.
+
+The result says at which times of the same episodes the achieved goals are taken, whole numbers ``(n,)`` from
+``steps.first`` to ``steps.last``. Others are an error on the host, and the nearest allowed time on the device.
+:func:`register_goal_strategy` gives it a name, by which it is saved. A function ``(rng, time, first, last) -> times`` of
+NumPy's generator and arrays works as well, on the host only."""
+
+
+def future(steps: HindsightSteps) -> Any:
+    """Returns later times."""
+    return steps.integers(steps.time + 1, steps.last + 1)
+
+
+def final(steps: HindsightSteps) -> Any:
+    """Returns the last times."""
+    return steps.last
+
+
+def episode(steps: HindsightSteps) -> Any:
+    """Returns any times of the episodes."""
+    return steps.integers(steps.first, steps.last + 1)
+
+
+def closest(steps: HindsightSteps) -> Any:
+    """Returns the time, of :data:`N_CANDIDATES` later ones, whose achieved goal has the least distance to the goal."""
+    np = steps.np
+    times = steps.integers(np.repeat(steps.time[:, None] + 1, N_CANDIDATES, axis=1), steps.last[:, None] + 1)
+    difference = steps.achieved(times).astype("float32") - steps.desired().astype("float32")[:, None]
+    distance = np.square(difference).reshape(*times.shape, -1).sum(axis=-1)
+    return np.take_along_axis(times, distance.argmin(axis=1)[:, None], axis=1)[:, 0]
+
+
+def next_future(steps: HindsightSteps) -> Any:
+    """Returns the next time for one of :data:`N_GOALS` transitions, chosen at random, and later times for the others."""
+    nothing = steps.np.zeros_like(steps.time)
+    is_next = steps.integers(nothing, nothing + N_GOALS) == 0
+    return steps.np.where(is_next, steps.time + 1, future(steps))
+
+
+FROM_LATER = {"future": future, "final": final, "closest": closest, "next_future": next_future}
+BUILT_IN = {**FROM_LATER, "episode": episode}
+"""Without ``random``, which takes the goals of other episodes."""
+STRATEGIES: dict[str, GoalStrategy] = dict(BUILT_IN)
+"""All strategies that have a name."""
+
+
+def register_goal_strategy(name: str) -> Callable[[GoalStrategy], GoalStrategy]:
+    """Returns a decorator that gives a goal strategy a name, for ``goal_selection_strategy`` and for files.
+
+    A later registration of the same name replaces the earlier one.
+
+    >>> @register_goal_strategy("soon")
+    ... def soon(steps):
+    ...     return steps.np.minimum(steps.time + 3, steps.last)
+    """
+
+    def register(strategy: GoalStrategy) -> GoalStrategy:
+        if name == "random" or name in BUILT_IN:
+            raise ValueError(f"{name!r} is the name of a goal strategy of rejeu; choose another")
+        STRATEGIES[name] = strategy
+        return strategy
+
+    return register
+
+
+def name_of(strategy: str | Callable[..., Any]) -> str | Callable[..., Any]:
+    """Returns the name of a strategy, or the function itself if it has none."""
+    names = [name for name, known in STRATEGIES.items() if known is strategy]
+    return names[0] if names else strategy
+
+
+def takes_generator(strategy: str | Callable[..., Any]) -> bool:
+    """Returns whether a strategy is a function ``(rng, time, first, last)``, for the host only."""
+    if not callable(strategy):
+        return False
+    try:
+        inspect.signature(strategy).bind(None)
+    except TypeError:
+        return True
+    return False
+
+
+class GoalSelectionStrategy(str, Enum):
+    """Where the goals of hindsight come from; the strings do as well."""
+
+    FUTURE = "future"
+    FINAL = "final"
+    EPISODE = "episode"
+    RANDOM = "random"
+    CLOSEST = "closest"
+    NEXT_FUTURE = "next_future"
+
+
+@dataclass(frozen=True)
+class HindsightConfig:
+    """Settings of hindsight replay (Stable-Baselines3's ``replay_buffer_kwargs``)."""
+
+    n_sampled_goal: int = 4
+    """Relabeled transitions per original one. Raising it learns more from failures and less from the real goals."""
+    goal_selection_strategy: str | GoalStrategy = "future"
+    """``future``, ``final``, ``episode``, ``random``, ``closest``, ``next_future``, a ``GoalSelectionStrategy``, or a strategy
+    of your own: a function ``(steps) -> times``, or its registered name (see ``rejeu.replay.hindsight.GoalStrategy``)."""
+    copy_info_dict: bool = False
+    """Give ``compute_reward`` the info of each step, row by row, instead of an empty one. Files of the buffer and checkpoints
+    do not contain infos: after loading, those of earlier steps are empty."""
+
+    def __post_init__(self) -> None:
+        if isinstance(self.n_sampled_goal, bool) or not isinstance(self.n_sampled_goal, int) or self.n_sampled_goal < 0:
+            raise ValueError(f"n_sampled_goal={self.n_sampled_goal!r} must be a whole number of at least 0")
+        strategy = name_of(self.goal_selection_strategy)
+        if isinstance(strategy, GoalSelectionStrategy):
+            strategy = strategy.value
+        known = [*dict.fromkeys([*(one.value for one in GoalSelectionStrategy), *STRATEGIES])]
+        if not callable(strategy) and strategy not in known:
+            raise ValueError(
+                f"goal_selection_strategy={strategy!r} must be one of {', '.join(known)}, or a function (steps) -> times; the "
+                "name of a function of yours is enough if it was registered before (register_goal_strategy)"
+            )
+        object.__setattr__(self, "goal_selection_strategy", strategy)
+        if not isinstance(self.copy_info_dict, bool):
+            raise ValueError(f"copy_info_dict={self.copy_info_dict!r} must be True or False")
+
+
+def counters(config: HindsightConfig | None) -> tuple[str, ...]:
+    """Returns the counters that the ring must keep of every row for these settings, None being no hindsight.
+
+    >>> counters(HindsightConfig(goal_selection_strategy="future"))
+    ('until_end',)
+    """
+    strategy = None if config is None else config.goal_selection_strategy
+    if strategy is None or strategy == "random":
+        return ()
+    return ("until_end",) if strategy in (*FROM_LATER,) else ("since_start", "until_end")
+
+
+class HerReplayBuffer(BaseReplayBuffer):
+    """Draws transitions from a :class:`Ring`, uniformly or by priority, and gives most of them a goal that was reached.
+
+    Subclasses may override :meth:`goal_index`, which chooses these goals.
+    """
+
+    def __init__(
+        self,
+        ring: Ring,
+        gamma: float,
+        config: HindsightConfig,
+        goals: GoalFunctions,
+        n_steps: int = 1,
+        priorities: Priorities | None = None,
+        each_reward: bool = False,
+    ) -> None:
+        """Takes a ring that keeps the ``counters`` of ``config``; ``each_reward`` is as for :class:`ReplayBuffer`.
+
+        Raises:
+            ValueError: if it does not.
+        """
+        if missing := [name for name in counters(config) if name not in ring.counters]:
+            raise ValueError(
+                f"goal_selection_strategy={config.goal_selection_strategy!r} needs a ring that keeps "
+                f"{' and '.join(missing)}; make it with Ring(..., counters={counters(config)})"
+            )
+        super().__init__(ring, gamma, n_steps, priorities, each_reward)
+        self.config, self.goals = config, goals
+        paths = [leaf.path for leaf in ring.obs_leaves]
+        self.achieved = paths.index("achieved_goal")
+        self.desired = paths.index("desired_goal")
+        self.infos: Any = np.full(ring.rows * ring.n_envs, None) if config.copy_info_dict else None
+        """The info of each step, with ``copy_info_dict``."""
+        self.last_infos: Callable[[], Any] = tuple
+        """Returns the infos of the step that is added, one for each environment; set by the agent."""
+
+    def add(
+        self,
+        action: np.ndarray,
+        reward: np.ndarray,
+        terminated: np.ndarray,
+        next_obs: Any,
+        envs: np.ndarray | None = None,
+    ) -> None:
+        """Records one step of each environment; see :meth:`Ring.add`."""
+        if self.infos is not None:
+            which, last = self.ring.all_envs if envs is None else envs, self.last_infos()
+            for position, env in zip(self.ring.index(which, self.ring.head[which]), which, strict=True):
+                self.infos[position] = deepcopy(last[env]) if last else {}
+        super().add(action, reward, terminated, next_obs, envs)
+
+    def draw(
+        self, rng: np.random.Generator, shape: tuple[int, ...], progress: float = 1.0
+    ) -> tuple[Transition, Draw | None]:
+        """Returns the batch of :meth:`sample` and, with priorities, the argument of :meth:`update_priorities`.
+
+        Of each batch, the first ``k / (k + 1)`` are relabeled.
+        """
+        ring = self.ring
+        rows, weight, drawn = self.draw_rows(rng, math.prod(shape), progress)
+        read = ring.read(rows.position)
+        which = relabeled_positions(shape, self.config.n_sampled_goal)
+        index = self.goal_index(rng, rows.env[which], rows.time[which], read[0][which])
+        goal = ring.read_leaf(self.achieved, index)
+        reward = self.goals.reward
+        if self.infos is not None:
+            times = rows.time[which, None] + np.arange(self.n_steps)
+            infos = [info or {} for info in self.infos[ring.index(rows.env[which, None], times)].ravel()]
+            reward = partial(reward, infos=infos)
+        goals = NewGoals(which, goal, self.achieved, reward, self.goals.terminated)
+        return self.batch(shape, rows, read, weight, goals), drawn
+
+    def goal_index(self, rng: np.random.Generator, env: np.ndarray, time: np.ndarray, step: np.ndarray) -> np.ndarray:
+        """Returns the positions of the rows whose achieved goals become the new goals, by the strategy, ``(n,)``.
+
+        Args:
+            rng: the only source of random numbers.
+            env: environments of the relabeled rows, ``(n,)``.
+            time: their times, as in :data:`GoalStrategy`, ``(n,)``.
+            step: their records, ``(n,)``, with the :func:`counters` of the strategy: ``until_end`` is the number of steps from
+                ``time`` to the end of the episode, 0 while it runs; ``since_start`` the number since its first observation.
+        """
+        ring, strategy = self.ring, self.config.goal_selection_strategy
+        if strategy == "random":
+            other = ring.draw(rng, len(step))
+            return ring.index(other.env, other.time + 1)
+        until_end, names = step["until_end"], step.dtype.names or ()
+        last = time + np.where(until_end, until_end, ring.head[env] - time)
+        first = (
+            time - np.minimum(step["since_start"], time - ring.oldest()[env]) + 1 if "since_start" in names else None
+        )
+        if takes_generator(strategy):
+            with_generator: Any = strategy
+            return ring.index(env, checked(with_generator(rng, time, first, last), first, last))
+
+        def integers(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+            u = rng.random(np.broadcast_shapes(np.shape(low), np.shape(high)))
+            return low + (u * (high - low)).astype(np.int64)
+
+        goals_at = partial(ring.read_leaf, self.achieved), partial(ring.read_leaf, self.desired)
+        steps = HindsightSteps.of(np, ring.index, env, (time, first, last), goals_at, integers)
+        times = steps.chosen_by(strategy)
+        return ring.index(env, times if strategy in BUILT_IN else checked(times, first, last))
+
+
+@cache
+def relabeled_positions(shape: tuple[int, ...], k: int) -> slice | np.ndarray:
+    """Returns which of the flattened transitions of ``shape`` get a new goal: the first ``k / (k + 1)`` of each batch."""
+    n = int(shape[-1] * k / (k + 1))
+    if math.prod(shape) == shape[-1]:
+        return slice(n)
+    chosen = np.zeros(shape, bool)
+    chosen[..., :n] = True
+    return np.flatnonzero(chosen)
+
+
+WANTED = "goal_selection_strategy must return whole numbers from first to last, one for each transition,"
+
+
+def whole_times(times: Any, last: Any) -> Any:
+    """Returns the times that a strategy of the user's own chose, of which only shape and dtype are known on the device.
+
+    Raises:
+        ValueError: if they are not whole numbers ``(n,)``.
+    """
+    times = times if hasattr(times, "dtype") else np.asarray(times)
+    if times.shape != last.shape or times.dtype.kind not in "iu":
+        raise ValueError(f"{WANTED} of shape {last.shape}; it returned {times.dtype} of shape {times.shape}")
+    return times
+
+
+def checked(times: Any, first: Any, last: np.ndarray) -> np.ndarray:
+    """Returns the times that a strategy of the user's own chose.
+
+    Raises:
+        ValueError: if one is outside of the episode.
+    """
+    times = np.asarray(whole_times(times, last))
+    if ((times < first) | (times > last)).any():
+        wrong = np.flatnonzero((times < first) | (times > last))[0]
+        received = f"{times[wrong]} where first is {first[wrong]} and last is {last[wrong]}"
+        raise ValueError(f"{WANTED} of shape {last.shape}; it returned {received}")
+    return times

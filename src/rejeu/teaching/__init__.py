@@ -1,0 +1,1 @@
+"""Courses, games played by hand, and the ball."""

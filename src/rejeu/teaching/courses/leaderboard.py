@@ -1,0 +1,370 @@
+"""A leaderboard of a folder of students' models, in English or French.
+
+The files are untrusted: each is evaluated within limits, or named with the reason why not. Every model plays
+the same episodes: each in an environment of its own, with the same seeds for all models.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import tomllib
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import closing, suppress
+from dataclasses import dataclass, replace
+from functools import cache
+from html import escape
+from importlib import resources
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rejeu.agents import load
+from rejeu.agents.policy import policy
+from rejeu.checkpoints.run_folder import RunFolder, find_model
+from rejeu.core import checkpoint, xla
+from rejeu.core.errors import MissingExtra
+from rejeu.core.language import Language, said
+from rejeu.core.records import shown
+from rejeu.envs.make import VectorEnv
+from rejeu.envs.registry import is_plain_id
+from rejeu.logs.evaluation import Evaluation, evaluate
+
+if TYPE_CHECKING:
+    from jinja2 import Template
+
+MAX_MODELS = 1_000
+"""Upper limit on the models of a folder; the others are left out, with a line that says so."""
+MAX_BYTES = 2**28
+"""Upper limit on the size of a model."""
+NARROW_SPACE = "\N{NARROW NO-BREAK SPACE}"
+PROBLEMS = (ArithmeticError, LookupError, MemoryError, OSError, RuntimeError, TypeError, ValueError)
+"""Exceptions that a damaged or hostile model can cause."""
+
+
+@dataclass(frozen=True)
+class Model:
+    """A model that was evaluated."""
+
+    name: str
+    algorithm: str
+    steps: int
+    """Environment steps of its training."""
+    seed: int
+    evaluation: Evaluation
+    first: int = 1
+    """Best place that the intervals allow: 1 and the number of models whose whole interval is above."""
+    last: int = 1
+    """Worst place that the intervals allow."""
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """95 % confidence interval of the mean return; the mean twice for a single episode."""
+        low, high = self.evaluation.return_interval
+        return (self.evaluation.mean_return,) * 2 if math.isnan(low) else (low, high)
+
+
+@dataclass(frozen=True)
+class Leaderboard:
+    """Models by mean return, and those that could not be evaluated."""
+
+    env_id: str
+    episodes: int
+    rows: tuple[Model, ...]
+    problems: tuple[tuple[str, str], ...]
+    """Name and reason."""
+    language: Language = "en"
+    equal: tuple[tuple[str, ...], ...] = ()
+    """Names of files with the same bytes."""
+
+    @property
+    def texts(self) -> Mapping[str, Any]:
+        """The texts in its language."""
+        return texts()[self.language]
+
+
+@cache
+def texts() -> dict[str, dict[str, Any]]:
+    """Returns the texts of leaderboards by language and name."""
+    return tomllib.loads((resources.files("rejeu.teaching.courses") / "leaderboard.toml").read_text(encoding="utf-8"))
+
+
+def models(folder: Path) -> list[Path]:
+    """Returns the model files in a folder and the folders in it, sorted; symbolic links are not followed.
+
+    A run folder is one model, the best, and its checkpoints are none.
+
+    Raises:
+        FileNotFoundError: if there is no such folder, or no model in it.
+    """
+    if not folder.is_dir():
+        raise FileNotFoundError(f"there is no folder {folder}")
+    suffixes = (checkpoint.SUFFIX, ".zip")
+    files = (one for one in folder.rglob("*") if one.suffix in suffixes and one.is_file() and not one.is_symlink())
+    found = {find_model(one.parent) if is_of_run(one) else one for one in files if one.parent.name != "checkpoints"}
+    if not found:
+        raise FileNotFoundError(f"{folder} holds no {' or '.join(suffixes)} files; agent.save(name) writes them")
+    return sorted(found)
+
+
+def is_of_run(path: Path) -> bool:
+    """Returns whether a file is one of the models of a run folder."""
+    run = RunFolder(path.parent)
+    return path in (run.best, run.agent) and run.config.is_file()
+
+
+def name_of(path: Path, folder: Path, paths: Sequence[Path]) -> str:
+    """Returns the name of a model among others: its path in the folder, of a run that of the run."""
+    bare = path.parent if is_of_run(path) else path.with_suffix("")
+    is_alone = sum(other.with_suffix("") == bare for other in paths) <= 1
+    return shown((bare if is_alone else path).relative_to(folder).as_posix().replace(".", folder.name, bare == folder))
+
+
+def equal_files(paths: Sequence[Path]) -> list[list[Path]]:
+    """Returns the groups of files with the same bytes."""
+    groups: dict[bytes, list[Path]] = {}
+    for path in paths:
+        with suppress(OSError):
+            if 0 < path.stat().st_size <= MAX_BYTES:
+                groups.setdefault(hashlib.sha256(path.read_bytes()).digest(), []).append(path)
+    return [group for group in groups.values() if len(group) > 1]
+
+
+def usual_env_id(paths: Sequence[Path]) -> str:
+    """Returns the environment that most models were trained on.
+
+    Raises:
+        ValueError: if no file says.
+    """
+    ids: Counter[str] = Counter()
+    for path in paths[:MAX_MODELS]:
+        try:
+            env_id = header(path).get("env_id")
+        except PROBLEMS:
+            continue
+        if is_plain_id(env_id):
+            ids[str(env_id)] += 1
+    if not ids:
+        raise ValueError("no model says which environment it was trained on; name it: --env ID")
+    return ids.most_common(1)[0][0]
+
+
+def header(path: Path, language: Language = "en") -> dict[str, Any]:
+    """Returns the header of a model file.
+
+    Raises:
+        Unranked: if the file is too large.
+        ValueError: if it is damaged.
+        OSError: if it cannot be read.
+    """
+    size = path.stat().st_size
+    if size > MAX_BYTES:
+        raise Unranked(texts()[language]["large"].format(size=size / 2**20, most=MAX_BYTES >> 20))
+    return dict(checkpoint.read_header(path, "agent"))
+
+
+def build(
+    folder: Path,
+    paths: Sequence[Path],
+    env_id: str,
+    make_vector: Callable[[int], VectorEnv],
+    episodes: int,
+    seed: int,
+    seconds: float,
+    success_threshold: float | None = None,
+    language: Language = "en",
+    report: Callable[[str], None] = print,
+) -> Leaderboard:
+    """Evaluates every model, and returns the leaderboard.
+
+    Args:
+        folder: the names of the models are their paths in it.
+        paths: the models.
+        env_id: the environment that they must have been trained on.
+        make_vector: makes a number of environments.
+        episodes: episodes of each model.
+        seed: seed of the environments, the same for all models.
+        seconds: time of each model, without compilation. One that takes longer is not ranked.
+        success_threshold: return of a successful episode, the same for all models, if the environment does not report success;
+            None for the environment's own. That of a file is not used: its author could choose it.
+        language: of the leaderboard.
+        report: called with a line for each model.
+    """
+    done: list[Model] = []
+    problems = []
+    written, board = texts()[language], Leaderboard(env_id, episodes, (), (), language)
+    if len(paths) > MAX_MODELS:
+        problems.append((written["more"].format(n=len(paths) - MAX_MODELS), written["first"].format(n=MAX_MODELS)))
+    with closing(make_vector(episodes)) as env:
+        for path in paths[:MAX_MODELS]:
+            name = name_of(path, folder, paths)
+            try:
+                model = evaluated(name, path, env_id, env, episodes, seed, seconds, success_threshold, language)
+            except Unranked as error:
+                reason = str(error)
+            except PROBLEMS as error:
+                text = str(error).replace(f"{path}: ", "").replace(str(path), "the file") or type(error).__name__
+                reason = written["damaged"].format(reason=shown(" ".join(text.split()), 300))
+            else:
+                done.append(model)
+                cells, columns = cells_of(model, board), written["columns"]
+                found = f"{columns[5]} {cells[5]} ({columns[6]} {cells[6]})"
+                report(said("{}: {}", name, found, language=language))
+                continue
+            problems.append((name, reason))
+            report(said("{}: {}", name, reason, language=language))
+    equal = tuple(tuple(name_of(path, folder, paths) for path in group) for group in equal_files(paths[:MAX_MODELS]))
+    return replace(board, rows=ranked(done), problems=tuple(problems), equal=equal)
+
+
+class Unranked(ValueError):
+    """A model cannot be ranked; the message says why, in the language of the leaderboard."""
+
+
+def evaluated(
+    name: str,
+    path: Path,
+    env_id: str,
+    env: VectorEnv,
+    episodes: int,
+    seed: int,
+    seconds: float,
+    success_threshold: float | None,
+    language: Language,
+) -> Model:
+    """Returns a model with its evaluation.
+
+    Raises:
+        Unranked: if it is too large or of another environment, takes too long, or has returns that are not finite.
+        ValueError: if it is damaged.
+    """
+    texts_of = texts()[language]
+    trained_on = header(path, language).get("env_id")
+    if trained_on != env_id:
+        raise Unranked(texts_of["other_env"].format(said=shown(trained_on), env_id=env_id))
+    end = xla.clock() + seconds
+    agent = load(path)
+    try:
+        agent.check_spaces(env, env_id)
+    except ValueError as error:
+        raise Unranked(texts_of["spaces"].format(env_id=env_id, reason=error)) from None
+    choose = policy(agent, deterministic=True)
+
+    def within_budget(obs: Any, started: np.ndarray) -> np.ndarray:
+        if xla.clock() > end:
+            raise Unranked(texts_of["slow"].format(seconds=seconds, n=episodes))
+        return choose(obs, started)
+
+    result = evaluate(within_budget, env, episodes, success_threshold, seed)
+    if not np.isfinite(result.returns).all():
+        raise Unranked(texts_of["not_finite"])
+    return Model(name, agent.name, agent.num_timesteps, agent.seed, result)
+
+
+def ranked(models: Iterable[Model]) -> tuple[Model, ...]:
+    """Returns the models by mean return, with the places that their intervals allow."""
+    done = sorted(models, key=lambda one: (-one.evaluation.mean_return, one.name))
+    lows, highs = np.array([one.interval for one in done]).reshape(-1, 2).T
+    return tuple(
+        replace(one, first=1 + int(np.sum(lows > one.interval[1])), last=int(np.sum(highs >= one.interval[0])))
+        for one in done
+    )
+
+
+def to_dict(board: Leaderboard) -> dict[str, Any]:
+    """Returns a leaderboard as JSON values."""
+    rows = [
+        {
+            "name": row.name,
+            "algorithm": row.algorithm,
+            "steps": row.steps,
+            "seed": row.seed,
+            "places": [row.first, row.last],
+            "mean_return": (result := row.evaluation).mean_return,
+            "return_interval": [*row.interval],
+            "success_rate": None if math.isnan(result.success_rate) else result.success_rate,
+            "mean_length": result.mean_length,
+            "returns": result.returns.tolist(),
+        }
+        for row in board.rows
+    ]
+    problems = [{"name": name, "reason": reason} for name, reason in board.problems]
+    return {
+        "env_id": board.env_id,
+        "episodes": board.episodes,
+        "models": rows,
+        "not_evaluated": problems,
+        "equal_files": board.equal,
+    }
+
+
+def markdown(board: Leaderboard) -> str:
+    """Returns a leaderboard as a Markdown table."""
+    columns = board.texts["columns"]
+    rows = [columns, ["---"] * len(columns), *([quoted(cell) for cell in cells_of(row, board)] for row in board.rows)]
+    lines = ["| " + " | ".join(cells) + " |" for cells in rows]
+    lines += ["", f"{board.env_id}, {board.texts['episodes'].format(n=board.episodes)}.", ""]
+    for name, reason in board.problems:
+        lines.append(said("{}: {}", f"- {quoted(name)}", quoted(reason), language=board.language))
+    lines += [f"- {board.texts['equal']}{quoted(', '.join(names))}" for names in board.equal]
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def cells_of(row: Model, board: Leaderboard) -> list[str]:
+    """Returns the cells of a row, in the order of the columns."""
+    to, result = board.texts["to"], row.evaluation
+    low, high = row.interval
+    place = f"{row.first}" if row.first == row.last else f"{row.first} {to} {row.last}"
+    numbers = [
+        f"{row.steps:,}",
+        f"{row.seed}",
+        f"{result.mean_return:,.1f}",
+        f"{low:,.1f} {to} {high:,.1f}",
+        "" if math.isnan(result.success_rate) else f"{result.success_rate:.0%}",
+        f"{result.mean_length:,.0f}",
+    ]
+    if board.language == "fr":
+        numbers = [one.replace(",", NARROW_SPACE).replace(".", ",").replace("%", f"{NARROW_SPACE}%") for one in numbers]
+    return [place, row.name, row.algorithm, *numbers]
+
+
+def quoted(text: str) -> str:
+    r"""Returns a text that Markdown shows as it is.
+
+    >>> quoted("a|b <b>*x*")
+    'a\\|b &lt;b&gt;\\*x\\*'
+    """
+    return "".join(f"\\{c}" if c in "\\|*_[]`#~!" else c for c in escape(text, quote=False))
+
+
+def page(board: Leaderboard) -> str:
+    """Returns a leaderboard as an HTML page that needs no network.
+
+    Raises:
+        MissingExtra: if Jinja2 is not installed.
+    """
+    ends = [end for row in board.rows for end in row.interval] or [0.0]
+    low, width = min(ends), max(max(ends) - min(ends), 1e-9)
+    means = [row.evaluation.mean_return for row in board.rows]
+    bars = [
+        [100 * (end - low) / width for end in (*row.interval, mean)]
+        for row, mean in zip(board.rows, means, strict=True)
+    ]
+    rows = [(cells_of(row, board), bar) for row, bar in zip(board.rows, bars, strict=True)]
+    return f"{template().render(board=board, texts=board.texts, rows=rows)}\n"
+
+
+def template() -> Template:
+    """Returns the template of the page.
+
+    Raises:
+        MissingExtra: if Jinja2 is not installed.
+    """
+    try:
+        from jinja2 import Environment
+    except ImportError:
+        raise MissingExtra("the page", "jinja2", "course") from None
+    text = (resources.files("rejeu.teaching.courses") / "leaderboard.html").read_text(encoding="utf-8")
+    return Environment(autoescape=True).from_string(text)

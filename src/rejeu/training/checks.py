@@ -1,0 +1,149 @@
+"""Checks of the loops: of what environments return, and of the state before training."""
+
+from __future__ import annotations
+
+import math
+import warnings
+
+import jax
+import numpy as np
+
+from rejeu.core.algorithm import Masked, PyTree
+from rejeu.core.errors import BadEnvironmentError, NonFiniteError
+from rejeu.core.spaces import leaves
+from rejeu.envs import validation
+from rejeu.envs.base import Step
+from rejeu.training.learner import Learner
+from rejeu.training.run import Run, timed
+
+VDOT_SIZE = 2**13
+"""Number of elements up to which an array is checked by its square; beyond it BLAS would use its threads."""
+
+
+@timed("env")
+def checked_step(run: Run, action: np.ndarray, active: np.ndarray | None = None) -> Step:
+    """Steps the environments, or those that are ``active``, and checks what they return, bounds from time to time.
+
+    Where environments do not wait for each other, the result is that of the first ``wait_for``.
+
+    Raises:
+        BadEnvironmentError, NonFiniteError, NonFiniteUpdate: as :func:`check_finite`.
+    """
+    if run.env.wait_for is None:
+        step = run.env.step(action, active)
+    else:
+        run.env.send(action)
+        step = run.env.receive()
+    check_finite(run, step, run.step)
+    if run.step >= run.next_look:
+        check_bounds(run, step.obs)
+    return step
+
+
+def is_finite(array: np.ndarray) -> bool:
+    """Returns whether all numbers are finite. For small arrays the square is the fastest check."""
+    if array.dtype.kind != "f":
+        return True
+    if array.size <= VDOT_SIZE and math.isfinite(np.vdot(array, array)):
+        return True
+    return bool(np.isfinite(array).all())
+
+
+def check_finite(run: Run, step: Step, taken: int) -> None:
+    """Checks the rewards and observations of a step after ``taken`` steps.
+
+    Raises:
+        BadEnvironmentError: if a reward or an observation is NaN or infinite: nothing can be learned from it.
+        NonFiniteError: if the agent's own action was not finite, so that the environment is not to blame.
+        NonFiniteUpdate: if that action came from weights that an update left not finite.
+    """
+    if not is_finite(step.reward):
+        raise _reward_error(run, step.reward, taken)
+    check_obs(run, step.obs, taken, "returned")
+
+
+@timed("env")
+def checked_reset(run: Run, done: np.ndarray) -> PyTree:
+    """Starts new episodes in the environments where ``done`` and returns the observations of all.
+
+    Raises:
+        BadEnvironmentError: if one of them is not finite.
+    """
+    obs = run.env.reset_done(done)
+    check_obs(run, obs, run.step, "reset returned")
+    return obs
+
+
+def check_obs(run: Run, obs: PyTree, taken: int, what: str) -> None:
+    """Raises ``BadEnvironmentError`` if an observation ``(n_envs, ...)`` is NaN or infinite; see :func:`check_finite`."""
+    for i, array in enumerate(jax.tree.leaves(obs)):
+        if not is_finite(array):
+            raise _observation_error(run, i, array, taken, what)
+
+
+def check_bounds(run: Run, obs: PyTree) -> None:
+    """Warns once in a run if an observation ``(n_envs, ...)`` lies far outside of the declared bounds.
+
+    The interval between two checks doubles each time, because a check takes longer than a step of some environments.
+    """
+    run.next_look = 2 * run.step + 1
+    fault = validation.far_outside(run.env.observation_space, obs.obs if isinstance(obs, Masked) else obs)
+    if fault is not None:
+        run.next_look = math.inf
+        warnings.warn(
+            f"{run.env.env_id} returned {fault}, after {run.step} steps. Networks learn badly from large numbers: scale the "
+            "observations, or set normalize=True if it is not, and declare the bounds that they really have",
+            UserWarning,
+            stacklevel=2,
+        )
+
+
+def _reward_error(run: Run, reward: np.ndarray, taken: int) -> Exception:
+    _check_action(run, taken)
+    which = int(np.flatnonzero(~np.isfinite(reward))[0])
+    return BadEnvironmentError(
+        f"{run.env.env_id} returned the reward {reward[which]} in environment {which} after {taken} steps; rewards must be "
+        "finite numbers: fix the environment, or wrap it with gymnasium.wrappers.TransformReward"
+    )
+
+
+def _observation_error(run: Run, leaf: int, array: np.ndarray, taken: int, what: str) -> Exception:
+    _check_action(run, taken)
+    where = tuple(np.argwhere(~np.isfinite(array))[0].tolist())
+    path, at = leaves(run.env.observation_space)[leaf].path, ", ".join(map(str, where[1:]))
+    return BadEnvironmentError(
+        f"{run.env.env_id}: {what} an observation with {array[where]}{f' at [{at}]' if at else ''}"
+        f"{f' of {path!r}' if path else ''} in environment {where[0]} after {taken} steps; observations must be finite "
+        "numbers: fix the environment, or wrap it with gymnasium.wrappers.TransformObservation and np.nan_to_num"
+    )
+
+
+def _check_action(run: Run, taken: int) -> None:
+    if run.action is not None and not is_finite(run.action):
+        run.monitor.read()
+        which = int(np.argwhere(~np.isfinite(run.action))[0][0])
+        raise NonFiniteError(
+            f"the policy chose the action {run.action[which]} in environment {which} after {taken} steps, and "
+            f"{run.env.env_id} answered with numbers that are not finite. The weights are finite, what they compute is not: "
+            "they or the observations are too large; lower learning_rate, or set normalize=True",
+            names=("action",),
+            step=taken,
+            n_updates=run.n_updates,
+        )
+
+
+def check_state(run: Run, learner: Learner) -> None:
+    """Raises ``NonFiniteError`` if the state is not finite when training begins; waits for the device."""
+    if bad := learner.bad_leaves(run.state):
+        raise _state_error(run, bad)
+
+
+def _state_error(run: Run, bad: list[str]) -> Exception:
+    more = f" and {len(bad) - 1} more of its arrays are" if len(bad) > 1 else " is"
+    return NonFiniteError(
+        f"{bad[0]} of the agent's state{more} not finite before learning begins (step {run.step}, update "
+        f"{run.n_updates}); set_parameters or a file put them there: give it finite numbers, or load another model",
+        names=[text.split(" ")[0] for text in bad],
+        step=run.step,
+        n_updates=run.n_updates,
+    )

@@ -1,0 +1,150 @@
+"""On-policy learning in one program: the turns of :mod:`rejeu.training.on_policy`, on the device.
+
+Everything happens in the order of the host's loop, with the same functions of the algorithm and the same keys.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from rejeu.algorithms.rollout_config import RolloutConfig
+from rejeu.core.algorithm import Clock, Rollout
+from rejeu.core.prng import nth
+from rejeu.envs.functional.protocol import FunctionalEnv
+from rejeu.training.compiled.program import Carry, Limits, Loop, Program, capacity_of, step_envs
+from rejeu.training.on_policy import begin_episodes
+from rejeu.training.run import Run
+
+
+class Counts(NamedTuple):
+    """Counters of a run, equal for all seeds."""
+
+    step: Array
+    """Environment steps, ``uint32[]``."""
+    length: Array
+    """Turns of the current rollout, ``int32[]``."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class OnPolicyProgram(Program):
+    """Turns that fill a rollout, and updates on all of it."""
+
+    @classmethod
+    def of(cls, run: Run, config: RolloutConfig, **settings: Any) -> OnPolicyProgram:
+        """Returns the program for runs like ``run``."""
+        return cls(config=config, capacity=capacity_of(run.env.n_envs), **settings)
+
+    def batch(self, env: FunctionalEnv, carry: Carry, experience: Rollout, clock: Clock, number: Any) -> Rollout:
+        return rollout_of(experience, carry.counts.length)
+
+    def turns(self, env: FunctionalEnv, loop: Loop, limits: Limits, may_go_on: Callable[[Array, Loop], Array]) -> Loop:
+        n_steps = self.config.n_steps
+
+        def fills(inner: tuple[Array, Loop]) -> Array:
+            return may_go_on(*inner) & (inner[1].carry.counts.length < n_steps)
+
+        def one_turn(inner: tuple[Array, Loop]) -> tuple[Array, Loop]:
+            i, loop = inner
+            return i + 1, take_turn(self, env, loop, limits, i)
+
+        def one_rollout(outer: tuple[Array, Loop, Array]) -> tuple[Array, Loop, Array]:
+            i, loop = jax.lax.while_loop(fills, one_turn, outer[:2])
+            counts = loop.carry.counts
+            is_done = (counts.length == n_steps) | (limits.uses_part & (counts.step == limits.last))
+            is_done &= outer[2] < limits.most_updates
+            clock = Clock(counts.step, loop.carry.episodes.n_finished, limits.progress[i])
+            loop = jax.lax.cond(is_done, lambda loop: end_of_rollout(self, loop, clock), lambda loop: loop, loop)
+            return i, loop, outer[2] + is_done
+
+        begin = (jnp.int32(0), loop, jnp.int32(0))
+        return jax.lax.while_loop(lambda outer: may_go_on(*outer[:2]), one_rollout, begin)[1]
+
+    def begin_episodes(self, run: Run) -> None:
+        begin_episodes(run, self.config)
+
+    def uses_part(self, run: Run, n_turns: int, last: int | None) -> bool:
+        """Returns whether the rollout that is under way at the step ``last`` is learned from.
+
+        It begins in this chunk or holds the steps of the buffer.
+        """
+        n_steps, n_envs = self.config.n_steps, run.env.n_envs
+        if last is None or run.step + n_turns * n_envs < last:
+            return False
+        length = run.replay.length
+        turns, size = (length + n_turns) % n_steps, run.replay.size() + last - run.step
+        if length + n_turns >= n_steps:
+            size = turns * n_envs - (run.step + n_turns * n_envs - last)
+        return bool(turns) and self.config.learns_from_part(size, n_envs)
+
+    def counts_of(self, run: Run) -> Counts:
+        return Counts(jnp.uint32(run.step), jnp.int32(run.replay.length))
+
+    def action_of(self, run: Run) -> None:
+        return None
+
+    def rows_changed(self, n_turns: int) -> None:
+        return None
+
+    def uploaded(self, run: Run) -> Rollout:
+        steps: Any = jax.tree.map(jnp.array, run.replay.rollout())
+        return steps if steps.carry != () else steps._replace(carry=jax.tree.map(jnp.array, run.carry))
+
+    def download(self, run: Run, experience: Rollout, counts: Counts) -> None:
+        buffer, n = run.buffer, int(counts.length)
+        buffer.length = n
+        buffer.started, buffer.carry = np.array(experience.started), jax.tree.map(jnp.array, experience.carry)
+        if n:
+            own, found = (
+                jax.tree.leaves(one._replace(started=None, carry=None)) for one in (buffer.rollout(), experience)
+            )
+            for host, device in zip(own, found, strict=True):
+                host[:n] = np.asarray(device)[:n]
+
+    def pull_counts(self, run: Run, carry: Carry) -> None:
+        """Does nothing: the length of the rollout is copied with it."""
+
+
+def take_turn(program: OnPolicyProgram, env: FunctionalEnv, loop: Loop, limits: Limits, i: Array) -> Loop:
+    """Returns what the ``i``-th turn of a chunk passes on, apart from the update."""
+    config, carry, steps = program.config, loop.carry, loop.experience
+    counts, before, t = carry.counts, carry.episodes, carry.counts.length
+    clock = Clock(counts.step, before.n_finished, limits.progress[i])
+    actor, key = program.algorithm.actor(loop.learned.state), nth(carry.key, clock.step)
+    action, explorer = program.explorer.act(carry.explorer, actor, before.obs, before.ended, key, clock)
+    action = action.astype(steps.action.dtype)
+    loop = step_envs(program, env, loop, action, limits, i)
+    result, episodes = loop.result, loop.carry.episodes
+    put = lambda stores, values: jax.tree.map(lambda s, v: s.at[t].set(v.astype(s.dtype)), stores, values)  # noqa: E731
+    steps = steps._replace(
+        obs=put(steps.obs, before.obs),
+        next_obs=put(steps.next_obs, result.obs),
+        action=put(steps.action, action),
+        reward=put(steps.reward, result.reward),
+        discount=put(steps.discount, jnp.where(result.terminated, 0.0, config.gamma)),
+        ended=put(steps.ended, episodes.ended),
+        valid=put(steps.valid, result.kept),
+        running_return=put(steps.running_return, episodes.running_return),
+    )
+    counts = Counts(counts.step + jnp.sum(result.kept, dtype=jnp.uint32), t + 1)
+    return loop._replace(carry=loop.carry._replace(explorer=explorer, counts=counts), experience=steps)
+
+
+def end_of_rollout(program: OnPolicyProgram, loop: Loop, clock: Clock) -> Loop:
+    """Returns what is passed on after learning from the rollout; the next one begins."""
+    carry = loop.carry
+    learned, _ = program.learn(loop.learned, rollout_of(loop.experience, carry.counts.length), clock)
+    steps = loop.experience._replace(started=carry.episodes.ended, carry=carry.explorer)
+    counts = carry.counts._replace(length=jnp.zeros_like(carry.counts.length))
+    return loop._replace(carry=carry._replace(counts=counts), experience=steps, learned=learned)
+
+
+def rollout_of(steps: Rollout, length: Any) -> Rollout:
+    """Returns the first ``length`` steps as the update takes them."""
+    return steps._replace(valid=steps.valid & (jnp.arange(len(steps.valid)) < length)[:, None])

@@ -1,0 +1,447 @@
+"""What the programs of all loops on the device share: chunks of turns, in which environments step and episodes are counted.
+
+A :class:`Program` also says how a run of the host becomes its arguments, and how experience comes back.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from rejeu.core import spaces
+from rejeu.core.algorithm import (
+    GRADIENT_STEPS,
+    TD_ERROR,
+    Algorithm,
+    Clock,
+    Explorer,
+    Masked,
+    Metrics,
+    PyTree,
+    Rollout,
+    Transition,
+)
+from rejeu.core.prng import below
+from rejeu.envs.functional.protocol import FunctionalEnv
+from rejeu.envs.functional.vector import VectorState, reset_done, step_all
+from rejeu.envs.masks import FunctionalMask, masked
+from rejeu.training.finite import MAX_SKIPPED
+from rejeu.training.learner import FINITE, Packing, check, td_error_of, undo
+from rejeu.training.run import Run
+
+MAX_TURNS = 1000
+"""Turns of a chunk at most. Chunks also end at multiples of it, where the best weights are looked for."""
+LOG_SIZE = 2**18
+"""Entries of a chunk's log of episodes at most: turns times environments."""
+NO_LIMIT = 2**32 - 1
+"""The value for no last step; steps are counted in ``uint32``."""
+
+Remake = Callable[[Any], tuple[Algorithm, Explorer]]
+"""Makes the algorithm of a configuration, and its exploration."""
+
+
+class Limits(NamedTuple):
+    """The limits of a chunk."""
+
+    n_turns: Any
+    """Turns to take, ``int32[]``."""
+    last: Any
+    """Total environment steps at which training ends, ``uint32[]``, ``NO_LIMIT`` for never."""
+    progress: Any
+    """Progress of schedules after 0, 1, ... turns of the chunk, ``float32 (capacity + 1,)``."""
+    most_updates: Any
+    """Gradient steps of a turn at most, or updates from rollouts, ``int32[]``; used to find the one that left NaN."""
+    learn_from: Any
+    """The environment step after which off-policy updates begin, ``uint32[]``."""
+    uses_part: Any
+    """Whether an incomplete rollout is learned from at the last step, ``bool[]``."""
+
+
+class EpisodeLog(NamedTuple):
+    """The episodes that ended in a chunk, by turn and environment, ``(capacity, n_envs)``."""
+
+    length: Array
+    """Their steps, ``int32``; 0 where none ended."""
+    episode_return: Array
+    """``float32``, where one ended."""
+    success: Array
+    """1 or 0 where one ended, NaN if the environment does not say, ``float32``."""
+
+
+class EpisodeState(NamedTuple):
+    """The environments and their running episodes."""
+
+    env: VectorState | None
+    """None where the other fields are on the host."""
+    obs: PyTree
+    """The current observations, in the dtypes of the agent's leaves."""
+    ended: Array
+    """Where the last turn ended an episode, ``bool (n_envs,)``."""
+    episode_return: Array
+    """Sum of the rewards of the running episode, ``float32 (n_envs,)``."""
+    length: Array
+    """Its steps, ``int32 (n_envs,)``."""
+    running_return: Array
+    """The discounted sum of its rewards, ``float32 (n_envs,)``."""
+    n_finished: Array
+    """Episodes finished, ``uint32[]``."""
+
+
+class StepResult(NamedTuple):
+    """The result of one step of all environments."""
+
+    obs: PyTree
+    """True successors."""
+    reward: Array
+    """``float32 (n_envs,)``."""
+    terminated: Array
+    truncated: Array
+    kept: Array
+    """Which of the steps count, ``bool (n_envs,)``; all but in the last turn."""
+    action: Array
+    """What was done, in the range of algorithms."""
+
+
+class Learned(NamedTuple):
+    """What updates change."""
+
+    state: PyTree
+    """The algorithm's state."""
+    metrics: Metrics
+    """Of the newest update, ``float32[]`` each; 0 before the first."""
+    n_updates: Array
+    """Gradient steps in this chunk, ``int32[]``."""
+    n_bad: Array
+    """Updates in this chunk whose metrics, or with ``skips`` whose state, were not finite, ``int32[]``."""
+    in_a_row: Array
+    """How many of the newest updates were not finite, ``int32[]``."""
+
+
+class Carry(NamedTuple):
+    """What a chunk passes on, apart from the experience."""
+
+    state: PyTree
+    """The algorithm's state, packed between chunks; None within."""
+    key: Array
+    """Root of the random numbers, ``uint32[2]``."""
+    explorer: PyTree
+    """The state of exploration or of a recurrent policy."""
+    action: Array | None
+    """Chosen for the observations, not yet taken, in the algorithm's range; None if turns begin with choosing them."""
+    episodes: EpisodeState
+    counts: Any
+    """Counters, equal for all runs; ``counts.step`` is the number of environment steps, ``uint32[]``."""
+    in_a_row: Array
+    """How many of the newest updates were not finite, ``int32[]``."""
+    hyper: dict[str, Array]
+    """Hyperparameters that differ between runs, ``float32[]``."""
+
+
+class Loop(NamedTuple):
+    """What the turns of a chunk pass on."""
+
+    carry: Carry
+    experience: Any
+    """The replay buffer, or the rollout."""
+    learned: Learned
+    result: StepResult
+    log: EpisodeLog
+    nonfinite_env: Array
+    """Whether a reward or an observation was not finite in this chunk, ``bool[]``."""
+
+
+class Report(NamedTuple):
+    """The results of a chunk of turns."""
+
+    metrics: Metrics
+    n_updates: Array
+    n_bad: Array
+    is_finite: Array
+    """Whether the state is finite after the chunk, ``bool[]``."""
+    nonfinite_env: Array
+    result: StepResult
+    """Of the newest turn."""
+    log: EpisodeLog
+
+
+@dataclass(frozen=True, kw_only=True)
+class Program(ABC):
+    """What a program is compiled for. Hashable. Abstract: there is one for each kind of learning."""
+
+    algorithm: Algorithm
+    explorer: Explorer
+    config: Any
+    packing: Packing
+    """Of the algorithm's state."""
+    n_envs: int
+    capacity: int
+    """Turns of a chunk at most."""
+    skips: bool
+    """Whether updates that leave NaN are undone."""
+    stops_at_episode: bool
+    """Whether a chunk ends with the first turn in which an episode ends."""
+    remake: Remake | None = None
+    """Makes the algorithm of a configuration, and its exploration, where hyperparameters differ between runs."""
+
+    @abstractmethod
+    def batch(self, env: FunctionalEnv, carry: Carry, experience: Any, clock: Clock, number: Any) -> Any:
+        """Returns the batch of the ``number``-th gradient step of a turn that ends at ``clock``."""
+
+    @abstractmethod
+    def turns(self, env: FunctionalEnv, loop: Loop, limits: Limits, may_go_on: Callable[[Array, Loop], Array]) -> Loop:
+        """Returns what turns pass on, which are taken while ``may_go_on(number of turns, loop)``."""
+
+    @abstractmethod
+    def begin_episodes(self, run: Run) -> None:
+        """Starts an episode in every environment of a run."""
+
+    @abstractmethod
+    def uses_part(self, run: Run, n_turns: int, last: int | None) -> bool:
+        """Returns whether an incomplete rollout is learned from if the step ``last`` is reached in so many turns."""
+
+    @abstractmethod
+    def counts_of(self, run: Run) -> Any:
+        """Returns the counters of a run."""
+
+    @abstractmethod
+    def action_of(self, run: Run) -> Array | None:
+        """Returns :attr:`Carry.action`; where none was chosen yet, any of its shape."""
+
+    @abstractmethod
+    def rows_changed(self, n_turns: int) -> int | None:
+        """Returns how many rows of each environment so many turns may change in place, at least; None if they copy them."""
+
+    @abstractmethod
+    def uploaded(self, run: Run) -> Any:
+        """Returns the experience of a run, on the device."""
+
+    @abstractmethod
+    def download(self, run: Run, experience: Any, counts: Any) -> None:
+        """Copies experience on the device into the buffer of a run."""
+
+    @abstractmethod
+    def pull_counts(self, run: Run, carry: Carry) -> None:
+        """Copies what only this kind of learning counts into a run."""
+
+    def chunk(self, env: FunctionalEnv, carry: Carry, experience: Any, limits: Limits) -> tuple[Carry, Any, Report]:
+        """Returns carry, experience and report after a number of turns."""
+        program = self.with_hyperparameters(carry.hyper)
+        first_episode = carry.episodes.n_finished
+        state, carry = program.packing.unpack(carry.state), carry._replace(state=None)
+        action = experience.action[0] if carry.action is None else carry.action  # of its shape
+        loop = Loop(
+            carry,
+            experience,
+            program.nothing_learned(env, state, carry, experience),
+            no_result(carry.episodes, action),
+            empty_log(program.capacity, program.n_envs),
+            jnp.bool(False),
+        )
+
+        def may_go_on(i: Array, loop: Loop) -> Array:
+            more = i < limits.n_turns
+            return more & (loop.carry.episodes.n_finished == first_episode) if program.stops_at_episode else more
+
+        loop = program.turns(env, loop, limits, may_go_on)
+        learned = loop.learned
+        is_finite = check(jax.tree.leaves(learned.state), {})
+        counted = learned.metrics, learned.n_updates, learned.n_bad
+        report = Report(*counted, is_finite, loop.nonfinite_env, loop.result, loop.log)
+        carry = loop.carry._replace(state=program.packing.pack(learned.state), in_a_row=learned.in_a_row)
+        return carry, loop.experience, report
+
+    def with_hyperparameters(self, hyper: dict[str, Array]) -> Any:
+        """Returns the program for the hyperparameters ``float32[]`` of one run."""
+        if self.remake is None:
+            return self
+        config = changed(self.config, hyper)
+        algorithm, explorer = self.remake(config)
+        return dataclasses.replace(self, algorithm=algorithm, explorer=explorer, config=config)
+
+    def nothing_learned(self, env: FunctionalEnv, state: PyTree, carry: Carry, experience: Any) -> Learned:
+        """Returns what is learned before the first update: metrics are 0. The update is only traced."""
+
+        def update(state: PyTree, carry: Carry, experience: Any) -> tuple[PyTree, Metrics]:
+            clock = Clock(jnp.uint32(0), jnp.uint32(0), jnp.float32(0))
+            return self.algorithm.update(state, self.batch(env, carry, experience, clock, 0), clock)
+
+        _, found = jax.eval_shape(update, state, carry, experience)
+        metrics = {name: jnp.float32(0) for name in found if name != TD_ERROR}
+        return Learned(state, metrics, jnp.int32(0), jnp.int32(0), carry.in_a_row)
+
+    def learn(self, learned: Learned, batch: Transition | Rollout, clock: Clock) -> tuple[Learned, Array | None]:
+        """Returns what is learned from a batch, and the TD errors if the batch has importance weights.
+
+        With ``skips``, an update that leaves NaN is undone, and its TD errors are NaN.
+        """
+        after, found = self.algorithm.update(learned.state, batch, clock)
+        td_error = td_error_of(found, batch)
+        found = {name: jnp.mean(jnp.asarray(value, jnp.float32)) for name, value in found.items() if name != TD_ERROR}
+        n = found[GRADIENT_STEPS].astype(jnp.int32) if GRADIENT_STEPS in found else 1
+        if self.skips:
+            after, found = undo(learned.state, after, found)
+            is_bad = ~found.pop(FINITE)
+            td_error = None if td_error is None else jnp.where(is_bad, jnp.nan, td_error)
+        else:
+            is_bad = ~check((), found)
+        is_over = learned.in_a_row >= MAX_SKIPPED  # the turns after it, in the same chunk, do not count
+        in_a_row = jnp.where(is_bad | is_over, learned.in_a_row + ~is_over, 0)
+        return Learned(after, found, learned.n_updates + n, learned.n_bad + is_bad, in_a_row), td_error
+
+
+def capacity_of(n_envs: int) -> int:
+    """Returns the turns of a chunk at most, for that number of environments."""
+    return max(min(MAX_TURNS, LOG_SIZE // n_envs), 1)
+
+
+def changed(config: Any, hyper: dict[str, Array]) -> Any:
+    """Returns a configuration with traced numbers, whose checks are left out, since they need the values."""
+    copied = copy.copy(config)
+    kinds = {field.name: str(field.type) for field in dataclasses.fields(config)}
+    for name, value in hyper.items():
+        is_schedule = "Schedule" in kinds[name]
+        object.__setattr__(copied, name, (lambda progress, value=value: value) if is_schedule else value)
+    return copied
+
+
+def no_result(episodes: EpisodeState, action: Array) -> StepResult:
+    """Returns the result before the first turn of a chunk; ``action`` has the shape of actions."""
+    n_envs = len(episodes.ended)
+    never = jnp.zeros(n_envs, bool)
+    return StepResult(episodes.obs, jnp.zeros(n_envs, jnp.float32), never, never, never, action)
+
+
+def empty_log(capacity: int, n_envs: int) -> EpisodeLog:
+    """Returns a log without episodes."""
+    shape = (capacity, n_envs)
+    return EpisodeLog(jnp.zeros(shape, jnp.int32), jnp.zeros(shape, jnp.float32), jnp.zeros(shape, jnp.float32))
+
+
+def observed(env: FunctionalEnv, obs: PyTree) -> PyTree:
+    """Returns a batch of observations as agents see them: with the mask apart if there is one."""
+    if isinstance(env, FunctionalMask):
+        parts = masked(obs)
+        return Masked(observed(env.env, parts.obs), parts.mask)
+    return plain(env.observation_space, obs)
+
+
+def plain(space: gym.Space, obs: PyTree) -> PyTree:
+    """Returns a batch of observations in the structure and dtypes in which agents see them."""
+    leaves = spaces.leaves(space)
+    parts = [jnp.asarray(x).astype(leaf.dtype) for x, leaf in zip(jax.tree.leaves(obs), leaves, strict=True)]
+    return jax.tree.unflatten(spaces.structure(space), parts)
+
+
+def step_envs(program: Program, env: FunctionalEnv, loop: Loop, action: Array, limits: Limits, turn: Array) -> Loop:
+    """Takes one step of all environments, and starts new episodes where some ended.
+
+    Args:
+        program: what is compiled.
+        env: the environment.
+        loop: before the step.
+        action: in the range of algorithms, ``(n_envs, ...)``.
+        limits: of the chunk. In its last turn only as many steps count as remain; the episodes of the other environments are
+            discarded.
+        turn: the number of the turn in the chunk, ``int32[]``.
+    """
+    before, step = loop.carry.episodes, loop.carry.counts.step
+    assert before.env is not None
+    kept = jnp.arange(program.n_envs, dtype=jnp.uint32) < jnp.minimum(limits.last - step, jnp.uint32(program.n_envs))
+    vstate, obs, reward, terminated, truncated, success = step_all(env, before.env, scale(env.action_space, action))
+    obs, reward = observed(env, obs), reward.astype(jnp.float32)
+    episode_return = before.episode_return + jnp.where(kept, reward, 0.0)
+    length = before.length + kept
+    over = terminated | truncated
+    ended, counts = over | ~kept, over & kept
+    log = EpisodeLog(
+        loop.log.length.at[turn].set(jnp.where(counts, length, 0)),
+        loop.log.episode_return.at[turn].set(episode_return),
+        loop.log.success.at[turn].set(
+            jnp.full_like(episode_return, jnp.nan) if success is None else success.astype(jnp.float32)
+        ),
+    )
+    vstate, fresh = reset_done(env, vstate, ended)
+    fresh = observed(env, fresh)
+    episodes = EpisodeState(
+        vstate,
+        fresh,
+        ended,
+        jnp.where(ended, 0.0, episode_return),
+        jnp.where(ended, 0, length),
+        jnp.where(before.ended, 0.0, program.config.gamma * before.running_return) + reward,
+        before.n_finished + jnp.sum(counts, dtype=jnp.uint32),
+    )
+    return loop._replace(
+        carry=loop.carry._replace(episodes=episodes),
+        result=StepResult(obs, reward, terminated, truncated, kept, action),
+        log=log,
+        nonfinite_env=loop.nonfinite_env | ~all_finite(reward, *jax.tree.leaves((obs, fresh))),
+    )
+
+
+def all_finite(*arrays: Array) -> Array:
+    """Returns whether all numbers are finite, ``bool[]``."""
+    floats = [jnp.isfinite(array).all() for array in arrays if jnp.issubdtype(array.dtype, jnp.floating)]
+    return jnp.stack(floats).all() if floats else jnp.bool(True)
+
+
+def scale(space: gym.Space, action: Array) -> Any:
+    """Returns actions in the range of the environment, as :func:`rejeu.core.spaces.scale_action` does on the host.
+
+    Between bounds that are not symmetric about 0, the last bit may differ, because the host computes in 64 bits.
+
+    >>> scale(gym.spaces.Box(-2.0, 2.0, (1,)), jnp.array([[0.25], [3.0]])).tolist()
+    [[0.5], [2.0]]
+    """
+    if isinstance(space, gym.spaces.Box):
+        low, high = space.low.astype(np.float64), space.high.astype(np.float64)
+        action = action.reshape(-1, *space.shape)
+        if space.dtype.kind != "f":
+            levels = jnp.floor(low[None] + (action + 1.0) * (0.5 * (high - low + 1.0))[None])
+            return jnp.clip(levels, low[None], high[None]).astype(jax.dtypes.canonicalize_dtype(space.dtype))
+        bounded = spaces.bounded(space)
+        middle = np.where(bounded, 0.5 * (low + high), 0.0).astype(np.float32)
+        half = np.where(bounded, 0.5 * (high - low), 1.0).astype(np.float32)
+        scaled = jnp.clip(middle[None] + action * half[None], space.low[None], space.high[None])
+        return scaled.astype(jax.dtypes.canonicalize_dtype(space.dtype))
+    if isinstance(space, gym.spaces.Discrete):
+        return action.astype(jnp.int32) + int(space.start)
+    if isinstance(space, gym.spaces.MultiDiscrete):
+        starts = np.broadcast_to(space.start, space.nvec.shape).astype(np.int32)
+        return action.reshape(-1, *space.nvec.shape) + starts[None]
+    if isinstance(space, gym.spaces.Dict | gym.spaces.Tuple):
+        return spaces.nested_action(space, action, scale)
+    assert isinstance(space, gym.spaces.MultiBinary)
+    return action.reshape(-1, *space.shape).astype(jnp.int8)
+
+
+def random_action(space: gym.Space, n: int, key: Array, mask: Array | None = None) -> Array:
+    """Returns ``n`` uniformly random actions in the range of algorithms, like :func:`rejeu.core.spaces.random_action`."""
+    if mask is not None:
+        n_allowed = jnp.sum(mask, axis=-1, dtype=jnp.int32)
+        return spaces.nth_allowed(mask, below(jax.random.bits(key, (n,), jnp.uint32), n_allowed))
+    if isinstance(space, gym.spaces.Box):
+        bits = jax.random.bits(key, (n, int(np.prod(space.shape))), jnp.uint32)
+        return (bits >> 8).astype(jnp.float32) * jnp.float32(2.0**-23) - 1.0
+    if isinstance(space, gym.spaces.Dict | gym.spaces.Tuple):
+        keys = [jax.random.fold_in(key, i) for i in range(len(space.spaces))]
+        pairs = zip(spaces.members(space), keys, strict=True)
+        parts = [random_action(part, n, own).reshape(n, -1).astype(jnp.float32) for part, own in pairs]
+        return jnp.concatenate(parts, axis=-1)
+    sizes: Any = {
+        gym.spaces.Discrete: lambda: np.int32(space.n),  # type: ignore[attr-defined]
+        gym.spaces.MultiDiscrete: lambda: space.nvec.ravel().astype(np.int32),  # type: ignore[attr-defined]
+        gym.spaces.MultiBinary: lambda: np.full(int(np.prod(space.shape)), 2, np.int32),  # type: ignore[arg-type]
+    }[type(space)]()
+    bits = jax.random.bits(key, (n, *sizes.shape), jnp.uint32)
+    return below(bits, sizes if sizes.ndim == 0 else sizes[None])

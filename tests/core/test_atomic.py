@@ -1,0 +1,110 @@
+"""Writing where a folder from elsewhere holds links to the user's own files."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from rejeu.agents import presets
+from rejeu.core import atomic
+from rejeu.lab.cli.output import noted_in
+from rejeu.lab.experiments.folder import JobWork
+from rejeu.lab.experiments.process import Process
+from rejeu.lab.runs import config
+from rejeu.lab.runs.config import DecidedRun, Task
+from rejeu.logs.history import History
+from rejeu.logs.logging import CsvFile, JsonLines
+
+pytestmark = pytest.mark.skipif(os.name != "posix", reason="links need rights on Windows")
+
+
+@pytest.fixture
+def link(tmp_path):
+    """A link in a run folder to a file that is the user's own."""
+    (tmp_path / "run").mkdir()
+    (tmp_path / "profile").write_text("export PATH\n")
+    path = tmp_path / "run" / "link.png"
+    path.symlink_to(tmp_path / "profile")
+    yield path
+    assert (tmp_path / "profile").read_text() == "export PATH\n"
+
+
+def test_nothing_is_appended_to_the_target_of_a_link(link):
+    with pytest.raises(OSError, match=r"link.png could not be written: .*is a symbolic link; remove it"):
+        atomic.append(link, b"1,2\n")
+    with pytest.raises(OSError, match="is a symbolic link; remove it"):
+        atomic.open_log(link)
+
+
+def test_a_file_takes_the_place_of_a_link_and_not_of_its_target(link):
+    with atomic.replacing(link) as file:
+        file.write(b"new")
+    assert not link.is_symlink()
+    assert link.read_text() == "new"
+
+
+@pytest.mark.parametrize("log", [CsvFile, JsonLines])
+def test_a_log_that_is_a_link_is_not_continued(link, log):
+    with pytest.raises(OSError, match="not a regular file"):
+        log(link, up_to=100)
+
+
+def test_warnings_are_not_written_to_the_target_of_a_link(link):
+    with pytest.warns(UserWarning, match="touch"), noted_in(link):
+        warnings.warn("$(touch /tmp/x)", UserWarning, stacklevel=1)
+
+
+def test_the_log_of_a_process_is_no_link(link, tmp_path):
+    with pytest.raises(OSError, match="is a symbolic link; remove it"):
+        Process(["list"], link, tmp_path / "lock", dict(os.environ))
+
+
+def test_a_curve_takes_the_place_of_a_link(link):
+    pytest.importorskip("matplotlib")
+    History([]).plot(link)
+    assert link.read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_file_that_a_reader_holds_is_replaced_when_it_is_closed(tmp_path, monkeypatch):
+    """As on Windows, where another process that reads a file keeps it from being replaced."""
+    new, old, tries, rename = tmp_path / "new", tmp_path / "old", [], Path.replace
+    new.write_text("new")
+    old.write_text("old")
+
+    def held(source, target):
+        tries.append(target)
+        if len(tries) < 3:
+            raise PermissionError
+        rename(source, target)
+
+    monkeypatch.setattr(Path, "replace", held)
+    atomic.replace_patiently(new, old, (0.0, 0.0))
+    assert (old.read_text(), len(tries)) == ("new", 3)
+    new.write_text("newer")
+    tries.clear()
+    with pytest.raises(PermissionError):
+        atomic.replace_patiently(new, old, (0.0,))
+
+
+RUN = DecidedRun(env="CartPole-v1", algorithm="DQN", policy="MlpPolicy", seed=0, n_envs=1, backend="gymnasium", preset=True,
+                 hyperparameters={}, evaluate_every=1, evaluate_episodes=1)  # fmt: skip
+WRITERS = {
+    "config.json": lambda path: config.write(path, RUN),
+    "task.json": lambda path: config.write_task(path, Task(folder="run", run=RUN)),
+    "preset.json": lambda path: presets.write(presets.find("CartPole-v1", "DQN"), path),
+    "job.exit": lambda path: JobWork.write_exit(SimpleNamespace(exit=path), 0),
+    "episodes.csv": lambda path: History([]).write_csv(path),
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_new_file_takes_the_place_of_the_old_one_which_is_never_written_to(name, tmp_path):
+    (tmp_path / name).write_text("old")
+    os.link(tmp_path / name, tmp_path / "same")
+    WRITERS[name](tmp_path / name)
+    assert (tmp_path / name).read_text() != "old"
+    assert (tmp_path / "same").read_text() == "old"

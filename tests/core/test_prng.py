@@ -1,0 +1,63 @@
+"""rejeu's keys give the numbers that JAX's give, bit for bit."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rejeu.core.prng import nth, threefry
+
+DRAWS = {
+    "normal": lambda key: jax.random.normal(key, (3, 5)),
+    "a single normal": jax.random.normal,
+    "uniform": lambda key: jax.random.uniform(key, (7,), minval=-2.0, maxval=3.0),
+    "whole numbers": lambda key: jax.random.randint(key, (9,), 0, 100),
+    "categories": lambda key: jax.random.categorical(key, jnp.log(jnp.array([[0.2, 0.5, 0.3]] * 8))),
+    "bytes": lambda key: jax.random.bits(key, (11,), jnp.uint8),
+    "nothing": lambda key: jax.random.normal(key, (0, 2)),
+    "after splitting": lambda key: jax.random.normal(jax.random.split(key, 5)[3], (4,)),
+    "many at once": lambda key: jax.vmap(lambda k: jax.random.normal(k, (2,)))(jax.random.split(key, 3)),
+    "after folding in": lambda key: jax.random.normal(jax.random.fold_in(key, 2**32 - 1), (4,)),
+}
+
+
+@pytest.mark.parametrize("draw", DRAWS.values(), ids=DRAWS)
+@pytest.mark.parametrize(("seed", "n"), [(0, 0), (1, 7), (2**32 - 1, 2**32 - 1)])
+def test_numbers_are_those_of_jax(draw, seed, n):
+    key = jax.random.PRNGKey(seed)
+    expected = draw(jax.random.fold_in(jax.random.wrap_key_data(key, impl="threefry2x32"), np.uint32(n)))
+    found = jax.jit(lambda key, n: draw(nth(key, n)))(key, np.uint32(n))
+    assert found.dtype == expected.dtype
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_the_hash_gives_its_authors_known_answers():
+    """From the file of known answers of Random123: threefry2x32, 20 rounds, key and counter 0."""
+    high, low = threefry(jnp.zeros(2, jnp.uint32), jnp.zeros((), jnp.uint32))
+    assert (hex(int(high)), hex(int(low))) == ("0x6b200159", "0x99ba4efe")
+
+
+def test_wide_numbers_are_those_of_jax():
+    """As in environments in JAX and algorithms that draw in the default dtype with ``jax_enable_x64``."""
+    with jax.enable_x64(True):
+        expected = jax.random.uniform(jax.random.fold_in(jax.random.key(3, impl="threefry2x32"), np.uint32(5)), (7,))
+        found = jax.random.uniform(nth(jax.random.PRNGKey(3), 5), (7,))
+        assert found.dtype == np.float64
+        np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="of XLA on CPUs")
+def test_numbers_that_several_kernels_read_are_hashed_once():
+    """XLA repeats what is elementwise in each of them; repeated hashes once doubled the time to compile an update."""
+
+    def rotations(n_readers):
+        def readers(key, scales):
+            noise = jax.random.normal(nth(key, 0), (64, 2))
+            return [jnp.sum(jnp.exp(scales[i] * noise), axis=i % 2) for i in range(n_readers)]
+
+        lowered = jax.jit(readers).lower(jax.random.PRNGKey(0), jnp.arange(1.0, 6.0))
+        return lowered.compile().as_text().count(" shift-left(")
+
+    assert 0 < rotations(5) <= rotations(1)

@@ -1,0 +1,75 @@
+"""What ``rejeu train``, ``resume`` and ``status`` measure and print: columns, times, limits."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from rejeu.callbacks.evaluate import Evaluated
+from rejeu.core import xla
+from rejeu.lab.cli import output, runs, session
+from rejeu.lab.cli.session import Limits
+from rejeu.lab.reporting import run_list
+from rejeu.logs.evaluation import Evaluation
+from rejeu.logs.logging import CsvFile
+from tests.lab.reporting.test_comparison import write_run
+
+
+def test_an_evaluation_is_a_row_with_its_own_values_in_each_column(tmp_path, capsys):
+    evaluation = Evaluation(np.array([1.0, 5.0]), np.array([10, 30]), np.array([0.0, 1.0]))
+    agent = SimpleNamespace(seconds={"total": 7.0})
+    report = output.reporter(agent, CsvFile(tmp_path / "table.csv"), "seed 3: ")
+    report(Evaluated(40, evaluation), True)
+    (row,) = csv.DictReader((tmp_path / "table.csv").read_text().splitlines())
+    expected = {"step": 40, "seconds": 7, "success_rate": 0.5, "mean_return": 3, "std_return": 2}
+    assert {key: float(value) for key, value in row.items()} == expected | {"mean_length": 20, "episodes": 2, "best": 1}
+    assert capsys.readouterr().out == "seed 3: step        40  success  50.0%  return 3.00  (best)\n"
+    report(Evaluated(50, evaluation), False)
+    assert "best" not in capsys.readouterr().out
+
+
+def test_the_stopwatch_counts_from_its_start_and_compilation_is_what_the_clock_leaves_out(monkeypatch):
+    now = {"wall": 100.0, "clock": 60.0}
+    monkeypatch.setattr(output.time, "perf_counter", lambda: now["wall"])
+    monkeypatch.setattr(xla, "clock", lambda: now["clock"])
+    stopwatch = output.Stopwatch()
+    now.update(wall=110.0, clock=67.0)
+    assert stopwatch.seconds() == (10.0, 3.0)
+
+
+def test_a_pause_is_due_after_so_many_further_steps_or_minutes(monkeypatch):
+    now, agent = [1000.0], SimpleNamespace(num_timesteps=30)
+    monkeypatch.setattr(xla, "clock", lambda: now[0])
+    by_minutes, by_steps = session.pause(agent, Limits(pause_minutes=2)), session.pause(agent, Limits(pause_steps=5))
+    never = session.pause(agent, Limits(steps=1, minutes=1))
+    for seconds, steps, due in ((119, 34, False), (120, 35, True)):
+        now[0], agent.num_timesteps = 1000.0 + seconds, steps
+        assert (by_minutes(None), by_steps(None), never(None)) == (due, due, False)
+
+
+@pytest.mark.parametrize("n", [50, 150])
+def test_status_is_the_mean_of_the_last_hundred_episodes_and_the_time_that_is_left(tmp_path, n):
+    run = write_run(tmp_path / "run", steps=10 * n, level=100.0)  # rises to 100 over the first half of the episodes
+    found = run_list.read(run)
+    returns = 100 * np.minimum(2 * np.arange(1, n + 1) / n, 1)
+    metrics = "step,time/compile_seconds\n10,1\n20,2\n"
+    (run / "metrics.csv").write_text(metrics, encoding="utf-8")
+    (run / "agent.safetensors").unlink()
+    config = json.loads((run / "config.json").read_text())
+    seconds = run_list.read(run).seconds
+    assert runs.describe(found)["mean_return"] == pytest.approx(returns[-100:].mean())
+    for asked, left in (({"steps": 40 * n}, 3 * (seconds - 2)), ({"steps": None, "minutes": 2}, 120 - seconds + 2)):
+        (run / "config.json").write_text(json.dumps({**config, **asked}))
+        (run / "checkpoints").mkdir(exist_ok=True)
+        facts = runs.describe(SimpleNamespace(**{**vars(run_list.read(run)), "state": "running"}))
+        assert facts["steps_per_second"] == pytest.approx(10 * n / (seconds - 2))
+        assert facts["seconds_left"] == pytest.approx(left)
+        assert f"about {left:,.0f} s left" in "\n".join(runs.lines(facts))
+    facts = runs.describe(SimpleNamespace(**{**vars(run_list.read(run)), "state": "interrupted"}))
+    assert (facts["episodes"], facts["seconds_left"], facts["seconds"]) == (n, None, seconds)
+    assert facts["best"] == {"step": 10 * n, "mean_return": 101.0, "success_rate": pytest.approx(math.nan, nan_ok=True)}

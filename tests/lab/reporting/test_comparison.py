@@ -1,0 +1,373 @@
+"""Comparison of groups of runs."""
+
+import csv
+import io
+import json
+import math
+
+import numpy as np
+import pytest
+
+import rejeu
+from rejeu.lab.reporting.comparison import compare
+
+
+def write_run(folder, algorithm="DQN", env="CartPole-v1", seed=0, level=10.0, steps=1000, every=10, **config):
+    """Writes a run whose return rises linearly over the first half and then stays at ``level``."""
+    folder.mkdir(parents=True)
+    content = {
+        "env": env,
+        "algorithm": algorithm,
+        "seed": seed,
+        "hyperparameters": {"gamma": 0.9},
+        "steps": steps,
+        **config,
+    }
+    (folder / "config.json").write_text(json.dumps(content), encoding="utf-8")
+    step = np.arange(every, steps + 1, every)
+    rows = [f"{x},0,{level * min(2 * x / steps, 1.0)},{every},nan,{x / 100}" for x in step.tolist()]
+    (folder / "episodes.csv").write_text(
+        "\n".join(["step,env,return,length,success,seconds", *rows, ""]), encoding="utf-8"
+    )
+    (folder / "evaluations.csv").write_text(
+        f"step,seconds,success_rate,mean_return\n{steps},9,nan,{level + 1}\n", encoding="utf-8"
+    )
+    (folder / "agent.safetensors").write_bytes(b"")
+    return folder
+
+
+@pytest.fixture
+def runs(tmp_path):
+    for algorithm, base in (("DQN", 10.0), ("PPO", 20.0)):
+        for seed in range(5):
+            write_run(tmp_path / f"{algorithm}_{seed}", algorithm, seed=seed, level=base + seed)
+    return tmp_path
+
+
+def test_two_algorithms(runs):
+    comparison = rejeu.compare(runs, samples=200)
+    assert comparison.by == "algorithm"
+    assert [(group.label, group.env_id, len(group.runs)) for group in comparison.groups] == [
+        ("DQN", "CartPole-v1", 5),
+        ("PPO", "CartPole-v1", 5),
+    ]
+    dqn, ppo = comparison.groups
+    np.testing.assert_allclose(dqn.scores[0], [10, 11, 12, 13, 14])
+    assert dqn.score[0] == pytest.approx(12.0)
+    assert 10 <= dqn.score[1] < 12 < dqn.score[2] <= 14
+    assert (dqn.mean, dqn.median) == pytest.approx((12.0, 12.0))
+    assert dqn.curve[0, -1] == pytest.approx(12.0)
+    assert math.isnan(dqn.curve[0, 0])
+    (improvement,) = comparison.improvements
+    assert (improvement.label, improvement.other, improvement.probability) == ("PPO", "DQN", 1.0)
+    assert dqn.reached is ppo.reached is None
+    assert dqn.profile[0, 0] == pytest.approx(0.8)  # four of five are above the lowest score
+    assert comparison.notes == (
+        "intervals of few runs are too narrow: those of 5 runs contain the true score in 90 % of cases, not in 95 %",
+    )
+
+
+def test_steps_to_the_threshold_are_the_median_of_the_runs(tmp_path):
+    for seed, level in enumerate((10.0, 20.0)):
+        write_run(tmp_path / str(seed), seed=seed, level=level)
+    # the mean of the last 50 steps is the return 20 steps before, and curves have a point each 10 steps
+    for folder, expected in ((tmp_path / "0", 470.0), (tmp_path / "1", 250.0)):
+        assert compare(folder, threshold=8.9, samples=10).groups[0].reached == (1, expected)
+        assert compare(folder, x="time", threshold=8.9, samples=10).groups[0].reached[1] == pytest.approx(
+            expected / 100
+        )
+    assert compare(tmp_path, threshold=8.9, samples=10).groups[0].reached == (2, 360.0)
+    assert compare(tmp_path, threshold=15.0, samples=10).groups[0].reached == (1, math.inf)
+
+
+def test_curve_is_a_moving_mean_of_the_returns(tmp_path):
+    run = write_run(tmp_path / "run")
+    (group,) = compare([run], samples=10).groups
+    step = np.arange(10, 1001, 10)
+    returns = 10 * np.minimum(2 * step / 1000, 1)
+    for x, value in zip(group.x[2:], group.curve[0, 2:], strict=True):
+        assert value == pytest.approx(returns[(step > x - 50) & (step <= x)].mean())
+
+
+def test_final_score_by_evaluation_and_over_time(runs):
+    comparison = compare(runs, score="evaluation", samples=50)
+    np.testing.assert_allclose(comparison.groups[0].scores[0], [11, 12, 13, 14, 15])
+    assert "last evaluation" in comparison.definition
+    assert compare(runs, x="time", samples=10).groups[0].x[-1] == 10.0
+
+
+def test_last_evaluation_counts_though_the_last_episode_ended_before_it(tmp_path):
+    folder = write_run(tmp_path / "run")
+    lines = (folder / "episodes.csv").read_text(encoding="utf-8").splitlines()
+    (folder / "episodes.csv").write_text("\n".join([*lines[:-3], ""]), encoding="utf-8")
+    rows = ["step,seconds,success_rate,mean_return", "500,5,nan,1", "1000,10,nan,2", ""]
+    (folder / "evaluations.csv").write_text("\n".join(rows), encoding="utf-8")
+    for axis, end in (("steps", 1000), ("time", 10)):
+        (group,) = compare(folder, x=axis, score="evaluation", samples=10).groups
+        assert (group.score[0], group.x[-1]) == (2.0, end)
+
+
+def test_different_budgets_are_cut_to_the_shortest_and_runs_without_an_evaluation_before_it_are_left_out(tmp_path):
+    write_run(tmp_path / "a", seed=0)
+    write_run(tmp_path / "b", seed=1, steps=500)
+    comparison = compare(tmp_path, samples=10)
+    assert comparison.groups[0].x[-1] == 500
+    assert comparison.notes[0] == (
+        "the runs on CartPole-v1 have between 500 and 1,000 steps; all are compared up to those of b (finished)"
+    )
+    comparison = compare(tmp_path, score="evaluation", samples=10)
+    assert [run.name for run in comparison.groups[0].runs] == ["b"]
+    assert "a has no evaluation within what is compared and is left out" in comparison.notes
+
+
+def test_absurd_returns_are_damage(tmp_path):
+    folder = write_run(tmp_path / "run")
+    with (folder / "episodes.csv").open("a", encoding="utf-8") as file:
+        file.write("1000,0,1e200,10,nan,10\n")
+    assert compare(folder, samples=10).groups[0].score[0] == 10
+
+
+def test_time_that_was_set_back_is_sorted(tmp_path):
+    folder = write_run(tmp_path / "run", steps=40)
+    rows = ["step,env,return,length,success,seconds", "10,0,1,10,,3", "20,0,2,10,,1", "30,0,3,10,,2", "40,0,4,10,,10"]
+    (folder / "episodes.csv").write_text("\n".join([*rows, ""]), encoding="utf-8")
+    (group,) = compare(folder, x="time", samples=10).groups
+    assert group.curve[0, [11, 21, 31, 100]].tolist() == [2, 3, 1, 4]
+
+
+def test_groups_by_the_settings_that_differ_within_an_algorithm_and_a_note_where_they_are_mixed(tmp_path):
+    for i, gamma in enumerate((0.9, 0.9, 0.99)):
+        write_run(tmp_path / f"dqn{i}", seed=i, hyperparameters={"gamma": gamma, "tau": 1.0})
+    comparison = compare(tmp_path, samples=10)
+    assert comparison.by == "setting"
+    groups = [("DQN, gamma=0.9", 2), ("DQN, gamma=0.99", 1)]
+    assert [(group.label, len(group.runs)) for group in comparison.groups] == groups
+    assert "1 of 2 groups have one run" in comparison.notes[0]
+    assert f"<p>note: {comparison.notes[0]}</p>" in comparison._repr_html_()
+    for i in range(3):
+        write_run(tmp_path / f"ppo{i}", "PPO", seed=i, hyperparameters={"gamma": 0.9, "n_epochs": 4})
+    comparison = compare(tmp_path, "setting", samples=10)
+    assert [(group.label, len(group.runs)) for group in comparison.groups] == [*groups, ("PPO", 3)]
+    assert compare(tmp_path, samples=10).notes == (
+        "DQN: the runs of this group differ in their settings; --by setting separates them",
+        "intervals of few runs are too narrow: those of 3 runs contain the true score in 75 % of cases, not in 95 %",
+    )
+
+
+def test_settings_that_differ_between_environments_are_no_groups_by_default(tmp_path):
+    for env, gamma in (("A-v0", 0.9), ("B-v0", 0.99)):
+        write_run(tmp_path / env, env=env, hyperparameters={"gamma": gamma})
+    assert compare(tmp_path, samples=10).by == "env"
+    write_run(tmp_path / "more", env="B-v0", hyperparameters={"gamma": 0.9})
+    assert compare(tmp_path, samples=10).by == "setting"
+
+
+def test_settings_whose_labels_begin_alike_are_different_groups(tmp_path):
+    for i, last in enumerate((0.1, 0.2)):
+        noise = {"noise": "normal", "mean": [0.0] * 100, "sigma": [0.0] * 100 + [last]}
+        write_run(tmp_path / str(i), seed=i, hyperparameters={"action_noise": noise}, env_kwargs={"x": [0] * 90 + [i]})
+    comparison = compare(tmp_path, "setting", samples=10)
+    assert len({group.label for group in comparison.groups}) == 2
+    assert len({group.env_id for group in comparison.groups}) == 2
+    assert max(len(group.label) for group in comparison.groups) < 220
+
+
+def test_runs_of_the_same_seed_get_a_note(tmp_path):
+    for i, (algorithm, seed) in enumerate((("DQN", 0), ("DQN", 0), ("PPO", 0), ("PPO", 1))):
+        write_run(tmp_path / str(i), algorithm, seed=seed)
+    note = "DQN: runs of this group have the same seed; they count as several, but are not independent"
+    assert compare(tmp_path, samples=10).notes[0] == note
+    others = compare([tmp_path / "1", tmp_path / "2"], "env", samples=10)  # of two algorithms
+    assert len(others.groups[0].runs) == 2
+    assert not any("same seed" in one for one in others.notes)
+
+
+def test_runs_of_the_same_name_get_that_of_the_folder_above(tmp_path):
+    for parent in ("a", "b"):
+        write_run(tmp_path / parent / "seed_0")
+    (tmp_path / "b" / "seed_0" / "episodes.csv").unlink()
+    comparison = compare(tmp_path, samples=10)
+    assert "b/seed_0 has no episode yet and is left out" in comparison.notes
+    assert comparison.groups[0].runs[0].name == "a/seed_0"
+
+
+def test_several_environments_are_not_averaged_unless_normalized(tmp_path):
+    for env, level in (("A-v0", 1.0), ("B-v0", 1000.0)):
+        for algorithm, factor in (("DQN", 1.0), ("PPO", 2.0)):
+            for seed in range(2):
+                write_run(tmp_path / f"{env}{algorithm}{seed}", algorithm, env, seed, level * factor)
+    apart = compare(tmp_path, "algorithm", samples=20)
+    assert [(group.label, group.env_id) for group in apart.groups] == [
+        ("DQN", "A-v0"),
+        ("PPO", "A-v0"),
+        ("DQN", "B-v0"),
+        ("PPO", "B-v0"),
+    ]
+    assert "their returns cannot be averaged" in apart.notes[0]
+    together = compare(tmp_path, "algorithm", normalize="range", samples=20)
+    assert [(group.label, group.score[0]) for group in together.groups] == [("DQN", 0.0), ("PPO", 1.0)]
+    references = {"A-v0": (0.0, 2.0), "B-v0": (0.0, 4000.0)}
+    scaled = compare(tmp_path, "algorithm", normalize=references, samples=20)
+    assert [group.mean for group in scaled.groups] == pytest.approx([0.375, 0.75])
+    with pytest.raises(ValueError, match="has no reference returns for 'B-v0'"):
+        compare(tmp_path, normalize={"A-v0": (0.0, 2.0)})
+
+
+def test_groups_of_different_environments_are_not_compared(tmp_path):
+    for algorithm, envs in (("DQN", "AB"), ("PPO", "AC"), ("A2C", "AB")):
+        for env in envs:
+            for seed in range(5):
+                write_run(tmp_path / f"{algorithm}{env}{seed}", algorithm, f"{env}-v0", seed, 1.0 + seed)
+    comparison = compare(tmp_path, "algorithm", normalize="range", samples=20)
+    assert {(group.label, group.env_id) for group in comparison.groups} == {
+        ("DQN", "A-v0, B-v0"),
+        ("PPO", "A-v0, C-v0"),
+        ("A2C", "A-v0, B-v0"),
+    }
+    (improvement,) = comparison.improvements
+    assert {improvement.label, improvement.other} == {"A2C", "DQN"}
+    assert improvement.env_id == "A-v0, B-v0"
+    assert comparison.notes[0] == (
+        "the groups are of different environments; only groups of the same environments are compared"
+    )
+
+
+def test_runs_without_episodes_are_left_out(runs):
+    folder = write_run(runs / "crashed", seed=9)
+    (folder / "episodes.csv").unlink()
+    comparison = compare(runs, samples=10)
+    assert comparison.notes[0] == "crashed has no episode yet and is left out"
+    assert sum(len(group.runs) for group in comparison.groups) == 10
+    with pytest.raises(ValueError, match="there is nothing to compare; crashed has no episode yet"):
+        compare(folder)
+
+
+@pytest.mark.parametrize("score", ["training", "evaluation"])
+def test_offline_runs_are_compared_by_their_evaluations(tmp_path, score):
+    for seed in range(2):
+        folder = write_run(tmp_path / str(seed), "IQL", seed=seed, level=seed, hyperparameters={"offline": True})
+        (folder / "episodes.csv").unlink()
+    (group,) = compare(tmp_path, score=score, samples=10).groups
+    assert group.scores[0].tolist() == [1.0, 2.0]
+
+
+def test_run_in_progress_is_compared_by_its_means(tmp_path):
+    folder = write_run(tmp_path / "run")
+    (folder / "episodes.csv").unlink()
+    (folder / "metrics.csv").write_text("step,rollout/ep_rew_mean,time/seconds\n500,3,1\n1000,5,2\n", encoding="utf-8")
+    comparison = compare(folder, samples=10)
+    assert comparison.groups[0].score[0] == 5.0
+    assert (
+        comparison.notes[0]
+        == "1 of 1 runs have no episodes on disk; the logged means of their latest episodes are used"
+    )
+
+
+def test_outputs(runs, tmp_path):
+    assert (
+        "steps to" not in compare(runs, samples=20).to_markdown()
+    )  # every group reaches a threshold made from its own scores
+    comparison = compare(runs, threshold=12, samples=20)
+    table = list(csv.DictReader(io.StringIO(comparison.to_csv())))
+    assert [[*row.values()][:3] for row in table] == [["DQN", "CartPole-v1", "5"], ["PPO", "CartPole-v1", "5"]]
+    assert [*table[0]][3:] == [
+        "iqm",
+        "iqm_low",
+        "iqm_high",
+        "mean",
+        "median",
+        "threshold",
+        "reached",
+        "steps_to_threshold",
+    ]
+    dqn = comparison.groups[0]
+    expected = [*dqn.score, dqn.mean, dqn.median, 12, *dqn.reached]
+    assert [float(one) for one in [*table[0].values()][3:]] == expected
+    assert dqn.score[1] < dqn.score[0] < dqn.score[2]
+    assert "| DQN | CartPole-v1 | 5 |" in comparison.to_markdown()
+    assert "steps to 12" in comparison.to_markdown()
+    assert "(5 of 5)" in comparison.to_markdown()
+    content = json.loads(comparison.to_json())
+    curve = content["groups"][0]["curve"]
+    assert curve["value"][0] is None
+    rows = list(csv.DictReader(io.StringIO(comparison.curves_csv())))
+    assert len(rows) == 202
+    for i in (50, 100):
+        point = [curve[name][i] for name in ("x", "value", "low", "high")]
+        assert point == [float(rows[i][name]) for name in ("steps", "value", "low", "high")]
+        assert point == [10.0 * i, *dqn.curve[:, i]]
+        assert point[2] < point[1] < point[3]
+    assert "final score" in repr(comparison)
+    (path,) = comparison.save(tmp_path / "out" / "table.md")
+    assert path.read_text(encoding="utf-8") == comparison.to_markdown()
+    with pytest.raises(ValueError, match=r"'a\.txt' must end in md, csv"):
+        comparison.save(tmp_path / "a.txt")
+
+
+def test_the_legend_of_many_settings_is_inside_the_picture(tmp_path):
+    pytest.importorskip("matplotlib")
+    for i in range(10):
+        settings = {"learning_rate": 10.0**-i, "policy_kwargs": {"net_arch": [2**i] * 12, "activation_fn": "relu"}}
+        write_run(tmp_path / str(i), seed=i, hyperparameters=settings)
+    figure = compare(tmp_path, samples=10).plot(tmp_path / "a.png")
+    assert (tmp_path / "a.png").read_bytes()[:4] == b"\x89PNG"
+    assert len(figure.axes) == 1
+    figure.draw_without_rendering()
+    legend = figure.axes[0].get_legend()
+    assert len(legend.get_texts()) == 10
+    assert all(
+        legend.get_window_extent().contains(*corner) for corner in legend.get_title().get_window_extent().corners()
+    )
+    assert all(figure.bbox.contains(*corner) for corner in legend.get_window_extent().corners())
+    assert figure.axes[0].get_window_extent().height > 200 * figure.dpi / 72  # points
+
+
+HOSTILE = "<script>alert(1)</script>|=cmd()$x_{$"
+
+
+def test_hostile_names_are_escaped(tmp_path):
+    for seed, algorithm in enumerate((HOSTILE, "=1+1")):
+        write_run(tmp_path / str(seed), algorithm, env=HOSTILE, seed=seed)
+    comparison = compare(tmp_path, samples=10)
+    assert "<script" not in comparison._repr_html_()
+    assert "<script" not in comparison.to_markdown().replace("\\<", "")
+    assert "'=1+1" in comparison.to_csv()
+    pytest.importorskip("matplotlib")
+    comparison.plot(tmp_path / "a.png")
+
+
+def test_page(runs):
+    pytest.importorskip("plotly")
+    pytest.importorskip("jinja2")
+    write_run(runs / "hostile", HOSTILE, seed=0)
+    text = compare(runs, samples=20).to_html()
+    assert HOSTILE not in text
+    assert "Probability of improvement" in text
+    assert 'http-equiv="Content-Security-Policy"' in text
+    assert len(text) < 6_000_000
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        {"by": "seed"},
+        {"x": "epochs"},
+        {"score": "best"},
+        {"statistic": "mode"},
+        {"samples": 0},
+        {"seed": -1},
+        {"threshold": math.nan},
+        {"normalize": {"CartPole-v1": 3}},
+        {"normalize": {"CartPole-v1": (0, "x")}},
+    ],
+)
+def test_invalid_arguments(runs, arguments):
+    with pytest.raises(ValueError, match="must be"):
+        compare(runs, **arguments)
+
+
+def test_folder_without_runs(tmp_path):
+    with pytest.raises(FileNotFoundError, match="holds no run"):
+        compare(tmp_path)
+    with pytest.raises(FileNotFoundError, match="there is no run folder"):
+        compare(tmp_path / "none")

@@ -1,0 +1,132 @@
+"""Models on the hub: the package for it, against a stand-in of its server on this machine."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+import rejeu
+from rejeu.core.errors import CheckpointError
+from rejeu.lab import hub
+from rejeu.lab.cli import main
+from tests.lab import hub_server
+
+SB3 = Path(__file__).parents[1] / "data" / "sb3"
+
+
+@pytest.fixture
+def server(tmp_path, monkeypatch):
+    """The real huggingface_hub, whose server is a stand-in on this machine; returns its repositories."""
+    constants = pytest.importorskip("huggingface_hub.constants")
+    monkeypatch.setenv("HF_TOKEN", hub_server.TOKEN)
+    monkeypatch.chdir(tmp_path)
+    with hub_server.served() as (address, repos):
+        monkeypatch.setattr(constants, "ENDPOINT", address)
+        template = constants.HUGGINGFACE_CO_URL_TEMPLATE
+        monkeypatch.setattr(constants, "HUGGINGFACE_CO_URL_TEMPLATE", address + template[template.index("/{") :])
+        yield repos
+
+
+@pytest.fixture
+def run(tmp_path):
+    """Returns a small run folder."""
+    folder = tmp_path / "run"
+    folder.mkdir()
+    agent = rejeu.DQN("MlpPolicy", "CartPole-v1", policy_kwargs={"net_arch": [8]}, seed=0)
+    agent.save(folder / "agent")
+    rejeu.DQN("MlpPolicy", "CartPole-v1", policy_kwargs={"net_arch": [8]}, seed=1).save(folder / "best")
+    (folder / "config.json").write_text(json.dumps({"env_id": "CartPole-v1", "algorithm": "DQN", "seed": 0}))
+    (folder / "evaluations.csv").write_text(
+        "step,episodes,mean_return,std_return,mean_length,success_rate\n100,10,20,3,20,\n200,10,30,3,30,\n"
+    )
+    (folder / "curve.png").write_bytes(b"a picture")
+    (folder / "secrets.txt").write_text("private")
+    return folder
+
+
+def test_a_model_is_pushed_with_its_card_and_pulled_again(server, run, capsys, monkeypatch):
+    monkeypatch.setattr(rejeu.DQN, "export", lambda agent, path: Path(path).write_bytes(b"onnx"))
+    assert main(["push", str(run), "me/cart"]) == 0
+    assert "/me/cart" in capsys.readouterr().out
+    found = server["me/cart"]
+    assert {"agent.safetensors", "config.json", "evaluations.csv", "curve.png", "README.md", "policy.onnx"} <= {*found}
+    assert server.private == {"me/cart": False}
+    assert "secrets.txt" not in found
+    assert (
+        found["agent.safetensors"]
+        == (run / "best.safetensors").read_bytes()
+        != (run / "agent.safetensors").read_bytes()
+    )
+    card = found["README.md"].decode()
+    # The interval of 10 episodes: 30 -+ 2.262 * 3 / sqrt(9), with the 97.5 % quantile of Student's t at 9 degrees of freedom
+    assert "return 30.00 ± 3.00 (95 % confidence interval of the mean 27.74 to 32.26), 10 episodes" in card
+    assert "![Learning curve](curve.png)" in card
+    metadata = dict(line.split(": ", 1) for line in card.split("---")[1].strip().splitlines())
+    assert json.loads(metadata["library_name"]) == "rejeu"
+    assert json.loads(metadata["model-index"])[0]["results"][0]["metrics"][0]["value"] == 30
+
+    found |= {"train.py": b"print()", "inner/other.zip": b"PK", "../../evil.zip": b"PK"}
+    assert main(["pull", "me/cart"]) == 0
+    assert "rejeu evaluate cart" in capsys.readouterr().out
+    pulled = {path.relative_to("cart").as_posix() for path in Path("cart").rglob("*")}
+    assert pulled == {*found} - {".gitattributes", "train.py", "inner/other.zip", "../../evil.zip"}
+    assert Path("cart/agent.safetensors").read_bytes() == found["agent.safetensors"]
+    hub.push(run / "agent.safetensors", "me/last", private=True)
+    assert server.private["me/last"]
+    assert server["me/last"]["agent.safetensors"] == (run / "agent.safetensors").read_bytes()
+    assert "config.json" not in server["me/last"]
+
+
+def test_models_of_stable_baselines3_are_pulled(server, capsys):
+    server["me/theirs"] = {
+        f"{name}{suffix}": (SB3 / f"ppo-normalized{suffix}").read_bytes()
+        for name, suffix in (("model", ".zip"), ("vecnormalize", ".pkl"))
+    }
+    assert main(["pull", "me/theirs", "--out", "here"]) == 0
+    assert sorted(path.name for path in Path("here").rglob("*")) == ["model.zip", "vecnormalize.pkl"]
+    assert "rejeu import" in capsys.readouterr().out
+
+
+def test_refusals_are_one_line_and_leave_nothing(server, run, tmp_path, monkeypatch):
+    with pytest.raises(OSError, match=r"the hub answered: .*404") as error:
+        hub.pull("me/none", tmp_path / "none")
+    assert "\n" not in str(error.value)
+    with pytest.raises(OSError, match=r"the hub answered: .*403"):
+        hub.push(run, "others/x", note=lambda text: None)
+    with pytest.raises(ValueError, match="not the name of a repository, such as USER/MODEL: ") as error:
+        hub.push(run, "me/a b", note=lambda text: None)
+    assert "\n" not in str(error.value)
+    server["me/bad"] = {"agent.safetensors": b"nothing"}
+    with pytest.raises(CheckpointError, match="not a complete safetensors file"):
+        hub.pull("me/bad", tmp_path / "bad")
+    server["me/zip"] = {"model.zip": b"PK nothing"}
+    with pytest.raises(CheckpointError, match=r"model\.zip"):
+        hub.pull("me/zip", tmp_path / "bad")
+    monkeypatch.setenv("HF_TOKEN", "hf_wrong")
+    with pytest.raises(OSError, match=r"the hub answered: .*401"):
+        hub.push(run, "me/cart", note=lambda text: None)
+    assert not (tmp_path / "none").exists()
+    assert not (tmp_path / "bad").exists()
+
+
+def test_a_hub_that_cannot_be_reached_is_one_line(server, monkeypatch):
+    monkeypatch.setattr("huggingface_hub.constants.ENDPOINT", "http://127.0.0.1:9")
+    monkeypatch.setattr("time.sleep", lambda seconds: None)  # before each retry
+    with pytest.raises(OSError, match="the hub cannot be reached: ") as error:
+        hub.pull("away/x")
+    assert "\n" not in str(error.value)
+
+
+def test_a_folder_with_content_is_not_replaced(server):
+    Path("full").mkdir()
+    Path("full/file").touch()
+    with pytest.raises(FileExistsError, match="--out"):
+        hub.pull("me/full")
+
+
+@pytest.mark.parametrize("name", ["a\0.zip", "\ud800.zip", "a" * 300 + ".zip", "a\n.pkl", "a/b.zip", "c:x.zip"])
+def test_a_name_that_no_file_should_have_is_not_wanted(name):
+    assert not hub.is_wanted(name)
+    assert hub.is_wanted("a b.zip")
