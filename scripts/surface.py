@@ -37,7 +37,7 @@ def helps() -> dict[str, str]:
     """Returns the help of every command, and of ``rejeu`` itself under the name "rejeu"."""
     whole = command("--help")
     listed = re.search(r"\{([\w,]+)\}", whole)
-    names = listed[1].split(",") if listed else re.findall(r"^    (\w+)(?:  |$)", whole, re.MULTILINE)
+    names = listed[1].split(",") if listed else re.findall(r"^ {2,4}([a-z]+)(?:  |$)", whole, re.MULTILINE)
     return {"rejeu": whole, **{name: command(name, "--help") for name in names}}
 
 

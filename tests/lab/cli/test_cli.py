@@ -19,6 +19,7 @@ from rejeu.agents import AGENTS
 from rejeu.algorithms.dqn import FOR_NEW
 from rejeu.callbacks import Evaluate
 from rejeu.checkpoints import run_folder as folder
+from rejeu.lab import cli
 from rejeu.lab.cli import main
 from rejeu.lab.cli.session import Session
 from rejeu.lab.cli.train import untuned
@@ -275,6 +276,43 @@ def test_help_names_the_commands_and_python_m_rejeu_is_the_same_command(capsys):
     assert all(command in text for command in ("train", "evaluate", "record", "list", "--version"))
     done = subprocess.run([sys.executable, "-m", "rejeu", "--version"], capture_output=True, text=True, check=True)
     assert done.stdout == f"rejeu {rejeu.__version__}\n"
+
+
+def help_of(capsys, *words):
+    """Returns the lists of a help text by title: the first word of each entry."""
+    with pytest.raises(SystemExit):
+        main([*words, "--help"])
+    text = capsys.readouterr().out
+    lists = re.findall(r"^([a-z ]+):\n((?:  .*\n|\n(?=  ))+)", text, re.MULTILINE)
+    return {title: re.findall(r"^  (?:-h, )?([\w-]+)", entries, re.MULTILINE) for title, entries in lists}
+
+
+def test_help_lists_commands_by_task(capsys):
+    lists = help_of(capsys)
+    assert [*lists] == ["options", "train", "look", "share", "teach"]
+    assert {"tune": "train", "compare": "look", "export": "share", "class": "teach"}.items() <= {
+        name: title for title, names in lists.items() for name in names
+    }.items()
+    assert sorted(name for title in [*lists][1:] for name in lists[title]) == sorted(cli.COMMANDS)
+
+
+def test_help_of_train_begins_with_what_people_need_first_and_has_five_groups(capsys):
+    lists = help_of(capsys, "train")
+    assert lists.pop("positional arguments") == ["ENV"]
+    assert lists["options"] == ["--help", "--algo", "--steps", "--minutes", "--envs", "--seed", "--set", "--out"]
+    assert [*lists] == ["options", "environment", "training", "evaluation", "output"]
+    assert max(map(len, lists.values())) == 8
+    assert sum(map(len, lists.values())) == 33
+    assert [*help_of(capsys, "compare")] == ["positional arguments", "options"]
+
+
+@pytest.mark.parametrize("width", [80, 120])
+def test_help_is_as_wide_as_the_terminal(width, monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", str(width))
+    for command in ("clone", "train"):
+        with pytest.raises(SystemExit):
+            main([command, "--help"])
+        assert width - 20 < max(map(len, capsys.readouterr().out.splitlines())) < width
 
 
 def test_set_takes_dotted_names_numbers_lists_and_words():

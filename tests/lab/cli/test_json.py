@@ -17,7 +17,7 @@ from rejeu.agents import presets
 from rejeu.core.interrupt import Stopped
 from rejeu.lab import cli
 from rejeu.lab.cli import main, runs
-from rejeu.lab.cli.commands import COMMANDS
+from rejeu.lab.cli.commands import COMMANDS, TASKS
 
 ROOT = Path(__file__).parents[3]
 PENDULUM = "Pendulum-v1"
@@ -159,6 +159,14 @@ def test_every_command_that_prints_a_result_is_documented_with_its_option():
         assert f"| `rejeu {command}" in text, command
         if "json" in kind.__dataclass_fields__:
             assert documented_keys(command), command
+
+
+def test_the_documentation_lists_the_commands_as_the_help_does():
+    listed = (ROOT / "docs" / "cli.md").read_text(encoding="utf-8").partition("## Commands\n")[2].partition("\n## ")[0]
+    sections = [part.partition("\n") for part in listed.split("### ")[1:]]
+    named = {title: dict.fromkeys(re.findall(r"`rejeu (\w+)", rows)) for title, _, rows in sections}
+    tasks = {task.title(): dict.fromkeys(kind.__name__.lower() for kind in kinds) for task, kinds in TASKS.items()}
+    assert [(title, [*names]) for title, names in named.items()] == [(task, [*names]) for task, names in tasks.items()]
 
 
 @pytest.mark.parametrize("kind", ["wandb", "mlflow", "trackio"])

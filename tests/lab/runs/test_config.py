@@ -96,7 +96,7 @@ def test_what_is_out_of_range_is_damaged(tmp_path, changed):
 
 @pytest.mark.parametrize("run", RUNS.values(), ids=RUNS)
 def test_a_run_is_the_same_as_words_of_the_command_line_and_as_data(run, tmp_path):
-    command, arguments = parsing.parse(run.words(), commands.COMMANDS, "")
+    command, arguments = parsing.parse(run.words(), commands.COMMANDS, {}, "")
     assert command == "train"
     assert {one.name: getattr(arguments, one.name) for one in dataclasses.fields(run)} == dataclasses.asdict(run)
     write_task(tmp_path / "task.json", Task(folder="runs/1", run=run, pause=7))

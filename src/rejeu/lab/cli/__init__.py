@@ -25,7 +25,7 @@ import msgspec
 import rejeu
 from rejeu.core import errors, hardware, interrupt
 from rejeu.lab.cli import parsing
-from rejeu.lab.cli.commands import COMMANDS, MODULES, check_options, of_task
+from rejeu.lab.cli.commands import COMMANDS, MODULES, TASKS, check_options, of_task
 from rejeu.lab.runs.config import read_task
 
 DESCRIPTION = """Trains agents on Gymnasium environments.
@@ -66,7 +66,7 @@ def run_command(argv: Sequence[str]) -> int:
     try:
         is_task = [*argv[:1]] == ["--task"] and len(argv) == 2
         command, arguments = (
-            of_task(read_task(Path(argv[1]))) if is_task else parsing.parse(argv, COMMANDS, DESCRIPTION)
+            of_task(read_task(Path(argv[1]))) if is_task else parsing.parse(argv, COMMANDS, TASKS, DESCRIPTION)
         )
         check_options(arguments)
         for name in getattr(arguments, "imports", ()):

@@ -8,6 +8,8 @@ from __future__ import annotations
 import argparse
 import difflib
 import inspect
+import shutil
+import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from decimal import Decimal
@@ -15,7 +17,7 @@ from pathlib import Path
 from typing import Any, Literal, NoReturn, get_args, get_origin
 
 from rejeu.core.validation import field_docs, number, whole
-from rejeu.lab.runs.config import Option, assigned, options
+from rejeu.lab.runs.config import Group, Option, assigned, options
 
 ELSEWHERE = {
     "--env": "the environment is given without an option: rejeu {command} ENV",
@@ -47,6 +49,10 @@ MOST = 1e300
 """The upper limit of numbers that have none."""
 
 
+MOST_IN_ONE_LIST = 12
+"""Number of options above which the help of a command lists them in groups."""
+
+
 class Parser(argparse.ArgumentParser):
     """Raises an error where ``argparse`` prints one and exits."""
 
@@ -54,12 +60,15 @@ class Parser(argparse.ArgumentParser):
         raise argparse.ArgumentError(None, message)
 
 
-def parse(argv: Sequence[str], commands: Mapping[str, Any], about: str) -> tuple[str, Any]:
+def parse(
+    argv: Sequence[str], commands: Mapping[str, Any], tasks: Mapping[str, Iterable[Any]], about: str
+) -> tuple[str, Any]:
     """Returns the name of a command and its arguments.
 
     Args:
         argv: the words after ``rejeu``.
         commands: the dataclass of the arguments of each command.
+        tasks: the same, by what people want to do.
         about: the text at the head of the help.
 
     Raises:
@@ -71,7 +80,7 @@ def parse(argv: Sequence[str], commands: Mapping[str, Any], about: str) -> tuple
         raise ValueError("expected a command, such as rejeu train parking-v0; rejeu --help lists all")
     command, *words = argv
     if command in ("-h", "--help"):
-        overview(commands, about).parse_args([command])
+        overview(tasks, about).parse_args([command])
     if command not in commands:
         raise ValueError(f"no command is called {command!r}; {nearest(command, commands)}")
     known = {one.name: one for one in options(commands[command])}
@@ -91,30 +100,43 @@ def parse(argv: Sequence[str], commands: Mapping[str, Any], about: str) -> tuple
     return command, commands[command](**given)
 
 
-def overview(commands: Mapping[str, Any], about: str) -> argparse.ArgumentParser:
+def overview(tasks: Mapping[str, Iterable[Any]], about: str) -> argparse.ArgumentParser:
     """Returns the parser whose help lists the commands."""
-    parser = Parser("rejeu", description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
-    listed = parser.add_subparsers(metavar="COMMAND")
-    for name, kind in commands.items():
-        listed.add_parser(name, help=kind.__doc__.partition("\n")[0].replace("%", "%%"))
+    usage = "rejeu COMMAND ...\n       rejeu COMMAND --help"
+    parser = Parser("rejeu", usage, about, formatter_class=argparse.RawDescriptionHelpFormatter)
+    for task, kinds in tasks.items():
+        listed = parser.add_argument_group(task)
+        for kind in kinds:
+            listed.add_argument(kind.__name__.lower(), help=kind.__doc__.partition("\n")[0].replace("%", "%%"))
     return parser
 
 
 def make_parser(command: str, kind: type, known: Iterable[Option], with_help: object) -> argparse.ArgumentParser:
-    """Returns the parser of a command, by default without help texts. What is not given is no attribute of its result."""
+    """Returns the parser of a command, by default without help texts. What is not given is no attribute of its result.
+
+    The options of a command that has many are listed in groups.
+    """
+    known = tuple(known)
+    positional = "".join(f" {one.name}" for one in known if one.shown.is_positional)
     parser = Parser(
         f"rejeu {command}",
-        description=inspect.cleandoc(kind.__doc__ or ""),
+        f"rejeu {command}{positional} [options]",
+        description=filled(inspect.cleandoc(kind.__doc__ or "")),
         formatter_class=argparse.RawDescriptionHelpFormatter,
         argument_default=argparse.SUPPRESS,
         allow_abbrev=False,
         exit_on_error=False,
     )
     docs = field_docs(kind) if with_help else {}
+    lists: dict[Group, Any] = dict.fromkeys(Group, parser)
+    if len(known) > MOST_IN_ONE_LIST:
+        lists |= {one: parser.add_argument_group(one) for one in Group if one is not Group.FIRST}
     for one in known:
         text = docs.get(one.field, one.shown.help).replace("%", "%%")
         if one.kind is bool:
-            parser.add_argument(one.name, dest=one.field, action="store_true", default=argparse.SUPPRESS, help=text)
+            lists[one.group].add_argument(
+                one.name, dest=one.field, action="store_true", default=argparse.SUPPRESS, help=text
+            )
             continue
         if isinstance(one.default, str | int | float | Path):
             text += f" (default: {one.default:g})" if isinstance(one.default, float) else f" (default: {one.default})"
@@ -131,8 +153,14 @@ def make_parser(command: str, kind: type, known: Iterable[Option], with_help: ob
             parser.add_argument(one.field, **settings)
         else:
             many = {dict: "extend", tuple: "extend" if one.takes_many else "append"}
-            parser.add_argument(one.name, dest=one.field, action=many.get(one.kind, "store"), **settings)
+            lists[one.group].add_argument(one.name, dest=one.field, action=many.get(one.kind, "store"), **settings)
     return parser
+
+
+def filled(text: str) -> str:
+    """Returns paragraphs as wide as the terminal."""
+    width = shutil.get_terminal_size().columns - 2
+    return "\n\n".join(textwrap.fill(paragraph, width) for paragraph in text.split("\n\n"))
 
 
 def normalized(word: str) -> str:
