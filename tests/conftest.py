@@ -43,7 +43,7 @@ QUICK_TO_COMPILE = (
     "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
 )
 STATUS = Path("/proc/self/status")
-LARGE = 2**30
+LARGE = 3 * 2**29
 """Bytes of memory after which compiled functions are dropped."""
 MOST_MEMORY = 2**31
 """Bytes of memory that one process of tests may take."""
@@ -57,9 +57,21 @@ def pytest_configure(config: pytest.Config) -> None:
         os.environ.setdefault("XLA_FLAGS", QUICK_TO_COMPILE)
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Gives learning runs and searches more time than other tests."""
+@pytest.hookimpl(tryfirst=True)  # before pytest leaves out what is exhaustive
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Marks the dear tests, and gives learning runs and searches more time than other tests.
+
+    Raises:
+        pytest.UsageError: if all tests are collected, and a line of ``dear.txt`` is none of them.
+    """
+    from tests.tiers import DEAR, exhaustive
+
+    unknown = DEAR - {item.nodeid for item in items}
+    if unknown and not config.option.file_or_dir and not config.option.keyword:
+        raise pytest.UsageError(f"tests/dear.txt names tests that do not exist: {sorted(unknown)[:5]}")
     for item in items:
+        if item.nodeid in DEAR:
+            item.add_marker(exhaustive)
         if item.get_closest_marker("slow") or item.get_closest_marker("exhaustive"):
             item.add_marker(pytest.mark.timeout(7200))
 

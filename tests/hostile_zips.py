@@ -155,10 +155,12 @@ def hostile_zips(valid: bytes, n: int, seed: int, ran: Path) -> Iterator[tuple[s
         ran: the folder that code in the files would create.
     """
     members = members_of(valid)
-    made = [*special(valid, members, ran)]
-    yield from made
+    n_special = 0
+    for one in special(valid, members, ran):
+        n_special += 1
+        yield one
     rng = np.random.default_rng(seed)
-    for i in range(max(n - len(made), 0)):
+    for i in range(max(n - n_special, 0)):
         name = list(members)[rng.integers(len(members))]
         kind = i % 6
         if kind == 0:

@@ -1,13 +1,21 @@
-"""Which parameters of a test run by default, and which only in the exhaustive tier (``scripts/test --all``)."""
+"""Which tests run by default, and which only in the exhaustive tier (``scripts/test --all``).
+
+A test is exhaustive by its mark, or by its line in ``dear.txt``: tests that take over 0.3 s with an empty cache of compiled
+programs, none of which alone notices a planted bug (``trials/mutations.py``), and whose code path a test of the default tier
+takes too.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 exhaustive = pytest.mark.exhaustive
+DEAR = frozenset(Path(__file__).with_name("dear.txt").read_text(encoding="utf-8").splitlines())
+"""Ids of tests, as pytest prints them."""
 
 
 def only(default: Collection[Any], values: Iterable[Any]) -> list[Any]:

@@ -256,10 +256,11 @@ def test_images_are_what_convolutions_read():
     assert features == [16, 36 * 36]
 
 
-def test_hostile_files_end_soon_in_little_memory_and_run_nothing(tmp_path):
+@pytest.mark.parametrize("end", only([80], [80, None]))
+def test_hostile_files_end_soon_in_little_memory_and_run_nothing(end, tmp_path):
     """A sample of them."""
     ran = tmp_path / "ran"
-    for name, content in islice(hostile_zips(PPO, 240, seed=0, ran=ran), None, None, 7):
+    for name, content in islice(hostile_zips(PPO, 240, seed=0, ran=ran), 0, end, 7):
         path = write(tmp_path, content)
         tracemalloc.start()
         message = ""
