@@ -12,8 +12,8 @@ import pytest
 from rejeu.agents import presets
 from rejeu.core import atomic
 from rejeu.lab.cli.output import noted_in
-from rejeu.lab.experiments.folder import JobWork
 from rejeu.lab.experiments.process import Process
+from rejeu.lab.experiments.work import Work
 from rejeu.lab.runs import config
 from rejeu.lab.runs.config import DecidedRun, Task
 from rejeu.logs.history import History
@@ -96,7 +96,7 @@ WRITERS = {
     "config.json": lambda path: config.write(path, RUN),
     "task.json": lambda path: config.write_task(path, Task(folder="run", run=RUN)),
     "preset.json": lambda path: presets.write(presets.find("CartPole-v1", "DQN"), path),
-    "job.exit": lambda path: JobWork.write_exit(SimpleNamespace(exit=path), 0),
+    "job.exit": lambda path: Work.write_exit(SimpleNamespace(exit=path), 0),
     "episodes.csv": lambda path: History([]).write_csv(path),
 }
 

@@ -11,11 +11,12 @@ from rejeu.agents import AGENTS, SAC
 from rejeu.core.errors import CheckpointError
 from rejeu.core.interrupt import Interrupt
 from rejeu.lab.experiments import scheduler
-from rejeu.lab.experiments.folder import NOTHING, Job, JobWork, Sweep, open_folder, read_folder
+from rejeu.lab.experiments.folder import NOTHING, Plan, open_folder, read_folder
 from rejeu.lab.experiments.process import hold
-from rejeu.lab.experiments.scheduler import MAX_LOST, Scheduler, Work
-from rejeu.lab.experiments.sweep import Coordinator
-from rejeu.lab.runs.config import RunConfig, Task
+from rejeu.lab.experiments.scheduler import MAX_LOST, Scheduler
+from rejeu.lab.experiments.sweep import imports_of
+from rejeu.lab.experiments.work import Job, Work
+from rejeu.lab.runs.config import RunConfig
 
 
 class Handle:
@@ -82,25 +83,25 @@ def make_jobs(n=4, **more):
 
 
 def test_an_algorithm_that_no_other_process_knows_is_refused(tmp_path, monkeypatch):
-    folder = open_folder(tmp_path / "sweep", Sweep(jobs=make_jobs(2, algorithm="Own"), threads=1), None, NOTHING)
+    folder = open_folder(tmp_path / "sweep", Plan(jobs=make_jobs(2, algorithm="Own"), threads=1), None, NOTHING)
     with pytest.raises(ValueError, match="no algorithm is called 'Own'"):
-        Coordinator(folder, Launcher(), Interrupt(), NOTHING)
+        imports_of(folder, NOTHING)
     monkeypatch.setitem(AGENTS, "Own", type("Own", (SAC,), {}))
     with pytest.raises(ValueError, match=r"Own is registered in this program only.*imports=\['my_algorithm.py'\]"):
-        Coordinator(folder, Launcher(), Interrupt(), NOTHING)
-    typed = RunConfig(env="", imports=("own.py",))
-    assert Coordinator(folder, Launcher(), Interrupt(), typed).typed == typed
+        imports_of(folder, NOTHING)
+    assert imports_of(folder, RunConfig(env="", imports=("own.py",))) == ("own.py",)
 
 
 def make_folder(tmp_path, n=4):
-    return open_folder(tmp_path / "sweep", Sweep(jobs=make_jobs(n), threads=1), None, NOTHING)
+    return open_folder(tmp_path / "sweep", Plan(jobs=make_jobs(n), threads=1), None, NOTHING)
 
 
-def work(folder, launcher, watch=lambda coordinator: None, **options):
+def work(folder, launcher, watch=lambda: None, retry=False, stop=None):
     lines = []
-    coordinator = Coordinator(folder, launcher, options.pop("stop", Interrupt()), NOTHING, say=lines.append, **options)
-    coordinator.run(watch)
-    return {one.job.name: one.state for one in coordinator.outcomes()}, lines
+    one = Scheduler(launcher, stop or Interrupt(), lines.append)
+    one.add(folder.works(retry=retry))
+    one.run(watch)
+    return {one.job.name: one.state for one in one.outcomes()}, lines
 
 
 def test_every_job_is_trained_once_and_not_more_than_fit_at_once(tmp_path, monkeypatch):
@@ -167,7 +168,7 @@ def test_a_run_that_ends_without_a_result_fails_with_one_line(tmp_path):
 def test_a_stop_ends_all_runs_and_starts_no_more(tmp_path):
     folder, launcher, stop = make_folder(tmp_path), Launcher(ends={f"job-{i}": [None] for i in range(4)}), Interrupt()
 
-    def watch(coordinator):
+    def watch():
         stop.signal = 2
 
     states, _ = work(folder, launcher, watch, stop=stop)
@@ -218,7 +219,7 @@ def test_a_full_disk_at_the_end_of_a_run_is_one_line(tmp_path, monkeypatch):
     def full(self, status):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(JobWork, "write_exit", full)
+    monkeypatch.setattr(Work, "write_exit", full)
     states, lines = work(folder, Launcher())
     assert "job-0 ended with exit status 0, but [Errno 28] No space left" in lines[-1]
     assert states == {"job-0": "stopped"}  # the next process finds its last checkpoint
@@ -226,16 +227,16 @@ def test_a_full_disk_at_the_end_of_a_run_is_one_line(tmp_path, monkeypatch):
 
 def test_a_folder_is_joined_only_with_the_same_plan(tmp_path):
     folder = make_folder(tmp_path)
-    assert make_folder(tmp_path).sweep == folder.sweep
-    joined = open_folder(folder.path, Sweep(jobs=folder.jobs, threads=7), None, NOTHING)
-    assert joined.sweep.threads == 1  # fixed when it began
-    other = Sweep(jobs=make_jobs(4, hyperparameters={"gamma": 0.9}), threads=1)
+    assert make_folder(tmp_path).plan == folder.plan
+    joined = open_folder(folder.path, Plan(jobs=folder.jobs, threads=7), None, NOTHING)
+    assert joined.plan.threads == 1  # fixed when it began
+    other = Plan(jobs=make_jobs(4, hyperparameters={"gamma": 0.9}), threads=1)
     with pytest.raises(ValueError, match="is the sweep of another plan: job-0 differs"):
         open_folder(folder.path, other, None, NOTHING)
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "file").touch()
     with pytest.raises(FileExistsError, match="something else"):
-        open_folder(tmp_path / "other", folder.sweep, None, NOTHING)
+        open_folder(tmp_path / "other", folder.plan, None, NOTHING)
 
 
 @pytest.mark.parametrize(
@@ -287,27 +288,10 @@ def test_code_that_the_command_line_names_again_is_trusted(tmp_path):
     assert (task.resume, task.folder) == (True, str(tmp_path))
 
 
-class Alone(Work):
-    """A run that no claim protects, of a work without a claim file."""
-
-    def __init__(self, folder):
-        self.name, self.run, self.log, self.lock = "alone", folder / "run", folder / "run.log", folder / "process.lock"
-
-    def task(self):
-        return Task(folder=str(self.run), run=RunConfig(env="CartPole-v1"))
-
-    def has_result(self):
-        return (self.run / "agent.safetensors").exists()
-
-    def is_open(self):
-        return not self.has_result()
-
-    def ended(self):
-        pass
-
-
-def test_a_run_without_a_claim_waits_for_a_process_that_still_ends(tmp_path):
-    work, orphan, launcher = Alone(tmp_path), FileLock(tmp_path / "process.lock"), Launcher()
+def test_a_run_waits_for_a_process_that_still_ends(tmp_path):
+    folder, launcher = make_folder(tmp_path, 1), Launcher()
+    (work,) = folder.works()
+    orphan = FileLock(work.lock)  # of a process that outlived the one that started it
     orphan.acquire()
     looks = iter(range(100))
 
@@ -317,6 +301,6 @@ def test_a_run_without_a_claim_waits_for_a_process_that_still_ends(tmp_path):
             orphan.release()
 
     one = Scheduler(launcher, Interrupt())
-    one.waiting.append(work)
+    one.add([work])
     one.run(watch)
     assert work.ending == "done"

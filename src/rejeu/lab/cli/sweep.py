@@ -25,15 +25,14 @@ from rejeu.lab.cli.commands import Resume, Sweep, Train
 from rejeu.lab.cli.environment import find_id
 from rejeu.lab.cli.output import Stopwatch, echo, header
 from rejeu.lab.cli.session import Session, installed_logs, make_evaluation_env
-from rejeu.lab.experiments import folder as folders
-from rejeu.lab.experiments.folder import Job, JobWork, SweepFolder, again, open_folder, read_folder
+from rejeu.lab.experiments.folder import Plan, SweepFolder, open_folder, read_folder
 from rejeu.lab.experiments.process import LocalLauncher, default_workers, hold, threads_of
-from rejeu.lab.experiments.scheduler import Launcher
-from rejeu.lab.experiments.sweep import Coordinator, Outcome, SweepResult, closing_lines, make_launcher, prepare, shown
+from rejeu.lab.experiments.sweep import SweepResult, imports_of, make_launcher, prepare, states_text, train
+from rejeu.lab.experiments.work import Job, Outcome, Work, again
 from rejeu.lab.reporting.comparison import By, Comparison, compare
 from rejeu.lab.runs import config as configs
 from rejeu.lab.runs.config import RunConfig
-from rejeu.logs.formatting import quoted
+from rejeu.logs.formatting import counted, quoted
 
 Begin = Callable[[Train, int, ExitStack], Session]
 """Makes the session of a seed; see :func:`rejeu.lab.cli.train.begin`."""
@@ -67,40 +66,32 @@ def complete(
     """Trains what is missing in a folder, compares the runs, and returns the exit status and the result."""
     launcher = make_launcher(folder, workers, ray)
     echo(f"sweep         {folder.path}, {len(folder.jobs)} runs, {launcher.capacity} at once")
-    status, outcomes, comparison = train(folder, launcher, typed, retry)
+    typed = dataclasses.replace(typed, imports=imports_of(folder, typed))
+    with Interrupt() as stop:
+        outcomes = train(folder, launcher, stop, typed.imports, retry).outcomes()
+    status, comparison = finish(folder, outcomes, typed, stop)
     result = SweepResult(folder.path, tuple(outcomes))
     return status, {"folder": folder.path, **result.counts(), "runs": result.table(), "comparison": comparison}
 
 
-def train(
-    folder: SweepFolder, launcher: Launcher, typed: RunConfig, retry: bool = False, replaces: tuple[str, str] = ("", "")
-) -> tuple[int, list[Outcome], list[dict[str, Any]] | None]:
-    """Trains what is missing in a folder and compares the runs.
+def finish(
+    folder: SweepFolder, outcomes: list[Outcome], typed: RunConfig, stop: Interrupt
+) -> tuple[int, list[dict[str, Any]] | None]:
+    """Says what has become of the jobs and compares the runs.
 
-    Args:
-        folder: of the runs.
-        launcher: what starts them.
-        typed: what the command line named for import.
-        retry: whether failed runs are tried again.
-        replaces: part of the names of runs, and what stands in its place in lines about them.
-
-    Returns the exit status, the outcomes, and the rows of the comparison, None if there is none.
+    Returns the exit status, and the rows of the comparison, None if there is none.
     """
-    with Interrupt() as stop, shown() as (watch, say):
-        coordinator = Coordinator(folder, launcher, stop, typed, retry, lambda text: say(text.replace(*replaces, 1)))
-        coordinator.run(watch)
-    for line in closing_lines(coordinator):
-        echo(line)
-    comparison = summarize(folder.path, "setting" if len({job.setting for job in folder.jobs}) > 1 else None)
-    outcomes = coordinator.outcomes()
     states = {one.state for one in outcomes}
+    resume = f"rejeu resume {quoted(folder.path)}{again(folder.jobs, typed)}"
+    echo(f"{counted(len(outcomes), 'run')}: {states_text(outcomes)}")
+    if "failed" in states:
+        echo(f"{resume} tries failed runs again")
+    comparison = summarize(folder.path, "setting" if len({job.setting for job in folder.jobs}) > 1 else None)
     status = 2 if "failed" in states else 1 if states & {"waiting", "stopped"} else 0
     if stop.signal is not None:
-        echo(
-            f"stopped by {NAMES[stop.signal]}; rejeu resume {quoted(folder.path)}{again(folder.jobs, typed)} continues"
-        )
+        echo(f"stopped by {NAMES[stop.signal]}; {resume} continues")
         status = 128 + stop.signal
-    return status, outcomes, None if comparison is None else comparison.table()
+    return status, None if comparison is None else comparison.table()
 
 
 def summarize(folder: Path, by: By | None = None) -> Comparison | None:
@@ -126,14 +117,21 @@ def train_all(arguments: Train) -> tuple[int, dict[str, Any]]:
     """Trains all seeds and compares them; returns the exit status and the result."""
     jobs = make_jobs(arguments)
     at_once = min(arguments.jobs or default_workers(), len(jobs))
-    path = choose_folder(arguments)
-    folder = open_folder(path, folders.Sweep(jobs=jobs, threads=threads_of(at_once)), None, arguments)
-    echo(f"run folders   {path}, {len(jobs)} seeds from {jobs[0].run.seed}, {at_once} at once")
-    launcher = LocalLauncher(at_once, folder.sweep.threads)
-    status, outcomes, comparison = train(folder, launcher, arguments, replaces=("seed_", "seed "))
+    folder = open_folder(choose_folder(arguments), Plan(jobs=jobs, threads=threads_of(at_once)), None, arguments)
+    echo(f"run folders   {folder.path}, {len(jobs)} seeds from {jobs[0].seed}, {at_once} at once")
+    with Interrupt() as stop:
+        scheduler = train(folder, LocalLauncher(at_once, folder.plan.threads), stop, imports_of(folder, arguments))
+    return finish_seeds(folder, scheduler.outcomes(), arguments, stop)
+
+
+def finish_seeds(
+    folder: SweepFolder, outcomes: list[Outcome], arguments: Train, stop: Interrupt
+) -> tuple[int, dict[str, Any]]:
+    """Compares the seeds; returns the exit status and the result."""
+    status, comparison = finish(folder, outcomes, arguments, stop)
     keys = ("path", "log", "exit_status", "state")
-    runs = [{"seed": one.job.run.seed, **{key: getattr(one, key) for key in keys}} for one in outcomes]
-    return status, {"folder": path, "runs": runs, "comparison": comparison}
+    runs = [{"seed": one.job.seed, **{key: getattr(one, key) for key in keys}} for one in outcomes]
+    return status, {"folder": folder.path, "runs": runs, "comparison": comparison}
 
 
 def make_jobs(arguments: Train) -> tuple[Job, ...]:
@@ -195,7 +193,7 @@ def train_together(arguments: Train, begin: Begin) -> tuple[int, dict[str, Any]]
             echo(f"the seeds are trained in processes of their own, not in one program: {reason}")
             return train_all(arguments)
         require_memory(first.agent, len(jobs))
-        folder = open_folder(path, folders.Sweep(jobs=jobs, threads=threads_of(1)), None, arguments)
+        folder = open_folder(path, Plan(jobs=jobs, threads=threads_of(1)), None, arguments)
         sessions = [first, *(with_seed(first, job.seed, stack) for job in jobs[1:])]
         works = folder.works()
         sessions = [with_folder(session, work) for session, work in zip(sessions, works, strict=True)]
@@ -213,19 +211,7 @@ def train_together(arguments: Train, begin: Begin) -> tuple[int, dict[str, Any]]
         if stop.signal is None:
             for work, status in zip(works, statuses, strict=True):
                 work.write_exit(status)
-    comparison = summarize(path)
-    runs = [
-        {"seed": work.job.seed, "path": work.run, "exit_status": status}
-        for work, status in zip(works, statuses, strict=True)
-    ]
-    result = {"folder": path, "runs": runs, "comparison": None if comparison is None else comparison.table()}
-    if stop.signal is not None:
-        echo(
-            f"stopped by {NAMES[stop.signal]}; rejeu resume {quoted(path)}{again(jobs, arguments)} continues, each seed in a "
-            "process of its own"
-        )
-        return 128 + stop.signal, result
-    return max(statuses), result
+    return finish_seeds(folder, [work.outcome() for work in works], arguments, stop)
 
 
 def with_seed(first: Session, seed: int, stack: ExitStack) -> Session:
@@ -236,10 +222,10 @@ def with_seed(first: Session, seed: int, stack: ExitStack) -> Session:
     return first._replace(agent=sibling(first.agent, env, seed), config=config, evaluation_env=evaluation_env)
 
 
-def with_folder(session: Session, work: JobWork) -> Session:
+def with_folder(session: Session, work: Work) -> Session:
     """Returns a session with its new run folder."""
-    work.run.mkdir(parents=True, exist_ok=True)
-    session = session._replace(folder=RunFolder(work.run), label=f"seed {work.job.seed}: ")
+    work.path.mkdir(parents=True, exist_ok=True)
+    session = session._replace(folder=RunFolder(work.path), label=f"seed {work.job.seed}: ")
     configs.write(session.folder.config, session.config)
     return session
 

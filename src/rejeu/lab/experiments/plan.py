@@ -23,7 +23,8 @@ from rejeu.core.records import Seed, convert, shown
 from rejeu.core.validation import build, check_names, choice, field_names
 from rejeu.envs.make import BACKENDS, make_vector
 from rejeu.envs.registry import are_plain, is_plain_id, maker, register
-from rejeu.lab.experiments.folder import FILES, MAX_JOBS, Job, Resources, job_name
+from rejeu.lab.experiments.folder import MAX_JOBS, Plan, Resources
+from rejeu.lab.experiments.work import FILES, Job, job_name
 from rejeu.lab.runs.config import RunConfig, merged, options
 from rejeu.logs.logging import check_logs, require
 from rejeu.logs.tables import flat
@@ -81,16 +82,6 @@ class Environment(NamedTuple):
     algorithms: tuple[str | None, ...]
     observation: gym.Space
     action: gym.Space
-
-
-@dataclass(frozen=True, kw_only=True)
-class Plan:
-    """The jobs of a sweep, and what each needs."""
-
-    jobs: tuple[Job, ...]
-    threads: int | None = None
-    """Threads of each run; None for its share of the cores."""
-    resources: Resources = field(default_factory=Resources)
 
 
 @contextmanager

@@ -1,6 +1,7 @@
 """The scheduler of all runs that are processes: which starts when, and what its end means.
 
-Sweeps, several seeds, studies and their final comparisons give it their runs. One rule holds for all of them:
+Sweeps, several seeds, studies and their final comparisons give it their runs: all at the start, or, by a policy, some at
+each turn. One rule holds for all of them:
 
 - A run that ends with status 0 is done if it left its result; otherwise it has failed.
 - A run that was lost (its process was killed, its machine is gone, it was stopped by somebody else) continues from its newest
@@ -13,20 +14,20 @@ Sweeps, several seeds, studies and their final comparisons give it their runs. O
 from __future__ import annotations
 
 import time
-from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Protocol
 
 from filelock import FileLock
 
 from rejeu.checkpoints.run_folder import newest_step
 from rejeu.core.interrupt import TAKEN, Interrupt
 from rejeu.lab.experiments.process import hold, last_line
+from rejeu.lab.experiments.work import Ending, Outcome, Work
 from rejeu.lab.reporting.runs import is_locked
-from rejeu.lab.runs.config import Task, write_task
+from rejeu.lab.runs.config import write_task
 
 POLL = 0.2
 """Seconds between two looks at the processes."""
@@ -37,8 +38,9 @@ MAX_LOST = 5
 STOPPED = (129, 130, 143)
 """Exit statuses of a run that a signal stopped; its checkpoint is saved."""
 
-Ending = Literal["done", "failed", "stopped", "left"]
 Say = Callable[[str], object]
+Policy = Callable[[], bool]
+"""Which runs train next, given the results: adds some, asks others to stop, and returns whether it may add more."""
 
 
 class Handle(Protocol):
@@ -65,49 +67,12 @@ class Launcher(Protocol):
         """Ends what it started."""
 
 
-class Work(ABC):
-    """A run that the scheduler trains. Abstract. Mutable."""
-
-    name: str
-    """For messages."""
-    run: Path
-    """Its run folder."""
-    log: Path
-    """What its processes print."""
-    lock: Path
-    """Held by the process that trains."""
-    claim: Path | None = None
-    """Held by the process that schedules the run; None if that process has locked more than this run."""
-    ending: Ending | None = None
-    """How it ended, None before."""
-    status: int | None = None
-    """Its last exit status."""
-    reason: str = ""
-    """Why it failed or was left."""
-
-    @abstractmethod
-    def task(self) -> Task:
-        """Returns what a process is asked to do: to begin or to continue the run."""
-
-    @abstractmethod
-    def has_result(self) -> bool:
-        """Returns whether its files contain what it was trained for."""
-
-    @abstractmethod
-    def is_open(self) -> bool:
-        """Returns whether there is something left to train; also asked after the claim was obtained."""
-
-    @abstractmethod
-    def ended(self) -> None:
-        """Called when it is done, has failed or was stopped."""
-
-
 @dataclass(eq=False)
 class Attempt:
     """A task whose process runs. Mutable."""
 
     task: Work
-    claim: FileLock | None
+    claim: FileLock
     handle: Handle
     first_step: int
     """Step of the checkpoint that it began from, -1 for none."""
@@ -128,6 +93,8 @@ class Scheduler:
             waits: whether to wait for tasks that other processes have claimed, rather than to leave them to these.
         """
         self.launcher, self.stop, self.say, self.waits = launcher, stop, say, waits
+        self.works: list[Work] = []
+        """All that were added."""
         self.waiting: deque[Work] = deque()
         """Tasks that this process may still take."""
         self.running: list[Attempt] = []
@@ -139,10 +106,21 @@ class Scheduler:
         self._passes = 0
         """How often in a row every waiting task was held by another process."""
 
-    def run(self, watch: Callable[[], object] = lambda: None) -> None:
-        """Works until nothing is left; ``watch`` is called several times a second."""
+    def add(self, works: Iterable[Work]) -> None:
+        """Adds runs, in this order."""
+        for work in works:
+            self.works.append(work)
+            if self._is_open(work):
+                self.waiting.append(work)
+
+    def outcomes(self) -> list[Outcome]:
+        """Returns what has become of each run."""
+        return [work.outcome() for work in self.works]
+
+    def run(self, watch: Callable[[], object] = lambda: None, policy: Policy = lambda: False) -> None:
+        """Works until nothing is left; ``watch`` and ``policy`` are called several times a second."""
         try:
-            while self.turn():
+            while policy() | self.turn():
                 watch()
                 time.sleep(POLL)
             watch()
@@ -153,7 +131,7 @@ class Scheduler:
         """Lets all runs stop by themselves, with a checkpoint."""
         for attempt in self.running:
             attempt.handle.stop()
-            release(attempt.claim)
+            attempt.claim.release()
         self.launcher.close()
 
     def turn(self) -> bool:
@@ -185,34 +163,39 @@ class Scheduler:
         while self.waiting and len(self.running) < self.launcher.capacity:
             task = self.waiting.popleft()
             try:
-                claim, is_taken = claimed(task)
+                claim = claimed(task)
             except OSError as error:
                 self._leave(task, error)
                 continue
-            if is_taken:
+            if claim is None:
                 held.append(task)
-            elif task.is_open():
+            elif self._is_open(task):  # no other process has trained it meanwhile
                 self._start(task, claim)
-                continue
-            elif task.has_result():  # of another process, or of one that was lost at its end
-                task.ending = "done"
-            release(claim)
+            else:
+                claim.release()
         self.waiting.extendleft(reversed(held))
         if held:
             self._rescan_at = time.monotonic() + RESCAN
         self._passes = self._passes + 1 if held and not self.running else 0
-        if self._passes > 1 and not self.waits and not any(is_ours(task) for task in held):
-            self.waiting.clear()  # two looks found every task claimed elsewhere
+        if self._passes > 1 and not self.waits and all(is_locked(task.claim) for task in held):
+            self.waiting.clear()  # two looks found every task claimed elsewhere, and not only trained by one that is ending
 
-    def _start(self, task: Work, claim: FileLock | None) -> None:
+    def _is_open(self, task: Work) -> bool:
+        """Returns whether a run is to be trained, else notes how it has ended."""
+        if task.is_open():
+            return True
+        task.ending = "failed" if task.exit_status() else "done"
+        return False
+
+    def _start(self, task: Work, claim: FileLock) -> None:
         """Starts a run, from its newest checkpoint if there is one."""
         try:
-            first = newest_step(task.run / "checkpoints")
+            first = newest_step(task.path / "checkpoints")
             file = task.lock.with_suffix(".task")
             write_task(file, task.task())
             handle = self.launcher.start(file, task.log, task.lock)
         except OSError as error:
-            release(claim)
+            claim.release()
             self._leave(task, error)
             return
         self.running.append(Attempt(task, claim, handle, first))
@@ -240,11 +223,11 @@ class Scheduler:
             else:
                 self._note(task, "failed", f"failed with exit status {status}: {last_line(task.log)}")
         finally:
-            release(attempt.claim)
+            attempt.claim.release()
 
     def _go_on_later(self, attempt: Attempt, status: int) -> None:
         """Puts a lost run back, unless it was lost too often."""
-        task, step = attempt.task, newest_step(attempt.task.run / "checkpoints")
+        task, step = attempt.task, newest_step(attempt.task.path / "checkpoints")
         self._lost[task] = 0 if step > attempt.first_step else self._lost.get(task, 0) + 1
         if self._lost[task] >= MAX_LOST:
             text = f"was lost {MAX_LOST} times in a row without a new checkpoint (exit status {status})"
@@ -264,22 +247,10 @@ class Scheduler:
             self.say(f"{task.name} ended with exit status {task.status}, but {error}")
 
 
-def claimed(task: Work) -> tuple[FileLock | None, bool]:
-    """Returns the claim of a task, held by this process, and whether another process claims or trains it."""
-    claim = None if task.claim is None else hold(task.claim)
-    if task.claim is not None and claim is None:
-        return None, True
-    return claim, task.lock.is_file() and is_locked(task.lock)
-
-
-def is_ours(task: Work) -> bool:
-    """Returns whether no other process claims the task, although a process that trains it may still be ending."""
-    claim, _ = claimed(task)
-    release(claim)
-    return claim is not None or task.claim is None
-
-
-def release(claim: FileLock | None) -> None:
-    """Releases a claim."""
-    if claim is not None:
+def claimed(task: Work) -> FileLock | None:
+    """Returns the claim of a task, held by this process; None if another process claims or trains it."""
+    claim = hold(task.claim)
+    if claim is not None and task.is_training():
         claim.release()
+        return None
+    return claim

@@ -8,28 +8,26 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import shutil
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from rejeu.agents import AGENTS, presets
 from rejeu.agents.presets import Preset
-from rejeu.checkpoints.run_folder import newest_step
 from rejeu.core import validation
 from rejeu.core.interrupt import Interrupt
-from rejeu.lab.experiments import scheduler as schedulers
 from rejeu.lab.experiments.process import LocalLauncher
-from rejeu.lab.experiments.scheduler import Scheduler, Work
+from rejeu.lab.experiments.scheduler import Scheduler
 from rejeu.lab.experiments.study import Outcome, State, Study
 from rejeu.lab.experiments.study_plan import MIN_FINAL_SEEDS, Measure
+from rejeu.lab.experiments.work import Job, Work
 from rejeu.lab.reporting.comparison import Comparison, compare
 from rejeu.lab.reporting.runs import EVALUATIONS, Run, read_run
-from rejeu.lab.runs.config import RunConfig, Task
+from rejeu.lab.runs.config import RunConfig
 from rejeu.logs import statistics
 from rejeu.logs.tables import read_table
 
@@ -47,60 +45,21 @@ Watch = Callable[["list[Outcome]"], object]
 Verdict = Literal["better", "worse", "no difference found", "the default itself", "not compared"]
 
 
-def begin_or_resume(folder: Path, run: RunConfig, **more: Any) -> Task:
-    """Returns what begins a run in a folder, or continues it from its newest checkpoint; ``more`` is for both."""
-    resume = newest_step(folder / "checkpoints") >= 0
-    if not resume and folder.exists():
-        shutil.rmtree(folder)  # it was killed before its first checkpoint
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    return Task(folder=str(folder), run=run, resume=resume, no_report=True, no_video=True, **more)
+def work_of(run: RunConfig, folder: Path, seed: int) -> Work:
+    """Returns the training of a preset in a folder, on a seed, where ``run`` is what all trainings of the study share."""
+    of_preset = dataclasses.replace(run, preset=str(folder / "preset.json"), seed=seed, imports=())
+    job = Job(name=f"seed_{seed}", run=of_preset, no_report=True, no_video=True)
+    name = f"{folder.name}, {job.label}"
+    return Work(folder, job, run.imports, is_retried=True, name=name, keeps_checkpoints=False)
 
 
-class Training(Work):
-    """One training. Mutable."""
-
-    def __init__(self, run: RunConfig, path: Path, seed: int, preset: Path, claim: Path | None = None) -> None:
-        """Starts nothing.
-
-        Args:
-            run: what all trainings of the study have in common.
-            path: its run folder.
-            seed: of the training.
-            preset: file with its hyperparameters.
-            claim: file that is locked by the process that looks after it; None if that process holds another lock.
-        """
-        self.config, self.seed, self.claim = dataclasses.replace(run, preset=str(preset), seed=seed), seed, claim
-        self.name = f"{path.parent.name}, seed {seed}"
-        self.run, self.log, self.lock = (path.with_name(f"{path.name}{end}") for end in ("", ".log", ".lock"))
-
-    def task(self) -> Task:
-        return begin_or_resume(self.run, self.config)
-
-    def has_result(self) -> bool:
-        try:
-            return read_run(self.run).state == "finished"
-        except OSError:
-            return False
-
-    def is_open(self) -> bool:
-        return not self.has_result()
-
-    def ended(self) -> None:
-        """Deletes the checkpoints, which hold the replay buffer, once it is done."""
-        if self.ending == "done":
-            self.drop_checkpoints()
-
-    def evaluations(self, column: str) -> list[tuple[int, float]]:
-        """Returns step and value of each evaluation so far."""
-        try:
-            table = read_table(self.run / EVALUATIONS)
-        except OSError:
-            return []
-        return list(zip(table.column("step").astype(int).tolist(), table.column(column).tolist(), strict=True))
-
-    def drop_checkpoints(self) -> None:
-        """Deletes the checkpoints."""
-        shutil.rmtree(self.run / "checkpoints", ignore_errors=True)
+def evaluations(work: Work, column: str) -> list[tuple[int, float]]:
+    """Returns step and value of each evaluation so far."""
+    try:
+        table = read_table(work.path / EVALUATIONS)
+    except OSError:
+        return []
+    return list(zip(table.column("step").astype(int).tolist(), table.column(column).tolist(), strict=True))
 
 
 @dataclass(eq=False)
@@ -109,7 +68,7 @@ class RunningTrial:
 
     trial: optuna.Trial
     index: int
-    trainings: list[Training]
+    trainings: list[Work]
     n_reported: int = 0
     """Evaluations that Optuna knows."""
     value: float = math.nan
@@ -123,8 +82,8 @@ class RunningTrial:
         before = self.n_reported
         for training in self.trainings:
             if training.ending == "failed" and self.state is None:
-                self.state, self.reason = "failed", f"seed {training.seed} {training.reason}"
-        tables = [training.evaluations(study.plan.column) for training in self.trainings]
+                self.state, self.reason = "failed", f"{training.job.label} {training.reason}"
+        tables = [evaluations(training, study.plan.column) for training in self.trainings]
         while self.state is None and self.n_reported < min(map(len, tables)):
             step = tables[0][self.n_reported][0]
             self.value = sum(table[self.n_reported][1] for table in tables) / len(tables)
@@ -148,6 +107,7 @@ class Search:
         self.study, self.run_config, self.workers, self.stop = study, run, workers, stop
         self.running: list[RunningTrial] = []
         self.scheduler = Scheduler(LocalLauncher(workers * study.plan.trial_seeds), stop)
+        self.watch: Watch = lambda trials: None
         self._next_look = 0.0
 
     def run(self, watch: Watch) -> None:
@@ -155,20 +115,20 @@ class Search:
 
         The next run continues the trials that were interrupted or not started.
         """
+        self.watch = watch
         try:
-            while True:
-                is_over = self.stop.requested or bool(self.scheduler.left)
-                has_news = not is_over and self.begin()
-                self.scheduler.turn()
-                if self.advance() or has_news:
-                    watch(self.study.outcomes())
-                if not self.running and (is_over or self.study.is_searched()):
-                    return
-                time.sleep(schedulers.POLL)
+            self.scheduler.run(policy=self.turn)
         finally:
-            self.scheduler.close()
             for one in self.running:
                 self.study.release(one.index)
+
+    def turn(self) -> bool:
+        """Follows the running trials and begins others; returns whether any trial runs or is left. The policy of a study."""
+        has_news = self.advance()
+        is_over = self.stop.requested or bool(self.scheduler.left)
+        if (not is_over and self.begin()) or has_news:
+            self.watch(self.study.outcomes())
+        return bool(self.running) or not (is_over or self.study.is_searched())
 
     def begin(self) -> bool:
         """Begins trials while there are free workers and trials left; returns whether any was begun."""
@@ -180,12 +140,9 @@ class Search:
                 break
             trial, index, _ = taken
             folder = self.study.folder.trial(index)
-            trainings = [
-                Training(self.run_config, folder / f"seed_{seed}", seed, folder / "preset.json")
-                for seed in self.study.plan.seeds(index)
-            ]
+            trainings = [work_of(self.run_config, folder, seed) for seed in self.study.plan.seeds(index)]
             self.running.append(RunningTrial(trial, index, trainings))
-            self.scheduler.waiting.extend(trainings)
+            self.scheduler.add(trainings)
             begun = True
         return begun
 
@@ -246,7 +203,7 @@ def is_default(study: Study, winner: Preset) -> bool:
     return next(own) == next(own)
 
 
-def final_trainings(study: Study, best: Outcome, run: RunConfig) -> list[Training]:
+def final_trainings(study: Study, best: Outcome, run: RunConfig) -> list[Work]:
     """Returns all trainings of the comparison, in pairs; their presets are written."""
     named = {
         winner_name(best): study.preset_of(best, f"trial {best.index}"),
@@ -254,14 +211,11 @@ def final_trainings(study: Study, best: Outcome, run: RunConfig) -> list[Trainin
     }
     for name, preset in named.items():
         presets.write(preset, study.folder.final / name / "preset.json")
-    return [
-        Training(run, folder / f"seed_{seed}", seed, folder / "preset.json", folder / f"seed_{seed}.claim")
-        for seed in study.plan.fresh_seeds()
-        for folder in (study.folder.final / name for name in named)
-    ]
+    folders = [study.folder.final / name for name in named]
+    return [work_of(run, folder, seed) for seed in study.plan.fresh_seeds() for folder in folders]
 
 
-def train_final(tasks: Sequence[Training], workers: int, stop: Interrupt, echo: Callable[[str], object]) -> list[str]:
+def train_final(tasks: Sequence[Work], workers: int, stop: Interrupt, echo: Callable[[str], object]) -> list[str]:
     """Trains winner and default on the fresh seeds, as many as ``workers`` at once; returns the failures.
 
     Trainings that other processes hold are waited for; finished ones are not repeated.
@@ -272,7 +226,7 @@ def train_final(tasks: Sequence[Training], workers: int, stop: Interrupt, echo: 
         echo(f"final comparison: {n} of {len(tasks)} trainings have ended; {text}")
 
     scheduler = Scheduler(LocalLauncher(workers), stop, say, waits=True)
-    scheduler.waiting.extend(tasks)
+    scheduler.add(tasks)
     scheduler.run()
     return [f"{task.name}: {task.reason}" for task in tasks if task.ending in ("failed", "left")]
 

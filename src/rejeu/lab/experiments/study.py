@@ -33,8 +33,8 @@ from rejeu.core.errors import CheckpointError, MissingExtra
 from rejeu.core.records import json_text
 from rejeu.lab.experiments import space as spaces, study_plan as plans
 from rejeu.lab.experiments.process import hold
-from rejeu.lab.experiments.scheduler import release
 from rejeu.lab.experiments.study_plan import Plan
+from rejeu.lab.reporting.runs import is_locked
 
 if TYPE_CHECKING:
     import optuna
@@ -146,18 +146,12 @@ class Study:
         names = spaces.distributions(self.plan.search_space).keys()
         for one in trials:
             index = one.user_attrs.get(INDEX)
-            if one.state.name != "RUNNING" or index in self.held or (index is not None and self.is_held(index)):
+            if one.state.name != "RUNNING" or (index is not None and is_locked(self.folder.trial(index) / LOCK)):
                 continue
             if index is not None and one.number not in repeated:
                 params = dict(one.params) if one.params.keys() >= names else {}
                 self.optuna_study.enqueue_trial(params, user_attrs={INDEX: index, REPEATS: one.number})
             self.optuna_study.tell(one.number, state=TrialState.FAIL)
-
-    def is_held(self, index: int) -> bool:
-        """Returns whether a process trains a trial."""
-        lock = hold(self.folder.trial(index) / LOCK)
-        release(lock)
-        return lock is None
 
     def report(self, trial: optuna.Trial, step: int, value: float) -> bool:
         """Adds an evaluation to a trial; returns whether the trial is to be pruned."""

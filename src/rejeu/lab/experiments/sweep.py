@@ -18,24 +18,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rejeu.agents import modules_of
 from rejeu.core.interrupt import Interrupt
-from rejeu.lab.experiments.folder import (
-    HIDDEN,
-    Job,
-    JobProgress,
-    JobWork,
-    State,
-    Sweep,
-    SweepFolder,
-    again,
-    open_folder,
-    read_folder,
-)
+from rejeu.lab.experiments.folder import SweepFolder, open_folder, read_folder
 from rejeu.lab.experiments.plan import read_plan
 from rejeu.lab.experiments.process import LocalLauncher, default_workers, threads_of
 from rejeu.lab.experiments.scheduler import Launcher, Scheduler
+from rejeu.lab.experiments.work import HIDDEN, JobProgress, Outcome
 from rejeu.lab.runs.config import RunConfig
 from rejeu.logs import formatting
-from rejeu.logs.formatting import counted, quoted
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -48,75 +37,18 @@ MAX_NAMED = 4
 """Most runs that are named in a line."""
 
 echo = partial(print, flush=True)
-Watch = Callable[["Coordinator"], None]
+Watch = Callable[[Scheduler], None]
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """The outcome of one job."""
+def imports_of(folder: SweepFolder, typed: RunConfig) -> tuple[str, ...]:
+    """Returns what each run of a folder imports: what the command line named, with what offers the algorithms.
 
-    job: Job
-    state: State
-    exit_status: int | None
-    path: Path
-    log: Path
-
-
-class Coordinator:
-    """Works through the jobs of a folder until none is left that it may take. Mutable."""
-
-    def __init__(
-        self,
-        folder: SweepFolder,
-        launcher: Launcher,
-        stop: Interrupt,
-        typed: RunConfig,
-        retry: bool = False,
-        say: Callable[[str], object] = lambda text: None,
-    ) -> None:
-        """Starts nothing yet.
-
-        Args:
-            folder: of the sweep.
-            launcher: what starts runs.
-            stop: a requested stop ends all runs, with checkpoints.
-            typed: what the command line named for import.
-            retry: whether jobs that have failed are tried again, once.
-            say: called with a line for each event.
-
-        Raises:
-            ValueError: if the processes of the runs could not find an algorithm.
-        """
-        algorithms = {job.run.algorithm: None for job in folder.jobs if job.run.algorithm is not None}
-        modules = {name: None for algorithm in algorithms for name in modules_of(algorithm, typed.imports)}
-        self.folder, self.launcher = folder, launcher
-        self.typed = dataclasses.replace(typed, imports=tuple(modules) or typed.imports)
-        self.tasks = folder.works(self.typed.imports, retry)
-        self.scheduler = Scheduler(launcher, stop, say)
-        self.scheduler.waiting.extend(task for task in self.tasks if task.is_open())
-
-    def run(self, watch: Callable[[Coordinator], None] = lambda coordinator: None) -> None:
-        """Works until nothing is left; ``watch`` is called several times a second."""
-        self.scheduler.run(lambda: watch(self))
-
-    def running(self) -> list[JobWork]:
-        """Returns the jobs that this process looks after and that train."""
-        attended = {attempt.task for attempt in self.scheduler.running}
-        return [task for task in self.tasks if task in attended]
-
-    def outcomes(self) -> list[Outcome]:
-        """Returns the state of every job."""
-        running = self.running()
-        return [
-            Outcome(
-                task.job,
-                "running" if task in running else task.state(),
-                task.exit_status() if task.status is None else task.status,
-                task.run,
-                task.log,
-            )
-            for task in self.tasks
-        ]
+    Raises:
+        ValueError: if the processes of the runs could not find an algorithm.
+    """
+    algorithms = {job.run.algorithm: None for job in folder.jobs if job.run.algorithm is not None}
+    modules = {name: None for algorithm in algorithms for name in modules_of(algorithm, typed.imports)}
+    return tuple(modules) or typed.imports
 
 
 def count(states: Iterable[str]) -> dict[str, int]:
@@ -192,11 +124,10 @@ def prepare(
     found, text = read_plan(plan)
     at_once = min(workers or default_workers(), len(found.jobs))
     share = threads_of(at_once) if ray is None else max(int(found.resources.cpus), 1)
-    sweep_of_plan = Sweep(jobs=found.jobs, threads=found.threads or share, resources=found.resources)
     if folder is None:
         stem = "sweep" if isinstance(plan, Mapping) else Path(plan).stem
         folder = Path("runs") / f"{stem}-{time.strftime('%Y%m%d-%H%M%S')}"
-    return open_folder(Path(folder), sweep_of_plan, text, typed)
+    return open_folder(Path(folder), dataclasses.replace(found, threads=found.threads or share), text, typed)
 
 
 def make_launcher(folder: SweepFolder, workers: int | None, ray: str | None) -> Launcher:
@@ -209,8 +140,8 @@ def make_launcher(folder: SweepFolder, workers: int | None, ray: str | None) -> 
     if ray is not None:
         from rejeu.lab.experiments.ray import RayLauncher  # Ray is an extra
 
-        return RayLauncher(ray, folder.path / HIDDEN, folder.sweep.resources, folder.sweep.threads, workers)
-    return LocalLauncher(min(workers or default_workers(), len(folder.jobs)), folder.sweep.threads)
+        return RayLauncher(ray, folder.path / HIDDEN, folder.plan.resources, folder.plan.threads or 1, workers)
+    return LocalLauncher(min(workers or default_workers(), len(folder.jobs)), folder.plan.threads)
 
 
 def sweep(
@@ -250,11 +181,35 @@ def sweep(
     is_folder = not isinstance(plan, Mapping) and Path(plan).is_dir()
     found = read_folder(Path(plan), typed) if is_folder else prepare(plan, folder, workers, typed, ray)  # type: ignore[arg-type]
     with Interrupt() as stop:
-        with shown(progress) as (watch, say):
-            coordinator = Coordinator(found, make_launcher(found, workers, ray), stop, typed, retry, say)
-            coordinator.run(watch)
+        imports = imports_of(found, typed)
+        scheduler = train(found, make_launcher(found, workers, ray), stop, imports, retry, progress)
         stop.check()
-    return SweepResult(found.path, tuple(coordinator.outcomes()))
+    return SweepResult(found.path, tuple(scheduler.outcomes()))
+
+
+def train(
+    folder: SweepFolder,
+    launcher: Launcher,
+    stop: Interrupt,
+    imports: tuple[str, ...],
+    retry: bool = False,
+    progress: bool = True,
+) -> Scheduler:
+    """Works through the jobs of a folder until none is left that this process may take, and shows how far they are.
+
+    Args:
+        folder: of the sweep.
+        launcher: what starts runs.
+        stop: a requested stop ends all runs, with checkpoints.
+        imports: what each run imports first; see :func:`imports_of`.
+        retry: whether jobs that have failed are tried again, once.
+        progress: as for :func:`sweep`.
+    """
+    with shown(progress) as (watch, say):
+        scheduler = Scheduler(launcher, stop, say)
+        scheduler.add(folder.works(imports, retry))
+        scheduler.run(lambda: watch(scheduler))
+    return scheduler
 
 
 class Row(NamedTuple):
@@ -271,13 +226,13 @@ def shown(progress: bool = True) -> Iterator[tuple[Watch, Callable[[str], None]]
     """Context in which progress is shown; returns a function to call often, and one to call with each event."""
     console = formatting.console()
     if not progress:
-        yield (lambda coordinator: None), (lambda text: None)
+        yield (lambda scheduler: None), (lambda text: None)
     elif not console.is_terminal:
-        yield seldom(lambda coordinator: echo(line(coordinator)), LINES, time.monotonic() + LINES), echo
+        yield seldom(lambda scheduler: echo(line(scheduler)), LINES, time.monotonic() + LINES), echo
     else:
         with bars(console) as show:
             say = partial(console.print, highlight=False, markup=False)
-            yield seldom(lambda coordinator: show(rows(coordinator)), REFRESH), say
+            yield seldom(lambda scheduler: show(rows(scheduler)), REFRESH), say
 
 
 @contextmanager
@@ -306,33 +261,33 @@ def seldom(function: Watch, seconds: float, begin: float = 0.0) -> Watch:
     """Returns a function that calls another if the last call was so many seconds ago, and runs train."""
     due = begin
 
-    def call(coordinator: Coordinator) -> None:
+    def call(scheduler: Scheduler) -> None:
         nonlocal due
-        if time.monotonic() >= due and coordinator.running():
+        if time.monotonic() >= due and scheduler.running:
             due = time.monotonic() + seconds
-            function(coordinator)
+            function(scheduler)
 
     return call
 
 
-def rows(coordinator: Coordinator) -> list[Row]:
+def rows(scheduler: Scheduler) -> list[Row]:
     """Returns a row for all steps of the sweep, by which the remaining time is estimated, and one for each run that trains."""
     found, taken = [], 0
-    for task in coordinator.running():
+    for task in (attempt.task for attempt in scheduler.running):
         at, steps = task.progress(), task.job.run.steps
         taken += at.step
         found.append(Row(task.name, at.step, steps, text_of(at, steps)))
-    outcomes = coordinator.outcomes()
+    outcomes = scheduler.outcomes()
     asked = sum(one.job.run.steps or 0 for one in outcomes if one.state != "failed")
     taken += sum(one.job.run.steps or 0 for one in outcomes if one.state == "done")
-    return [Row("all steps", taken, asked or None, states(coordinator)), *found]
+    return [Row("all steps", taken, asked or None, states_text(outcomes)), *found]
 
 
-def line(coordinator: Coordinator) -> str:
+def line(scheduler: Scheduler) -> str:
     """Returns one line: the steps and the return of the runs that train, and how many are in each state."""
-    tasks = coordinator.running()[:MAX_NAMED]
+    tasks = [attempt.task for attempt in scheduler.running[:MAX_NAMED]]
     parts = [f"{task.name} {text_of(task.progress(), task.job.run.steps)}" for task in tasks]
-    return "; ".join([*parts, states(coordinator)])
+    return "; ".join([*parts, states_text(scheduler.outcomes())])
 
 
 def text_of(progress: JobProgress, steps: int | None) -> str:
@@ -347,17 +302,7 @@ def text_of(progress: JobProgress, steps: int | None) -> str:
     return f"{progress.step:,}{asked} steps{''.join(known)}"
 
 
-def states(coordinator: Coordinator) -> str:
+def states_text(outcomes: Iterable[Outcome]) -> str:
     """Returns how many runs are in each state, such as ``2 running, 3 done``."""
-    found = count(one.state for one in coordinator.outcomes())
+    found = count(one.state for one in outcomes)
     return ", ".join(f"{number} {state}" for state, number in found.items() if number)
-
-
-def closing_lines(coordinator: Coordinator) -> list[str]:
-    """Returns the lines that are printed at the end: how many jobs are in each state, and how failed ones are repeated."""
-    folder, outcomes = coordinator.folder, coordinator.outcomes()
-    lines = [f"{counted(len(outcomes), 'run')}: {states(coordinator)}"]
-    if any(one.state == "failed" for one in outcomes) and not coordinator.running():
-        resume = f"rejeu resume {quoted(folder.path)}{again(folder.jobs, coordinator.typed)}"
-        lines.append(f"{resume} tries failed runs again")
-    return lines
