@@ -162,7 +162,7 @@ def test_a_signal_after_training_ends_the_command_and_keeps_the_models(tmp_path,
 
     monkeypatch.setattr("rejeu.lab.cli.session.leaving", leaving)
     monkeypatch.setattr("rejeu.logs.video.record_video", record_video)
-    argv = ["train", "rejeu/Ball-v0", "--algo", "SAC", "--steps", "60", "--evaluate-episodes", "1", "--no-report"]
+    argv = ["train", "rejeu/Ball-v0", "--algo", "SAC", "--steps", "60", "--evaluate-episodes", "1"]
     with shared_learners(), pytest.raises(SystemExit):
         cli.main([*argv, "--out", str(out), "--set", *TINY])
     assert ends == [f"interrupted after training; the models are saved in {out}"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 import sys
 from collections import OrderedDict
 
@@ -13,7 +14,7 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 import rejeu
 from rejeu.core.errors import MissingExtra
 from rejeu.envs.make import EnvPool, GymnasiumVector, InProcess, auto_backend, make_vector
-from rejeu.envs.registry import make_env
+from rejeu.envs.registry import import_envpool, make_env
 from rejeu.sb3.common.env_util import make_vec_env
 from rejeu.sb3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 from rejeu.training.run import restart
@@ -353,6 +354,45 @@ def test_auto_uses_envpool_from_four_environments_on_or_if_gymnasium_lacks_the_i
 def without_envpool(monkeypatch):
     """Blocks the import of EnvPool, as if it were not installed."""
     monkeypatch.setitem(sys.modules, "envpool", None)
+
+
+def output_of(code):
+    """Returns what a new process prints."""
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+
+
+def test_an_id_is_looked_up_in_envpool_without_its_games():
+    code = """
+import sys
+from rejeu.envs.registry import import_envpool
+assert "Snake-v1" in import_envpool().list_all_envs()
+print(*{"matplotlib", "envpool.jumanji", "envpool.classic_control"} & {*sys.modules})
+import_envpool().make_gymnasium("CartPole-v1", num_envs=1).close()
+import envpool
+print("envpool.classic_control" in sys.modules, hasattr(envpool, "make_spec"))
+"""
+    assert output_of(code).splitlines() == ["", "True True"]
+
+
+@pytest.mark.exhaustive
+def test_envpool_knows_all_its_environments_without_its_games():
+    ids = "print(*envpool.list_all_envs())"
+    own = f"from rejeu.envs.registry import import_envpool; envpool = import_envpool(); {ids}"
+    assert output_of(own) == output_of(f"import envpool; {ids}")
+
+
+@pytest.mark.parametrize("entry", ["\nimport envpool.games.registration\n", "\nprint()\n", None])
+def test_an_envpool_of_another_layout_is_imported_as_it_is(entry, tmp_path, monkeypatch):
+    (tmp_path / "envpool").mkdir()
+    (tmp_path / "envpool" / "__init__.py").write_text("is_whole = True\n")
+    if entry is not None:
+        (tmp_path / "envpool" / "entry.py").write_text(f'"""Entry point."""\n{entry}')
+    monkeypatch.syspath_prepend(tmp_path)
+    for name in [name for name in sys.modules if name.partition(".")[0] == "envpool"]:
+        monkeypatch.delitem(sys.modules, name)
+    assert import_envpool().is_whole
+    monkeypatch.delitem(sys.modules, "envpool")
+    assert "envpool.entry" not in sys.modules
 
 
 def test_auto_uses_gymnasium_without_envpool(without_envpool):

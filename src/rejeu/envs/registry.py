@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import ast
 import difflib
 import importlib
 import importlib.util
 import re
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
-from types import SimpleNamespace
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -213,15 +216,41 @@ def newer_version(env_id: str) -> str | None:
 
 
 def import_envpool() -> Any:
-    """Returns the module ``envpool``, whose import takes half a second.
+    """Returns the module ``envpool``, which knows all its environments; the code of a game is imported when it is made.
+
+    ``import envpool`` itself imports every game, and Matplotlib with one of them, which takes half a second, only to execute
+    the modules that register their ids. These are executed alone here, where EnvPool's entry imports nothing else.
 
     Raises:
         MissingExtra: if it is not installed.
     """
-    try:
-        return importlib.import_module("envpool")
-    except ImportError:
-        raise MissingExtra("backend='envpool'", f"EnvPool ({ENVPOOL_SIZE})", "envpool") from None
+    if "envpool" in sys.modules or not (tables := _tables_of_envpool()):
+        try:
+            return importlib.import_module("envpool")
+        except ImportError:
+            raise MissingExtra("backend='envpool'", f"EnvPool ({ENVPOOL_SIZE})", "envpool") from None
+    sys.modules["envpool.entry"] = ModuleType("envpool.entry")
+    envpool = importlib.import_module("envpool")
+    for name, path in tables.items():
+        spec = importlib.util.spec_from_file_location(name, path)
+        assert spec is not None
+        assert spec.loader is not None
+        sys.modules[name] = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(sys.modules[name])
+    return envpool
+
+
+def _tables_of_envpool() -> dict[str, Path]:
+    """Returns the files of the modules that EnvPool's entry imports, by name; none if it does more than to import such."""
+    found = importlib.util.find_spec("envpool")
+    entry = Path(found.origin).with_name("entry.py") if found is not None and found.origin else None
+    if entry is None or not entry.is_file():
+        return {}
+    statements = ast.parse(entry.read_text(encoding="utf-8")).body[1:]  # the first is the docstring
+    names = [alias.name for one in statements if isinstance(one, ast.Import) for alias in one.names]
+    files = {name: entry.parents[1].joinpath(*name.split(".")).with_suffix(".py") for name in names}
+    are_tables = all(path.name == "registration.py" and path.is_file() for path in files.values())
+    return files if are_tables and all(isinstance(one, ast.Import) for one in statements) else {}
 
 
 def is_envpool_installed() -> bool:

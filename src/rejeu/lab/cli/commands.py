@@ -40,7 +40,7 @@ Return = Annotated[float | None, Shown("RETURN")]
 Folder = Annotated[Path | None, Shown("DIR")]
 Imports = Annotated[tuple[str, ...], Shown("MODULE", "import")]
 Assignments = tuple[str, ...]
-NoReport = Annotated[bool, Shown(help="Write no report.html at the end."), Group.OUTPUT]
+NoReport = Annotated[bool, Shown(help="Write no report.html and draw no curve.png at the end."), Group.OUTPUT]
 NoVideo = Annotated[bool, Shown(help="Record no video at the end."), Group.OUTPUT]
 Json = Annotated[
     bool, Shown(help="Print the result as one JSON document, and messages to standard error."), Group.OUTPUT

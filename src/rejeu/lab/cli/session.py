@@ -93,7 +93,7 @@ class Session(NamedTuple):
     is_new: bool
     """Whether the run begins here, rather than being resumed."""
     has_report: bool = True
-    """Whether ``report.html`` is written at the end."""
+    """Whether ``report.html`` and ``curve.png`` are written at the end."""
     has_video: bool = True
     """Whether a video is recorded at the end."""
     backend: str = ""
@@ -143,11 +143,11 @@ class Session(NamedTuple):
             if is_complete:
                 with leaving(f"interrupted after training; the models are saved in {folder.path}"):
                     evaluate_now(evaluate, agent)
-                    plot_curve(agent, folder, environment, evaluate)
+                    self.plot_curve(evaluate)
                     if self.has_video:
                         record_video(agent, folder, environment, self.config.seed, learning.outputs)
             else:
-                plot_curve(agent, folder, environment, evaluate)
+                self.plot_curve(evaluate)
                 again = f"rejeu record {quoted(folder.path)}{environment.run.again()}"
                 echo(f"no video of a run that was stopped; {again} makes one")
         except Exception:
@@ -218,6 +218,15 @@ class Session(NamedTuple):
             callbacks.append(Checkpoint(folder.checkpoints, minutes=config.checkpoint_minutes))
         return evaluate, callbacks
 
+    def plot_curve(self, evaluate: Evaluate) -> None:
+        """Plots the learning curve or prints why not, unless the run is to have no report."""
+        title = f"{self.environment.env_id}, {self.agent.name}"
+        try:
+            if self.has_report:
+                plots.learning_curve(self.agent.history, self.folder.curve, evaluations=evaluate.results, title=title)
+        except (ImportError, OSError) as error:
+            echo(f"no curve: {' '.join(str(error).split())}")
+
     def write_report(self) -> None:
         """Writes the page about the run, unless the run is to have none."""
         if self.has_report:
@@ -273,15 +282,6 @@ def saved_at_exit(agent: Agent, folder: RunFolder, evaluate: Evaluate) -> Iterat
 def save_model(agent: Agent, path: Path) -> None:
     """Saves a model, or warns and tries again at the end of the command."""
     agent.failed_writes.attempt(f"model {path}", agent.snapshot(path))
-
-
-def plot_curve(agent: Agent, folder: RunFolder, environment: Environment, evaluate: Evaluate) -> None:
-    """Plots the learning curve, or prints why not."""
-    title = f"{environment.env_id}, {agent.name}"
-    try:
-        plots.learning_curve(agent.history, folder.curve, evaluations=evaluate.results, title=title)
-    except (ImportError, OSError) as error:
-        echo(f"no curve: {' '.join(str(error).split())}")
 
 
 def record_video(
