@@ -75,16 +75,16 @@ class RowFiles:
         self.files = [one for one in self.files if (one[1] >= oldest).any()]
 
 
-def run_folder(agent: BaseAgent, folder: Path) -> RunFolder:
+def run_folder(agent: BaseAgent, folder: Path) -> CheckpointFolder:
     """Returns the folder of an agent's checkpoints, always the same object for the same path."""
     path = folder.resolve()
     if path not in agent.run_folders:
-        agent.run_folders[path] = RunFolder(agent, folder)
-    found: RunFolder = agent.run_folders[path]
+        agent.run_folders[path] = CheckpointFolder(agent, folder)
+    found: CheckpointFolder = agent.run_folders[path]
     return found
 
 
-class RunFolder:
+class CheckpointFolder:
     """A folder with the checkpoints of an agent's run. Mutable; see :meth:`Agent.run_folder`."""
 
     def __init__(self, agent: BaseAgent, folder: Path) -> None:

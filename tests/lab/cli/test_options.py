@@ -23,7 +23,7 @@ from rejeu.lab import hub
 from rejeu.lab.cli import clone, courses, main, models, resume, runs, sweep, train, tune
 from rejeu.lab.cli.commands import Train
 from rejeu.lab.cli.environment import Environment
-from rejeu.lab.cli.session import Limits, Session
+from rejeu.lab.cli.session import Session, TrainingLimits
 from rejeu.lab.experiments import study_plan
 from rejeu.lab.runs.config import DecidedRun, RunConfig, Task, write_task
 from rejeu.logs.evaluation import Evaluation
@@ -237,7 +237,7 @@ def test_train(sessions, tmp_path):
     content = json.loads((tmp_path / "run" / "config.json").read_text(encoding="utf-8"))
     assert {key: content[key] for key in GIVEN} == GIVEN
     assert (content["log"], content["hyperparameters"]["policy_kwargs"]["net_arch"]) == (["json"], [4])
-    assert session.limits == Limits(steps=70, pause_steps=20)
+    assert session.limits == TrainingLimits(steps=70, pause_steps=20)
     assert (session.has_report, session.has_video, session.is_new) == (False, False, True)
     agent = session.agent
     assert (agent.seed, agent.device, agent.success_threshold, agent.n_envs) == (5, "cpu", 3.0, 2)
@@ -284,7 +284,7 @@ def test_train_for_minutes_with_the_report_and_the_video(sessions, tmp_path):
     session, other = sessions
     assert (other.config.seed, other.has_report, other.has_video) == (6, True, False)
     assert other.folder == RunFolder(tmp_path / "other")
-    assert session.limits == Limits(minutes=2.0)
+    assert session.limits == TrainingLimits(minutes=2.0)
     assert session.has_report
     assert session.has_video
     assert session.config.checkpoint_minutes is None
@@ -309,7 +309,7 @@ def test_resume(spy, sessions, monkeypatch, tmp_path):
     argv = ["resume", str(tmp_path), "--restart-workers", "3", "--no-report", "--device", "cpu"]
     argv += ["--set", "gamma=0.5", "policy_kwargs.layer_norm=true"]
     assert main([*argv, "--steps", "20"]) == 0
-    assert sessions[-1].limits == Limits(pause_steps=20)
+    assert sessions[-1].limits == TrainingLimits(pause_steps=20)
     assert (sessions[-1].has_report, sessions[-1].has_video, sessions[-1].is_new) == (False, True, False)
     assert kind.resume.call_args.kwargs == {
         "device": "cpu",
@@ -323,15 +323,15 @@ def test_resume(spy, sessions, monkeypatch, tmp_path):
     assert evaluating["seed"] != 4
     assert written[-1]["config"].hyperparameters == {"gamma": 0.5}
     assert main([*argv, "--minutes", "2", "--no-video"]) == 0
-    assert sessions[-1].limits == Limits(pause_minutes=2.0)
+    assert sessions[-1].limits == TrainingLimits(pause_minutes=2.0)
     assert not sessions[-1].has_video
     assert main([*argv, "--steps", "80"]) == 0  # beyond the goal
-    assert sessions[-1].limits == Limits(steps=80)
+    assert sessions[-1].limits == TrainingLimits(steps=80)
     agent.training_call.is_over.return_value = True
     for words, limits in (
-        (["--steps", "8"], Limits(steps=8)),
-        (["--minutes", "2"], Limits(minutes=2.0)),
-        (["--finish"], Limits()),
+        (["--steps", "8"], TrainingLimits(steps=8)),
+        (["--minutes", "2"], TrainingLimits(minutes=2.0)),
+        (["--finish"], TrainingLimits()),
     ):
         assert main([*argv, *words]) == 0
         assert sessions[-1].limits == limits

@@ -13,7 +13,7 @@ import pytest
 from rejeu.callbacks.evaluate import Evaluated
 from rejeu.core import xla
 from rejeu.lab.cli import output, runs, session
-from rejeu.lab.cli.session import Limits
+from rejeu.lab.cli.session import TrainingLimits
 from rejeu.lab.reporting import run_list
 from rejeu.logs.evaluation import Evaluation
 from rejeu.logs.logging import CsvFile
@@ -45,8 +45,11 @@ def test_the_stopwatch_counts_from_its_start_and_compilation_is_what_the_clock_l
 def test_a_pause_is_due_after_so_many_further_steps_or_minutes(monkeypatch):
     now, agent = [1000.0], SimpleNamespace(num_timesteps=30)
     monkeypatch.setattr(xla, "clock", lambda: now[0])
-    by_minutes, by_steps = session.pause(agent, Limits(pause_minutes=2)), session.pause(agent, Limits(pause_steps=5))
-    never = session.pause(agent, Limits(steps=1, minutes=1))
+    by_minutes, by_steps = (
+        session.pause(agent, TrainingLimits(pause_minutes=2)),
+        session.pause(agent, TrainingLimits(pause_steps=5)),
+    )
+    never = session.pause(agent, TrainingLimits(steps=1, minutes=1))
     for seconds, steps, due in ((119, 34, False), (120, 35, True)):
         now[0], agent.num_timesteps = 1000.0 + seconds, steps
         assert (by_minutes(None), by_steps(None), never(None)) == (due, due, False)

@@ -42,7 +42,7 @@ def test_the_final_comparison_is_announced_with_its_length(tmp_path):
     study = studies.create(studies.StudyFolder(tmp_path), study_plan.make("Pendulum-v1", "SAC", steps=40, trials=2))
     found = "\n".join(tune_command.header(study, environment.Environment("Pendulum-v1", RunConfig(env="Pendulum-v1"))))
     assert "at the end    the best trial and the default: 5 fresh seeds each, 10 trainings of 40 steps\n" in found
-    ended = studies.Outcome(0, "complete", 1.0, {}, {}, 60.0, "")
+    ended = studies.Trial(0, "complete", 1.0, {}, {}, 60.0, "")
     assert tuning.announcement(study.plan, [ended] * 2, 2).endswith("10 trainings of 40 steps, about 5 min 0 s")
 
 

@@ -46,7 +46,7 @@ def make_plan(**changes):
     return plans.make("Pendulum-v1", "SAC", **{**given, **changes})
 
 
-def run(study, workers=1, stop=None, watch=lambda outcomes: None):
+def run(study, workers=1, stop=None, watch=lambda trials: None):
     return tuning.run(study, RunConfig(env="Pendulum-v1"), workers, stop or Interrupt(), watch, lambda text: None)
 
 
@@ -98,8 +98,8 @@ def test_a_study_with_one_worker_is_reproducible_and_another_seed_differs(whole,
 def test_an_interrupted_study_continues_as_if_it_had_not_been_interrupted(whole, tmp_path):
     stop = Interrupt()
 
-    def interrupt(outcomes):
-        if outcomes[-1].index == 2 and outcomes[-1].evaluations:
+    def interrupt(trials):
+        if trials[-1].index == 2 and trials[-1].evaluations:
             stop.signal = 2
 
     first = run(tuning.open_study(make_plan(final_seeds=0), tmp_path / "study"), stop=stop, watch=interrupt)
@@ -246,7 +246,7 @@ def test_the_verdict_is_that_of_the_interval_and_not_of_the_difference_alone(int
     }.items():
         monkeypatch.setattr(search, name, lambda *_, value=value, **__: value)
     monkeypatch.setattr(search, "MIN_FINAL_SEEDS", 0)
-    best = studies.Outcome(0, "complete", 1.0, {}, {}, 1.0, "")
+    best = studies.Trial(0, "complete", 1.0, {}, {}, 1.0, "")
     final = search.compared(SimpleNamespace(plan=make_plan(), folder=StudyFolder(Path()), preset_of=print), best, [])
     assert (final.verdict, final.difference, final.measure) == (verdict, found, "return")
 
@@ -260,9 +260,9 @@ def test_the_best_trial_is_a_complete_one_and_of_equals_the_first():
         ("complete", 2.0),
         ("running", 7.0),
     ]
-    outcomes = [studies.Outcome(i, state, value, {}, {}, 1.0, "") for i, (state, value) in enumerate(trials)]
-    assert studies.best_of(outcomes).index == 2
-    assert studies.best_of([outcomes[0], outcomes[3], outcomes[5]]) is None
+    trials = [studies.Trial(i, state, value, {}, {}, 1.0, "") for i, (state, value) in enumerate(trials)]
+    assert studies.best_of(trials).index == 2
+    assert studies.best_of([trials[0], trials[3], trials[5]]) is None
 
 
 def test_trainings_are_those_of_the_plan_and_as_many_at_once_as_asked(tmp_path, monkeypatch):
@@ -339,8 +339,8 @@ def test_the_value_of_a_trial_must_be_finite(tmp_path):
     study = tuning.open_study(make_plan(), tmp_path / "study")
     trial, index, _ = study.take()
     study.finish(trial, index, "complete", math.nan)
-    assert study.outcomes()[0].state == "failed"
-    assert study.outcomes()[0].reason == "its last evaluation has the return nan"
+    assert study.trials()[0].state == "failed"
+    assert study.trials()[0].reason == "its last evaluation has the return nan"
 
 
 def test_processes_are_ended_if_the_search_ends_by_an_error(tmp_path):
@@ -348,7 +348,7 @@ def test_processes_are_ended_if_the_search_ends_by_an_error(tmp_path):
     search = Search(study, RunConfig(env="Pendulum-v1"), 1, Interrupt())
     begun = []
 
-    def fail(outcomes):
+    def fail(trials):
         begun.extend(attempt.handle for attempt in search.scheduler.running)
         if begun:
             raise OSError("the disk is full")

@@ -17,7 +17,7 @@ from rejeu.envs.make import WorkerOptions
 from rejeu.lab.cli import environment as environments, sweep, tune
 from rejeu.lab.cli.commands import Resume
 from rejeu.lab.cli.output import Stopwatch, echo
-from rejeu.lab.cli.session import Limits, Session, has_reached_goal, make_evaluation_env
+from rejeu.lab.cli.session import Session, TrainingLimits, has_reached_goal, make_evaluation_env
 from rejeu.lab.experiments.folder import is_sweep
 from rejeu.lab.experiments.study import StudyFolder
 from rejeu.lab.runs import config as configs_of_runs
@@ -93,7 +93,7 @@ def is_evaluated(run: Path, agent: Agent) -> bool:
     return agent.num_timesteps in read_table(RunFolder(run).evaluations, ("step",)).column("step")
 
 
-def choose_limits(agent: Agent, arguments: Resume) -> Limits:
+def choose_limits(agent: Agent, arguments: Resume) -> TrainingLimits:
     """Returns how far to train: to the goal of the run, to a pause before it, or further than it.
 
     Raises:
@@ -102,15 +102,15 @@ def choose_limits(agent: Agent, arguments: Resume) -> Limits:
     steps, minutes = arguments.steps, arguments.minutes
     if has_reached_goal(agent):
         if arguments.finish or (steps is None and minutes is None and not is_evaluated(arguments.run, agent)):
-            return Limits()
+            return TrainingLimits()
         if steps is None and minutes is None:
             raise ValueError(
                 f"the run is complete after {agent.num_timesteps:,} steps; to train further: "
                 f"rejeu resume {quoted(arguments.run)} --steps N, or --minutes M"
             )
-        return Limits(steps, minutes)
+        return TrainingLimits(steps, minutes)
     assert agent.training_call is not None
     last = agent.training_call.last_step
     if steps is not None and last is not None and agent.run.step + steps > last:
-        return Limits(steps)
-    return Limits(pause_steps=steps, pause_minutes=minutes)
+        return TrainingLimits(steps)
+    return TrainingLimits(pause_steps=steps, pause_minutes=minutes)

@@ -51,7 +51,7 @@ def installed_logs(arguments: Train) -> tuple[str, ...]:
     return logs
 
 
-class Limits(NamedTuple):
+class TrainingLimits(NamedTuple):
     """What ends training."""
 
     steps: int | None = None
@@ -89,7 +89,7 @@ class Session(NamedTuple):
     folder: RunFolder
     environment: Environment
     evaluation_env: VectorEnv
-    limits: Limits
+    limits: TrainingLimits
     is_new: bool
     """Whether the run begins here, rather than being resumed."""
     has_report: bool = True
@@ -106,7 +106,7 @@ class Session(NamedTuple):
     @property
     def is_over(self) -> bool:
         """Whether there is nothing left to train, so that only files are written."""
-        return not self.is_new and self.limits == Limits() and has_reached_goal(self.agent)
+        return not self.is_new and self.limits == TrainingLimits() and has_reached_goal(self.agent)
 
     def run(self, stop: Interrupt, stopwatch: Stopwatch) -> tuple[int, dict[str, Any]]:
         """Trains, evaluates, plots and records a video; prints a summary, and returns the exit status and the result.
@@ -251,7 +251,7 @@ def has_reached_goal(agent: Agent) -> bool:
     return agent.training_call is None or agent.training_call.is_over(agent.run.step, agent.run.episode)
 
 
-def pause(agent: Agent, limits: Limits) -> Callable[[Progress], bool]:
+def pause(agent: Agent, limits: TrainingLimits) -> Callable[[Progress], bool]:
     """Returns a function that returns whether a pause is due after a turn of the loop."""
     last_step = None if limits.pause_steps is None else agent.num_timesteps + limits.pause_steps
     until = None if limits.pause_minutes is None else xla.clock() + 60 * limits.pause_minutes

@@ -28,7 +28,7 @@ from rejeu.lab.cli.session import Session, installed_logs, make_evaluation_env
 from rejeu.lab.experiments.folder import Plan, SweepFolder, open_folder, read_folder
 from rejeu.lab.experiments.process import LocalLauncher, default_workers, hold, threads_of
 from rejeu.lab.experiments.sweep import SweepResult, imports_of, make_launcher, prepare, states_text, train
-from rejeu.lab.experiments.work import Job, Outcome, Work, again
+from rejeu.lab.experiments.work import Job, RunOutcome, Work, again
 from rejeu.lab.reporting.comparison import By, Comparison, compare
 from rejeu.lab.runs import config as configs
 from rejeu.lab.runs.config import RunConfig
@@ -75,7 +75,7 @@ def complete(
 
 
 def finish(
-    folder: SweepFolder, outcomes: list[Outcome], typed: RunConfig, stop: Interrupt
+    folder: SweepFolder, outcomes: list[RunOutcome], typed: RunConfig, stop: Interrupt
 ) -> tuple[int, list[dict[str, Any]] | None]:
     """Says what has become of the jobs and compares the runs.
 
@@ -125,7 +125,7 @@ def train_all(arguments: Train) -> tuple[int, dict[str, Any]]:
 
 
 def finish_seeds(
-    folder: SweepFolder, outcomes: list[Outcome], arguments: Train, stop: Interrupt
+    folder: SweepFolder, outcomes: list[RunOutcome], arguments: Train, stop: Interrupt
 ) -> tuple[int, dict[str, Any]]:
     """Compares the seeds; returns the exit status and the result."""
     status, comparison = finish(folder, outcomes, arguments, stop)

@@ -27,7 +27,7 @@ from rejeu.lab.cli import check, environment, sweep
 from rejeu.lab.cli.commands import Train
 from rejeu.lab.cli.environment import Environment
 from rejeu.lab.cli.output import Stopwatch, echo, header
-from rejeu.lab.cli.session import Limits, Session, installed_logs, make_evaluation_env
+from rejeu.lab.cli.session import Session, TrainingLimits, installed_logs, make_evaluation_env
 from rejeu.lab.runs import config as runs
 from rejeu.lab.runs.config import DecidedRun, merged
 
@@ -93,7 +93,7 @@ def begin(arguments: Train, seed: int, stack: ExitStack) -> Session:
         RunFolder(Path()),
         made,
         stack.enter_context(closing(make_evaluation_env(config, made))),
-        Limits(config.steps, config.minutes, pause_steps=arguments.pause),
+        TrainingLimits(config.steps, config.minutes, pause_steps=arguments.pause),
         is_new=True,
         has_report=not arguments.no_report,
         has_video=not arguments.no_video,

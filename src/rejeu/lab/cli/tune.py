@@ -16,8 +16,8 @@ from rejeu.lab.cli.environment import Environment
 from rejeu.lab.cli.output import echo
 from rejeu.lab.experiments import space, study as studies, study_plan as plans, tune as tuning
 from rejeu.lab.experiments.search import Watch
-from rejeu.lab.experiments.study import Outcome, Study, StudyFolder
-from rejeu.lab.experiments.study_plan import Plan
+from rejeu.lab.experiments.study import Study, StudyFolder, Trial
+from rejeu.lab.experiments.study_plan import StudyPlan
 from rejeu.lab.experiments.sweep import Row, bars
 from rejeu.lab.runs.config import RunConfig, apply
 from rejeu.logs import formatting
@@ -64,7 +64,7 @@ def usable_environment(arguments: Tune) -> Environment:
     return made
 
 
-def environment_of(plan: Plan, what: str, arguments: Resume) -> Environment:
+def environment_of(plan: StudyPlan, what: str, arguments: Resume) -> Environment:
     """Returns the environment of a study.
 
     Raises:
@@ -136,25 +136,25 @@ def display(study: Study) -> Iterator[Watch]:
         return
     with bars(console) as show:
 
-        def watch(outcomes: list[Outcome]) -> None:
-            lines(outcomes)
-            show(rows(outcomes, study.plan))
+        def watch(trials: list[Trial]) -> None:
+            lines(trials)
+            show(rows(trials, study.plan))
 
         yield watch
 
 
-def rows(outcomes: list[Outcome], plan: Plan) -> list[Row]:
+def rows(trials: list[Trial], plan: StudyPlan) -> list[Row]:
     """Returns a row for the whole study, and one for each trial that runs.
 
     >>> rows([], plans.make("Pendulum-v1"))
     [Row(name='trials', done=0, total=30, text='0 of 30 trials have ended')]
     """
-    ended = sum(one.state in ("complete", "pruned", "failed") for one in outcomes)
+    ended = sum(one.state in ("complete", "pruned", "failed") for one in trials)
     text = f"{ended} of {plan.trials} trials have ended"
-    if (best := studies.best_of(outcomes)) is not None:
+    if (best := studies.best_of(trials)) is not None:
         text += f", best {plan.measure} {number(best.value)} (trial {best.index})"
     found = [Row("trials", ended, plan.trials, text)]
-    for one in outcomes:
+    for one in trials:
         if one.state == "running":
             step = max(one.evaluations, default=0)
             about = f"{step:,} of {plan.steps:,} steps, {plan.measure} {number(one.value)}  {tuning.settings(one)}"
@@ -165,7 +165,7 @@ def rows(outcomes: list[Outcome], plan: Plan) -> list[Row]:
 def header(study: Study, made: Environment) -> list[str]:
     """Returns the first lines of a study."""
     plan = study.plan
-    done = sum(one.state not in ("waiting", "running") for one in study.outcomes())
+    done = sum(one.state not in ("waiting", "running") for one in study.trials())
     seeds = f", {plan.trial_seeds} seeds each" if plan.trial_seeds > 1 else ""
     return [
         f"environment   {made}, {plan.n_envs} at once",

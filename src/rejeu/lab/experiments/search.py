@@ -22,7 +22,7 @@ from rejeu.core import validation
 from rejeu.core.interrupt import Interrupt
 from rejeu.lab.experiments.process import LocalLauncher
 from rejeu.lab.experiments.scheduler import Scheduler
-from rejeu.lab.experiments.study import Outcome, State, Study
+from rejeu.lab.experiments.study import State, Study, Trial
 from rejeu.lab.experiments.study_plan import MIN_FINAL_SEEDS, Measure
 from rejeu.lab.experiments.work import Job, Work
 from rejeu.lab.reporting.comparison import Comparison, compare
@@ -40,7 +40,7 @@ DEFAULT = "default"
 SAMPLES = 10_000
 """Bootstrap samples of the difference."""
 
-Watch = Callable[["list[Outcome]"], object]
+Watch = Callable[["list[Trial]"], object]
 """Called with all trials when one has begun, was evaluated, or has ended."""
 Verdict = Literal["better", "worse", "no difference found", "the default itself", "not compared"]
 
@@ -127,7 +127,7 @@ class Search:
         has_news = self.advance()
         is_over = self.stop.requested or bool(self.scheduler.left)
         if (not is_over and self.begin()) or has_news:
-            self.watch(self.study.outcomes())
+            self.watch(self.study.trials())
         return bool(self.running) or not (is_over or self.study.is_searched())
 
     def begin(self) -> bool:
@@ -191,7 +191,7 @@ class Final:
         return f"on fresh seeds the winner is {self.verdict} than the default {text}"
 
 
-def winner_name(best: Outcome) -> str:
+def winner_name(best: Trial) -> str:
     """Returns the name of the winner's folder and group."""
     return f"trial_{best.index:04d}"
 
@@ -203,7 +203,7 @@ def is_default(study: Study, winner: Preset) -> bool:
     return next(own) == next(own)
 
 
-def final_trainings(study: Study, best: Outcome, run: RunConfig) -> list[Work]:
+def final_trainings(study: Study, best: Trial, run: RunConfig) -> list[Work]:
     """Returns all trainings of the comparison, in pairs; their presets are written."""
     named = {
         winner_name(best): study.preset_of(best, f"trial {best.index}"),
@@ -231,7 +231,7 @@ def train_final(tasks: Sequence[Work], workers: int, stop: Interrupt, echo: Call
     return [f"{task.name}: {task.reason}" for task in tasks if task.ending in ("failed", "left")]
 
 
-def compared(study: Study, best: Outcome, failed: list[str]) -> Final:
+def compared(study: Study, best: Trial, failed: list[str]) -> Final:
     """Returns the comparison of the trainings that are there."""
     if is_default(study, study.preset_of(best, "")):
         return Final("the default itself", None, None, ())

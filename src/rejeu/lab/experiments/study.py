@@ -33,7 +33,7 @@ from rejeu.core.errors import CheckpointError, MissingExtra
 from rejeu.core.records import json_text
 from rejeu.lab.experiments import space as spaces, study_plan as plans
 from rejeu.lab.experiments.process import hold
-from rejeu.lab.experiments.study_plan import Plan
+from rejeu.lab.experiments.study_plan import StudyPlan
 from rejeu.lab.reporting.runs import is_locked
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ State = Literal["waiting", "running", "complete", "pruned", "failed"]
 
 
 @dataclass(frozen=True)
-class Outcome:
+class Trial:
     """What is known of one trial."""
 
     index: int
@@ -100,7 +100,7 @@ class Study:
     """An open study. Mutable."""
 
     folder: StudyFolder
-    plan: Plan
+    plan: StudyPlan
     optuna_study: optuna.Study
     held: dict[int, FileLock] = field(default_factory=dict)
     """Locks of the trials that this process trains, by index."""
@@ -177,19 +177,19 @@ class Study:
         if index in self.held:
             self.held.pop(index).release()
 
-    def outcomes(self) -> list[Outcome]:
+    def trials(self) -> list[Trial]:
         """Returns all trials by index, each once."""
         with readable(self.folder.journal):
             trials = self.optuna_study.get_trials(deepcopy=False)
-            found = {one.user_attrs[INDEX]: self.outcome(one) for one in trials if INDEX in one.user_attrs}
+            found = {one.user_attrs[INDEX]: self.trial_of(one) for one in trials if INDEX in one.user_attrs}
         return [found[index] for index in sorted(found)]
 
-    def outcome(self, trial: optuna.trial.FrozenTrial) -> Outcome:
+    def trial_of(self, trial: optuna.trial.FrozenTrial) -> Trial:
         """Returns what is known of a trial of Optuna."""
         states: dict[str, State] = {"FAIL": "failed", "COMPLETE": "complete", "PRUNED": "pruned", "RUNNING": "running"}
         last = trial.intermediate_values.get(trial.last_step) if trial.last_step is not None else None
         value = trial.value if trial.value is not None else last
-        return Outcome(
+        return Trial(
             index=int(trial.user_attrs[INDEX]),
             state=states.get(trial.state.name, "waiting"),
             value=math.nan if value is None else float(value),
@@ -201,20 +201,20 @@ class Study:
 
     def is_searched(self) -> bool:
         """Returns whether all trials have ended."""
-        ended = [one for one in self.outcomes() if one.state in ("complete", "pruned", "failed")]
+        ended = [one for one in self.trials() if one.state in ("complete", "pruned", "failed")]
         return len(ended) >= self.plan.trials
 
-    def preset_of(self, outcome: Outcome, source: str) -> Preset:
+    def preset_of(self, trial: Trial, source: str) -> Preset:
         """Returns a trial as a preset."""
-        return self.plan.preset(spaces.applied(self.plan.fixed, outcome.values), source)
+        return self.plan.preset(spaces.applied(self.plan.fixed, trial.values), source)
 
 
-def best_of(outcomes: list[Outcome]) -> Outcome | None:
+def best_of(trials: list[Trial]) -> Trial | None:
     """Returns the complete trial with the highest value, of equals the first; None without one."""
-    return max((one for one in outcomes if one.state == "complete"), key=lambda one: one.value, default=None)
+    return max((one for one in trials if one.state == "complete"), key=lambda one: one.value, default=None)
 
 
-def create(folder: StudyFolder, plan: Plan) -> Study:
+def create(folder: StudyFolder, plan: StudyPlan) -> Study:
     """Creates a study; its first trial has the values of the default, as far as they lie in the search space."""
     require()
     atomic.make_folder(folder.path)
@@ -227,7 +227,7 @@ def create(folder: StudyFolder, plan: Plan) -> Study:
     return Study(folder, plan, study)
 
 
-def join(folder: StudyFolder, plan: Plan | None = None) -> Study:
+def join(folder: StudyFolder, plan: StudyPlan | None = None) -> Study:
     """Opens a study that exists; with ``plan`` it must be that of the study, except for the number of trials and final seeds.
 
     Raises:
@@ -248,7 +248,7 @@ def join(folder: StudyFolder, plan: Plan | None = None) -> Study:
         return Study(folder, there, connect(folder, there))
 
 
-def connect(folder: StudyFolder, plan: Plan) -> optuna.Study:
+def connect(folder: StudyFolder, plan: StudyPlan) -> optuna.Study:
     """Returns Optuna's study of a folder, which is created if it does not exist.
 
     Raises:
@@ -319,7 +319,7 @@ def make_sampler(seed: int) -> optuna.samplers.BaseSampler:
     return TPESampler(seed=seed, constant_liar=True)
 
 
-def make_pruner(plan: Plan) -> optuna.pruners.BasePruner:
+def make_pruner(plan: StudyPlan) -> optuna.pruners.BasePruner:
     """Returns the pruner of a plan.
 
     ``median`` prunes a trial below the median of the earlier trials at the same step, after a third of its steps;

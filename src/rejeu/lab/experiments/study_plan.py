@@ -38,7 +38,7 @@ Measure = Literal["return", "success"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Plan:
+class StudyPlan:
     """The settings of a study. Everything that a repetition needs, except for the number of workers."""
 
     env_id: Annotated[str, Meta(pattern=r"^[\w./:-]{1,200}$")]
@@ -138,7 +138,7 @@ def make(
     evaluate_every: int | None = None,
     evaluate_episodes: int | None = None,
     **others: Any,
-) -> Plan:
+) -> StudyPlan:
     """Returns the plan of a study, completed by the preset or the defaults, after all checks that need no training.
 
     ``fixed`` are hyperparameters that are set instead of searched, and ``others`` are further fields of the plan. The rest is
@@ -153,7 +153,7 @@ def make(
     values = {**base.hyperparameters, **fixed}
     space = choose_space(base.algorithm, values, fixed, search or {}, only)
     total = validation.whole("steps", steps or base.total_steps, least=1)
-    plan = Plan(
+    plan = StudyPlan(
         env_id=env_id,
         env_argument=env_argument or env_id,
         env_kwargs=dict(env_kwargs or {}),
@@ -174,7 +174,7 @@ def make(
             f"final_seeds={plan.final_seeds} cannot tell luck from a difference; give {MIN_FINAL_SEEDS} or more, or 0"
         )
     try:  # as it is read again, so that a study begins and goes on with the same
-        return convert(json.loads(json_text(plan)), Plan)
+        return convert(json.loads(json_text(plan)), StudyPlan)
     except CheckpointError as error:
         raise ValueError(str(error)) from None
     except TypeError as error:
@@ -231,7 +231,7 @@ def is_set(fixed: Mapping[str, Any], name: str) -> bool:
     return head in fixed and (not rest or not isinstance(inner, Mapping) or is_set(inner, rest))
 
 
-def read(path: Path) -> Plan:
+def read(path: Path) -> StudyPlan:
     """Returns the plan of a ``study.json``, which is untrusted.
 
     Raises:
@@ -241,14 +241,14 @@ def read(path: Path) -> Plan:
     if not path.is_file():
         raise FileNotFoundError(f"{path.parent} is no study folder: it holds no {path.name}")
     try:
-        plan = convert(read_json(path, MAX_BYTES), Plan)
+        plan = convert(read_json(path, MAX_BYTES), StudyPlan)
         check(plan, path)
         return plan
     except (ValueError, TypeError) as error:
         raise CheckpointError(f"{path} is damaged: {shown(error, 1000)}") from None
 
 
-def check(plan: Plan, path: Path) -> None:
+def check(plan: StudyPlan, path: Path) -> None:
     """Raises ``ValueError`` or ``TypeError`` if the algorithm of a plan from a file does not take its hyperparameters."""
     config_class = agent_of_file(plan.algorithm, path).algorithm.Config
     for name, dimension in plan.search_space.items():
@@ -256,16 +256,16 @@ def check(plan: Plan, path: Path) -> None:
             validation.build(config_class, spaces.applied(plan.fixed, {name: value}))
 
 
-def default_values(plan: Plan) -> dict[str, Any]:
+def default_values(plan: StudyPlan) -> dict[str, Any]:
     """Returns the values of the searched hyperparameters in the default, as far as they lie in the search space."""
     config = validation.build(AGENTS[plan.algorithm].algorithm.Config, plan.fixed)
     values = spaces.values_at(configs.to_json(config), plan.search_space)
     return {name: value for name, value in values.items() if plan.search_space[name].contains(value)}
 
 
-def difference(plan: Plan, other: Plan) -> str:
+def difference(plan: StudyPlan, other: StudyPlan) -> str:
     """Returns the first setting in which two plans differ and which a study cannot change, as text; empty if none does."""
-    for one in dataclasses.fields(Plan):
+    for one in dataclasses.fields(StudyPlan):
         ours, theirs = getattr(plan, one.name), getattr(other, one.name)
         if one.name not in ("trials", "final_seeds", "checkpoint_minutes") and ours != theirs:
             return f"{one.name} is {str(ours)[:100]} there, not {str(theirs)[:100]}"

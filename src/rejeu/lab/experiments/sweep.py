@@ -22,7 +22,7 @@ from rejeu.lab.experiments.folder import SweepFolder, open_folder, read_folder
 from rejeu.lab.experiments.plan import read_plan
 from rejeu.lab.experiments.process import LocalLauncher, default_workers, threads_of
 from rejeu.lab.experiments.scheduler import Launcher, Scheduler
-from rejeu.lab.experiments.work import HIDDEN, JobProgress, Outcome
+from rejeu.lab.experiments.work import HIDDEN, JobProgress, RunOutcome
 from rejeu.lab.runs.config import RunConfig
 from rejeu.logs import formatting
 
@@ -66,7 +66,7 @@ class SweepResult:
 
     path: Path
     """Folder of the sweep."""
-    outcomes: tuple[Outcome, ...]
+    outcomes: tuple[RunOutcome, ...]
     """The outcome of each job."""
 
     @property
@@ -75,7 +75,7 @@ class SweepResult:
         return [one.path for one in self.outcomes if one.state == "done"]
 
     @property
-    def failed(self) -> list[Outcome]:
+    def failed(self) -> list[RunOutcome]:
         """The jobs that failed; the log of each says why."""
         return [one for one in self.outcomes if one.state == "failed"]
 
@@ -302,7 +302,7 @@ def text_of(progress: JobProgress, steps: int | None) -> str:
     return f"{progress.step:,}{asked} steps{''.join(known)}"
 
 
-def states_text(outcomes: Iterable[Outcome]) -> str:
+def states_text(outcomes: Iterable[RunOutcome]) -> str:
     """Returns how many runs are in each state, such as ``2 running, 3 done``."""
     found = count(one.state for one in outcomes)
     return ", ".join(f"{number} {state}" for state, number in found.items() if number)

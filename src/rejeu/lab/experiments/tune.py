@@ -22,8 +22,8 @@ from rejeu.core.interrupt import Interrupt
 from rejeu.lab.experiments import search as searches, study as studies, study_plan as plans
 from rejeu.lab.experiments.process import default_workers
 from rejeu.lab.experiments.search import Final, Search, Watch
-from rejeu.lab.experiments.study import Outcome, Study, StudyFolder
-from rejeu.lab.experiments.study_plan import Measure, Plan, Pruner
+from rejeu.lab.experiments.study import Study, StudyFolder, Trial
+from rejeu.lab.experiments.study_plan import Measure, Pruner, StudyPlan
 from rejeu.lab.reporting.report.sections import duration
 from rejeu.lab.runs.config import RunConfig
 from rejeu.logs.formatting import number
@@ -37,11 +37,11 @@ class Result:
 
     folder: Path
     """The study folder."""
-    plan: Plan
+    plan: StudyPlan
     """The settings of the study."""
-    trials: tuple[Outcome, ...]
+    trials: tuple[Trial, ...]
     """All trials that have begun, by index."""
-    best: Outcome | None
+    best: Trial | None
     """The complete trial with the highest value; None if no trial is complete."""
     final: Final | None
     """The comparison with the default; None before it."""
@@ -173,7 +173,7 @@ def tune(
     return result
 
 
-def open_study(plan: Plan, folder: Path | None) -> Study:
+def open_study(plan: StudyPlan, folder: Path | None) -> Study:
     """Returns the study of a folder, which is created if it is new or empty; None makes one under ``runs``.
 
     Raises:
@@ -219,15 +219,15 @@ def run(
     config = dataclasses.replace(config, checkpoint_minutes=plan.checkpoint_minutes)
     search = Search(study, config, at_once, stop)
     search.run(watch)
-    outcomes = study.outcomes()
-    best = studies.best_of(outcomes)
+    trials = study.trials()
+    best = studies.best_of(trials)
     compared = None
     if best is not None:
         presets.write(study.preset_of(best, source(study, best)), folder.preset)
     if best is not None and not stop.requested and plan.final_seeds:
         failed: list[str] = []
         if not searches.is_default(study, study.preset_of(best, "")):
-            echo(f"comparing trial {best.index} with the default: {announcement(plan, outcomes, at_once)}")
+            echo(f"comparing trial {best.index} with the default: {announcement(plan, trials, at_once)}")
             failed = searches.train_final(searches.final_trainings(study, best, config), at_once, stop, echo)
         compared = None if stop.requested else searches.compared(study, best, failed)
     complete = study.is_searched() and not stop.requested and not (compared and compared.failed)
@@ -238,23 +238,23 @@ def run(
             echo(f"page          {folder.page}")
         except (MissingExtra, OSError) as error:
             notes.append(f"no {folder.page.name}: {error}")
-    return Result(folder.path, plan, tuple(outcomes), best, compared, complete, stop.signal, tuple(notes))
+    return Result(folder.path, plan, tuple(trials), best, compared, complete, stop.signal, tuple(notes))
 
 
-def announcement(plan: Plan, outcomes: Sequence[Outcome] = (), workers: int = 1) -> str:
+def announcement(plan: StudyPlan, trials: Sequence[Trial] = (), workers: int = 1) -> str:
     """Returns what the final comparison trains, and about how long that takes if trials have ended.
 
     >>> announcement(plans.make("Pendulum-v1", steps=2000))
     '5 fresh seeds each, 10 trainings of 2,000 steps'
     """
     text = f"{plan.final_seeds} fresh seeds each, {2 * plan.final_seeds} trainings of {plan.steps:,} steps"
-    seconds = [one.seconds for one in outcomes if one.state == "complete" and math.isfinite(one.seconds)]
+    seconds = [one.seconds for one in trials if one.state == "complete" and math.isfinite(one.seconds)]
     if not seconds:
         return text
     return f"{text}, about {duration(sum(seconds) / len(seconds) * math.ceil(2 * plan.final_seeds / workers))}"
 
 
-def source(study: Study, best: Outcome) -> str:
+def source(study: Study, best: Trial) -> str:
     """Returns where a winner comes from, for its preset."""
     return (
         f"rejeu tune: trial {best.index} of {study.plan.trials}, mean {study.plan.measure} {number(best.value)} of the last "
@@ -264,11 +264,11 @@ def source(study: Study, best: Outcome) -> str:
 
 def lines(echo: Echo, study: Study) -> Watch:
     """Returns a function that prints a line for each trial that has ended since the last call."""
-    known = {one.index for one in study.outcomes() if one.state not in ("waiting", "running")}
+    known = {one.index for one in study.trials() if one.state not in ("waiting", "running")}
 
-    def watch(outcomes: list[Outcome]) -> None:
-        best = studies.best_of(outcomes)
-        for one in outcomes:
+    def watch(trials: list[Trial]) -> None:
+        best = studies.best_of(trials)
+        for one in trials:
             if one.state in ("waiting", "running") or one.index in known:
                 continue
             known.add(one.index)
@@ -277,18 +277,18 @@ def lines(echo: Echo, study: Study) -> Watch:
     return watch
 
 
-def line(outcome: Outcome, plan: Plan) -> str:
+def line(trial: Trial, plan: StudyPlan) -> str:
     """Returns a trial on one line."""
-    values = settings(outcome)
-    if outcome.state == "failed":
-        return f"trial {outcome.index:>3}  failed: {outcome.reason}  {values}"
-    at = f" at step {max(outcome.evaluations, default=0):,}" if outcome.state == "pruned" else ""
-    return f"trial {outcome.index:>3}  {outcome.state}{at}  {plan.measure} {number(outcome.value)}  {values}"
+    values = settings(trial)
+    if trial.state == "failed":
+        return f"trial {trial.index:>3}  failed: {trial.reason}  {values}"
+    at = f" at step {max(trial.evaluations, default=0):,}" if trial.state == "pruned" else ""
+    return f"trial {trial.index:>3}  {trial.state}{at}  {plan.measure} {number(trial.value)}  {values}"
 
 
-def settings(outcome: Outcome) -> str:
+def settings(trial: Trial) -> str:
     """Returns the hyperparameters of a trial, on one line."""
-    return " ".join(f"{name}={short(value)}" for name, value in outcome.values.items())
+    return " ".join(f"{name}={short(value)}" for name, value in trial.values.items())
 
 
 def short(value: Any) -> str:

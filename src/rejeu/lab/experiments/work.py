@@ -127,7 +127,7 @@ class JobProgress(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Outcome:
+class RunOutcome:
     """The outcome of one job."""
 
     job: Job
@@ -197,10 +197,10 @@ class Work:
             return "failed"
         return "stopped" if self.path.is_dir() else "waiting"
 
-    def outcome(self) -> Outcome:
+    def outcome(self) -> RunOutcome:
         """Returns what has become of it."""
         status = self.exit_status() if self.status is None else self.status
-        return Outcome(self.job, self.state(), status, self.path, self.log)
+        return RunOutcome(self.job, self.state(), status, self.path, self.log)
 
     def has_result(self) -> bool:
         """Returns whether its files contain what it was trained for."""
