@@ -56,6 +56,13 @@ def test_next_actions_are_those_of_the_next_observation_in_the_same_episode(n_st
     np.testing.assert_allclose(batch.next_action[..., 0], expected, atol=1e-6)
 
 
+@pytest.mark.parametrize(("name", "field"), [("TD3BC", "alpha"), ("ReBRAC", "actor_bc")])
+def test_a_setting_that_depends_on_the_data_is_named_where_it_was_left_to_its_default(name: str, field: str) -> None:
+    config = rejeu.AGENTS[name].algorithm.Config
+    assert field in config().doubts(1)
+    assert config(**{field: 0.1}).doubts(1) == ""
+
+
 def test_the_target_network_of_q_learning_follows_the_updates() -> None:
     env, known = shown("Discrete", 2)
     networks = {}

@@ -60,6 +60,15 @@ class Config(td3.Config):
         coerce(self, ("actor_bc", "critic_bc"), number, least=0)
         coerce(self, "critic_layer_norm", flag)
 
+    def doubts(self, n_envs: int) -> str:
+        """Returns a warning if how far actions may go from those in the data was left to the default."""
+        if self.actor_bc != type(self).actor_bc:
+            return ""
+        return (
+            "how far ReBRAC may go from the recorded actions depends on the data, and actor_bc=0.01 may learn nothing from "
+            "few good episodes among many random ones; try 0.001 to 0.3 (rejeu tune does), or IQL, and evaluate"
+        )
+
 
 def make(config: Config, observation_space: spaces.Space, action_space: spaces.Space) -> Algorithm:
     """Returns ReBRAC for these spaces; raises as :func:`rejeu.algorithms.td3.make` does."""

@@ -49,6 +49,15 @@ class Config(td3.Config):
         td3.Config.__post_init__(self)
         coerce(self, "alpha", number, least=0)
 
+    def doubts(self, n_envs: int) -> str:
+        """Returns a warning if how far actions may go from those in the data was left to the default."""
+        if self.alpha != type(self).alpha:
+            return ""
+        return (
+            "how far TD3+BC may go from the recorded actions depends on the data, and alpha=2.5 may learn nothing from "
+            "few good episodes among many random ones; try 0.3 to 30 (rejeu tune does), or IQL, and evaluate"
+        )
+
 
 def make(config: Config, observation_space: spaces.Space, action_space: spaces.Space) -> Algorithm:
     """Returns TD3+BC for these spaces; raises as :func:`rejeu.algorithms.td3.make` does."""

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -396,6 +397,8 @@ def learn_offline(
     run, updates = agent.run, whole("updates", updates, least=1)
     if run.env is None:
         raise ValueError("this agent has no environment, and so no replay buffer; give one to load(path, env=...)")
+    if not run.n_updates and (doubt := agent.config.doubts(run.env.n_envs)):
+        warnings.warn(doubt, UserWarning, stacklevel=2)
     replay, done = agent.replay_of(demonstrations, run.env), 0
     if not keep_policy:
         observe(agent, demonstrations)
