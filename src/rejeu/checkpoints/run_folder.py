@@ -72,6 +72,12 @@ def newest_inside(folder: Path) -> str:
     return f"; the newest of the {len(configs)} in it is {quoted(newest.parent)}"
 
 
+def dated(*names: str | None) -> Path:
+    """Returns the path of a folder under ``runs``, of these names, those that are None left out, and the time."""
+    stem = "-".join([*filter(None, names), time.strftime("%Y%m%d-%H%M%S")])
+    return Path("runs") / re.sub(r"[^\w.-]+", "-", stem)
+
+
 def create(out: Path | None, env_id: str, algorithm: str, seed: int) -> RunFolder:
     """Makes an empty folder: ``out``, or a new one under ``runs`` named after the run and the time.
 
@@ -82,10 +88,9 @@ def create(out: Path | None, env_id: str, algorithm: str, seed: int) -> RunFolde
         check_free(out)
         out.mkdir(parents=True, exist_ok=True)
         return RunFolder(out)
-    stem = re.sub(r"[^\w.-]+", "-", f"{env_id}-{algorithm}-seed{seed}-{time.strftime('%Y%m%d-%H%M%S')}")
-    n = 1
+    first, n = dated(env_id, algorithm, f"seed{seed}"), 1
     while True:
-        path = Path("runs") / (stem if n == 1 else f"{stem}-{n}")
+        path = first if n == 1 else first.with_name(f"{first.name}-{n}")
         try:
             path.mkdir(parents=True)
             return RunFolder(path)

@@ -43,7 +43,7 @@ def test_a_terminal_shows_bars_and_another_output_lines(tmp_path):
     assert (everything.completed, everything.total) == (1500, 3000)  # the failed run is not trained
     states = "1 running, 1 done, 1 failed, 1 waiting"
     assert everything.fields["text"] == states
-    assert sweep.line(scheduler) == f"job-2 500 of 1,000 steps, return 30.00; {states}"
+    assert sweep.line(sweep.rows(scheduler)) == f"job-2 500 of 1,000 steps, return 30.00; {states}"
     assert sweep.states_text(scheduler.outcomes()) == states
     (scheduler.works[2].path / "agent.safetensors").touch()
     scheduler.running[0].handle.status = 0

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import os
-import re
-import time
 from collections.abc import Callable
 from contextlib import ExitStack, closing
 from pathlib import Path
@@ -14,7 +12,7 @@ from typing import Any
 from rejeu.agents import find_agent, training
 from rejeu.agents.device import reason_against, require_memory
 from rejeu.agents.together import learn_together, sibling, start_device
-from rejeu.checkpoints.run_folder import RunFolder, check_free
+from rejeu.checkpoints.run_folder import RunFolder, check_free, dated
 from rejeu.core import devices
 from rejeu.core.errors import MissingExtra
 from rejeu.core.interrupt import NAMES, Interrupt
@@ -166,8 +164,7 @@ def make_jobs(arguments: Train) -> tuple[Job, ...]:
 def choose_folder(arguments: Train) -> Path:
     """Returns a new or empty folder for the run folders: ``--out``, or one under ``runs``."""
     check_free(arguments.out)
-    name = "-".join(filter(None, [arguments.env, arguments.algorithm, "seeds", time.strftime("%Y%m%d-%H%M%S")]))
-    return arguments.out or Path("runs") / re.sub(r"[^\w.-]+", "-", name)
+    return arguments.out or dated(arguments.env, arguments.algorithm, "seeds")
 
 
 def fit_together(arguments: Train) -> bool:

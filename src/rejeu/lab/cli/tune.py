@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from rejeu.agents import AGENTS, find_agent, find_preset, modules_of
+from rejeu.agents import AGENTS, find_agent, find_preset
 from rejeu.algorithms.search import Dimension
 from rejeu.core.interrupt import NAMES, Interrupt
 from rejeu.lab.cli import environment
@@ -19,9 +18,15 @@ from rejeu.lab.experiments.search import Watch
 from rejeu.lab.experiments.study import Study, StudyFolder, Trial
 from rejeu.lab.experiments.study_plan import StudyPlan
 from rejeu.lab.experiments.sweep import Row, bars
-from rejeu.lab.runs.config import RunConfig, apply
+from rejeu.lab.runs.config import apply
 from rejeu.logs import formatting
 from rejeu.logs.formatting import counted, number, quoted
+
+OF_THE_PLAN = (
+    *("only", "measure", "seed", "trials", "steps", "trial_seeds", "final_seeds", "pruner", "backend"),
+    *("evaluate_every", "evaluate_episodes", "checkpoint_minutes"),
+)
+"""Options that are arguments of a plan."""
 
 
 def run_tune(arguments: Tune) -> tuple[int, dict[str, Any]]:
@@ -29,16 +34,22 @@ def run_tune(arguments: Tune) -> tuple[int, dict[str, Any]]:
 
     It is 2 if no trial is complete or a training of the comparison failed.
     """
-    made = usable_environment(arguments)
+    made = environment.from_arguments(arguments.env, arguments)
+    made.vector(1, arguments.backend or "auto", arguments.seed).close()  # an error before there is a folder
+    name = None if arguments.algo is None else find_agent(arguments.algo).algorithm.Config.name
+    preset = find_preset(made.env_id, name, arguments.preset)
+    algorithm = name if preset is None else preset.algorithm
     plan = plans.make(
         made.env_id,
-        trials=arguments.trials,
-        steps=arguments.steps,
-        evaluate_every=arguments.evaluate_every,
-        trial_seeds=arguments.trial_seeds,
-        final_seeds=arguments.final_seeds,
-        pruner=arguments.pruner,
-        **shared(arguments, made),
+        algorithm,
+        env_argument=made.run.env,
+        env_kwargs=made.kwargs,
+        wrappers=made.run.wrappers,
+        preset=preset,
+        fixed=apply(arguments.assignments, {}),
+        search=read_search(arguments.search, algorithm),
+        n_envs=arguments.envs,
+        **{name: getattr(arguments, name) for name in OF_THE_PLAN},
     )
     return complete(tuning.open_study(plan, arguments.out), made, arguments.workers)
 
@@ -48,56 +59,17 @@ def resume_study(arguments: Resume) -> tuple[int, dict[str, Any]]:
 
     Raises:
         ValueError: for ``--steps`` or ``--minutes``, or an environment that is not that of the study.
+        CheckpointError: if the command line must name it again.
     """
     if arguments.steps is not None or arguments.minutes is not None:
         raise ValueError(
             f"{arguments.run} is a study of rejeu tune, whose trials have a length; leave out --steps and --minutes"
         )
     study = studies.join(StudyFolder(arguments.run))
-    return complete(study, environment_of(study.plan, "a study", arguments), arguments.workers)
-
-
-def usable_environment(arguments: Tune) -> Environment:
-    """Returns the environment that the command line names, after one was made."""
-    made = environment.from_arguments(arguments.env, arguments)
-    made.vector(1, arguments.backend or "auto", arguments.seed).close()
-    return made
-
-
-def environment_of(plan: StudyPlan, what: str, arguments: Resume) -> Environment:
-    """Returns the environment of a study.
-
-    Raises:
-        CheckpointError: if the command line must name it again.
-        ValueError: if the command line names another.
-    """
-    made = environment.from_run(plan.run, arguments.run, arguments)
-    if made.env_id != plan.env_id:
-        raise ValueError(f"{arguments.run} is {what} of {plan.env_id}, not of {made.env_id}")
-    return made
-
-
-def shared(arguments: Tune, made: Environment) -> dict[str, Any]:
-    """Returns the arguments of a plan that come from the options."""
-    name = None if arguments.algo is None else find_agent(arguments.algo).algorithm.Config.name
-    preset = find_preset(made.env_id, name, arguments.preset)
-    algorithm = name if preset is None else preset.algorithm
-    return {
-        "algorithm": algorithm,
-        "env_argument": made.run.env,
-        "env_kwargs": made.kwargs,
-        "wrappers": made.run.wrappers,
-        "preset": preset,
-        "fixed": apply(arguments.assignments, {}),
-        "search": read_search(arguments.search, algorithm),
-        "only": arguments.only,
-        "n_envs": arguments.envs,
-        "backend": arguments.backend,
-        "evaluate_episodes": arguments.evaluate_episodes,
-        "seed": arguments.seed,
-        "measure": arguments.measure,
-        "checkpoint_minutes": arguments.checkpoint_minutes,
-    }
+    made = environment.from_run(study.plan.run, arguments.run, arguments)
+    if made.env_id != study.plan.env_id:
+        raise ValueError(f"{arguments.run} is a study of {study.plan.env_id}, not of {made.env_id}")
+    return complete(study, made, arguments.workers)
 
 
 def read_search(assignments: Iterable[str], algorithm: str | None) -> dict[str, Dimension]:
@@ -110,7 +82,7 @@ def complete(study: Study, made: Environment, workers: int | None) -> tuple[int,
     """Runs a study to its end; returns the exit status and the result."""
     echo("\n".join(header(study, made)))
     with Interrupt() as stop, display(study) as watch:
-        result = tuning.run(study, common(made, study.plan.algorithm), workers, stop, watch, echo)
+        result = tuning.run(study, made.run, workers, stop, watch, echo)
     echo()
     if stop.signal is not None:
         echo(f"stopped by {NAMES[stop.signal]}; rejeu resume {quoted(study.folder.path)}{made.run.again()} continues")
@@ -120,11 +92,6 @@ def complete(study: Study, made: Environment, workers: int | None) -> tuple[int,
     if not study.is_searched():
         return 1, result.to_dict()
     return (0 if result.complete and result.best is not None else 2), result.to_dict()
-
-
-def common(made: Environment, algorithm: str) -> RunConfig:
-    """Returns what all trainings have in common: the environment and what they import, which the command line named."""
-    return dataclasses.replace(made.run, imports=tuple(modules_of(algorithm, made.run.imports)))
 
 
 @contextmanager

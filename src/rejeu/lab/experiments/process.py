@@ -45,11 +45,6 @@ class Process:
                 creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),
             )
 
-    @property
-    def pid(self) -> int:
-        """Id of the process."""
-        return self._process.pid
-
     def poll(self) -> int | None:
         """Returns the exit status, negative if a signal ended it; None while it runs."""
         status = self._process.poll()

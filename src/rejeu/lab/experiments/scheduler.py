@@ -98,8 +98,6 @@ class Scheduler:
         self.waiting: deque[Work] = deque()
         """Tasks that this process may still take."""
         self.running: list[Attempt] = []
-        self.left: list[str] = []
-        """The runs that could not be started, each with the reason."""
         self._lost: dict[Work, int] = {}
         """How often in a row a task was lost without a new checkpoint."""
         self._rescan_at = 0.0
@@ -116,6 +114,11 @@ class Scheduler:
     def outcomes(self) -> list[RunOutcome]:
         """Returns what has become of each run."""
         return [work.outcome() for work in self.works]
+
+    @property
+    def left(self) -> list[str]:
+        """The runs that could not be started, each with the reason."""
+        return [f"{work.name} {work.reason}" for work in self.works if work.ending == "left"]
 
     def run(self, watch: Callable[[], object] = lambda: None, policy: Policy = lambda: False) -> None:
         """Works until nothing is left; ``watch`` and ``policy`` are called several times a second."""
@@ -203,8 +206,7 @@ class Scheduler:
     def _leave(self, task: Work, error: OSError) -> None:
         """Leaves a run that cannot be started to a later process, which may be one of another machine."""
         task.ending, task.reason = "left", f"could not be started: {' '.join(str(error).split())}"
-        self.left.append(f"{task.name} {task.reason}")
-        self.say(self.left[-1])
+        self.say(f"{task.name} {task.reason}")
 
     def _end(self, attempt: Attempt, status: int) -> None:
         """Applies the rule to a run whose process ended."""

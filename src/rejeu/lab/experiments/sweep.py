@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rejeu.agents import modules_of
+from rejeu.checkpoints.run_folder import dated
 from rejeu.core.interrupt import Interrupt
 from rejeu.lab.experiments.folder import SweepFolder, open_folder, read_folder
 from rejeu.lab.experiments.plan import read_plan
@@ -124,10 +125,8 @@ def prepare(
     found, text = read_plan(plan)
     at_once = min(workers or default_workers(), len(found.jobs))
     share = threads_of(at_once) if ray is None else max(int(found.resources.cpus), 1)
-    if folder is None:
-        stem = "sweep" if isinstance(plan, Mapping) else Path(plan).stem
-        folder = Path("runs") / f"{stem}-{time.strftime('%Y%m%d-%H%M%S')}"
-    return open_folder(Path(folder), dataclasses.replace(found, threads=found.threads or share), text, typed)
+    path = Path(folder or dated("sweep" if isinstance(plan, Mapping) else Path(plan).stem))
+    return open_folder(path, dataclasses.replace(found, threads=found.threads or share), text, typed)
 
 
 def make_launcher(folder: SweepFolder, workers: int | None, ray: str | None) -> Launcher:
@@ -228,7 +227,7 @@ def shown(progress: bool = True) -> Iterator[tuple[Watch, Callable[[str], None]]
     if not progress:
         yield (lambda scheduler: None), (lambda text: None)
     elif not console.is_terminal:
-        yield seldom(lambda scheduler: echo(line(scheduler)), LINES, time.monotonic() + LINES), echo
+        yield seldom(lambda scheduler: echo(line(rows(scheduler))), LINES, time.monotonic() + LINES), echo
     else:
         with bars(console) as show:
             say = partial(console.print, highlight=False, markup=False)
@@ -283,11 +282,10 @@ def rows(scheduler: Scheduler) -> list[Row]:
     return [Row("all steps", taken, asked or None, states_text(outcomes)), *found]
 
 
-def line(scheduler: Scheduler) -> str:
-    """Returns one line: the steps and the return of the runs that train, and how many are in each state."""
-    tasks = [attempt.task for attempt in scheduler.running[:MAX_NAMED]]
-    parts = [f"{task.name} {text_of(task.progress(), task.job.run.steps)}" for task in tasks]
-    return "; ".join([*parts, states_text(scheduler.outcomes())])
+def line(table: Sequence[Row]) -> str:
+    """Returns rows as one line: the steps and the return of the runs that train, and how many are in each state."""
+    everything, *runs = table
+    return "; ".join([*(f"{row.name} {row.text}" for row in runs[:MAX_NAMED]), everything.text])
 
 
 def text_of(progress: JobProgress, steps: int | None) -> str:

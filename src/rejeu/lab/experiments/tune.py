@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ from rejeu import envs
 from rejeu.agents import modules_of, presets
 from rejeu.agents.presets import Preset
 from rejeu.algorithms.search import SearchSpace
+from rejeu.checkpoints.run_folder import dated
 from rejeu.core.errors import MissingExtra
 from rejeu.core.interrupt import Interrupt
 from rejeu.lab.experiments import search as searches, study as studies, study_plan as plans
@@ -164,11 +164,9 @@ def tune(
     )
     study = open_study(plan, None if folder is None else Path(folder))
     echo: Echo = print if verbose else lambda text: None
-    watch = lines(echo, study)
+    config = RunConfig(env=plan.env_id, env_kwargs=plan.env_kwargs, imports=tuple(imports))
     with Interrupt() as stop:
-        named = tuple(modules_of(plan.algorithm, imports))
-        config = RunConfig(env=plan.env_id, env_kwargs=plan.env_kwargs, imports=named)
-        result = run(study, config, workers, stop, watch, echo)
+        result = run(study, config, workers, stop, lines(echo, study), echo)
     echo(str(result))
     return result
 
@@ -180,9 +178,7 @@ def open_study(plan: StudyPlan, folder: Path | None) -> Study:
         ValueError: if it is the folder of another study.
         FileExistsError: if it is something else.
     """
-    if folder is None:
-        name = f"tune-{plan.env_id}-{plan.algorithm}-{time.strftime('%Y%m%d-%H%M%S')}".replace("/", "-")
-        folder = Path("runs") / name
+    folder = folder or dated("tune", plan.env_id, plan.algorithm)
     where = StudyFolder(folder)
     if where.plan.is_file():
         return studies.join(where, plan)
@@ -208,7 +204,7 @@ def run(
 
     Args:
         study: the study.
-        config: the environment of all trainings and what they import, which the command line named.
+        config: the environment of all trainings and what they import, as the command line named them.
         workers: trials at once.
         stop: ends the study where it is.
         watch: called with all trials when there is news.
@@ -216,7 +212,8 @@ def run(
     """
     plan, folder = study.plan, study.folder
     at_once = workers or default_workers()
-    config = dataclasses.replace(config, checkpoint_minutes=plan.checkpoint_minutes)
+    imports = tuple(modules_of(plan.algorithm, config.imports))
+    config = dataclasses.replace(config, imports=imports, checkpoint_minutes=plan.checkpoint_minutes)
     search = Search(study, config, at_once, stop)
     search.run(watch)
     trials = study.trials()
