@@ -39,7 +39,7 @@ def test_a_study_from_the_command_line(pretend, tmp_path, capsys):
 
 
 def test_the_final_comparison_is_announced_with_its_length(tmp_path):
-    study = studies.create(studies.StudyFolder(tmp_path), study_plan.make("Pendulum-v1", "SAC", steps=40, trials=2))
+    study = studies.open_study(studies.StudyFolder(tmp_path), study_plan.make("Pendulum-v1", "SAC", steps=40, trials=2))
     found = "\n".join(tune_command.header(study, environment.Environment("Pendulum-v1", RunConfig(env="Pendulum-v1"))))
     assert "at the end    the best trial and the default: 5 fresh seeds each, 10 trainings of 40 steps\n" in found
     ended = studies.Trial(0, "complete", 1.0, {}, {}, 60.0, "")

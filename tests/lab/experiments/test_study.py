@@ -105,7 +105,7 @@ def test_an_interrupted_study_continues_as_if_it_had_not_been_interrupted(whole,
     first = run(tuning.open_study(make_plan(final_seeds=0), tmp_path / "study"), stop=stop, watch=interrupt)
     assert (first.complete, first.signal) == (False, 2)
     assert [one.state for one in first.trials] == ["complete", "complete", "running"]
-    second = run(studies.join(StudyFolder(tmp_path / "study")))
+    second = run(studies.open_study(StudyFolder(tmp_path / "study")))
     assert facts(second) == facts(whole)
     begun = commands(tmp_path / "study")
     assert sorted(word for word, _ in begun) == ["resume", "train", "train", "train", "train"]
@@ -117,13 +117,13 @@ def test_a_trial_whose_process_was_killed_is_entered_again_with_its_parameters(w
     killed.take()
     for index in (0, 1):
         killed.release(index)  # as the end of a process does
-    other = studies.join(StudyFolder(tmp_path / "study"))
+    other = studies.open_study(StudyFolder(tmp_path / "study"))
     assert other.take()[1] == 0
-    third = studies.join(StudyFolder(tmp_path / "study"))
+    third = studies.open_study(StudyFolder(tmp_path / "study"))
     assert third.take()[1] == 1  # the first one is held
     other.release(0)
     third.release(1)
-    assert facts(run(studies.join(StudyFolder(tmp_path / "study")))) == facts(whole)
+    assert facts(run(studies.open_study(StudyFolder(tmp_path / "study")))) == facts(whole)
 
 
 def test_a_killed_training_continues_and_the_study_is_the_same(whole, tmp_path, monkeypatch):
@@ -145,7 +145,7 @@ def test_optuna_opens_the_journal(whole):
 
 def test_two_processes_share_the_trials_of_a_study(tmp_path):
     one = tuning.open_study(make_plan(trials=3), tmp_path / "study")
-    two = studies.join(StudyFolder(tmp_path / "study"))
+    two = studies.open_study(StudyFolder(tmp_path / "study"))
     taken = [one.take(), two.take(), one.take(), two.take()]
     assert [None if it is None else it[1] for it in taken] == [0, 1, 2, None]
 
@@ -170,7 +170,7 @@ def test_a_failed_trial_keeps_its_reason_and_does_not_stop_the_study(tmp_path):
     assert [one.state for one in result.trials] == ["failed"] * 3
     assert all(one.reason.endswith("failed with exit status 2: at step 20: the loss is NaN") for one in result.trials)
     assert (result.best, result.final, result.preset) == (None, None, None)
-    again = run(studies.join(StudyFolder(tmp_path / "study")))
+    again = run(studies.open_study(StudyFolder(tmp_path / "study")))
     assert facts(again) == facts(result)
     assert len(commands(tmp_path / "study")) == 3  # failed trials are not repeated
 
@@ -211,7 +211,7 @@ def test_the_winner_is_compared_with_the_default_on_fresh_seeds(tmp_path, monkey
     searched = {seed for one in result.trials for seed in study.plan.seeds(one.index)}
     assert not searched & set(study.plan.fresh_seeds())
     n = len(commands(tmp_path / "study"))
-    assert run(studies.join(StudyFolder(tmp_path / "study"))).final.difference == result.final.difference
+    assert run(studies.open_study(StudyFolder(tmp_path / "study"))).final.difference == result.final.difference
     assert len(commands(tmp_path / "study")) == n  # nothing is repeated
 
 
@@ -269,7 +269,7 @@ def test_trainings_are_those_of_the_plan_and_as_many_at_once_as_asked(tmp_path, 
     begun = []
     monkeypatch.setattr(tuning, "Search", lambda *given: begun.extend(given) or SimpleNamespace(run=print, scheduler=0))
     plan = make_plan(checkpoint_minutes=2.0, trial_seeds=2)
-    study, stop = studies.create(StudyFolder(tmp_path), plan), Interrupt()
+    study, stop = studies.open_study(StudyFolder(tmp_path), plan), Interrupt()
     with pytest.raises(AttributeError, match="left"):
         run(study, workers=3, stop=stop)
     assert begun == [study, RunConfig(env="Pendulum-v1", checkpoint_minutes=2.0), 3, stop]
@@ -308,7 +308,7 @@ def test_more_trials_continue_a_study_and_another_plan_is_refused(journal, tmp_p
         tuning.open_study(make_plan(steps=80), tmp_path / "study")
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "notes.txt").write_text("mine")
-    with pytest.raises(FileExistsError, match="neither empty nor a study folder"):
+    with pytest.raises(FileExistsError, match=r"holds something else than study\.json"):
         tuning.open_study(make_plan(), tmp_path / "mine")
 
 
@@ -319,7 +319,7 @@ def test_a_damaged_journal_is_one_line_and_is_not_changed(journal, place):
     content[at : at + 40] = b"\xff" * 40
     journal.write_bytes(content)
     with pytest.raises(CheckpointError, match=r"journal\.log is damaged: .*; restore it from a copy"):
-        run(studies.join(StudyFolder(journal.parent)))
+        run(studies.open_study(StudyFolder(journal.parent)))
     assert journal.read_bytes() == content
 
 
@@ -327,11 +327,11 @@ def test_a_journal_that_is_nested_too_deeply_or_a_link_is_refused(journal, tmp_p
     with journal.open("ab") as file:
         file.write(b"[" * 100_000 + b"]" * 100_000 + b"\n")
     with pytest.raises(CheckpointError, match=r"journal\.log is damaged"):
-        studies.join(StudyFolder(journal.parent))
+        studies.open_study(StudyFolder(journal.parent))
     journal.unlink()
     journal.symlink_to(tmp_path / "mine")
     with pytest.raises(CheckpointError, match="is a link and no file"):
-        studies.join(StudyFolder(journal.parent))
+        studies.open_study(StudyFolder(journal.parent))
     assert not (tmp_path / "mine").exists()
 
 

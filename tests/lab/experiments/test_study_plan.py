@@ -89,7 +89,7 @@ def test_what_is_written_is_read(tmp_path):
     (tmp_path / "study.json").write_text(json_text(plan))
     assert plans.read(tmp_path / "study.json") == plan
     assert plans.difference(plan, dataclasses.replace(plan, trials=99)) == ""
-    assert plans.difference(plan, dataclasses.replace(plan, seed=9)) == "seed is 0 there, not 9"
+    assert plans.difference(plan, dataclasses.replace(plan, seed=9)) == "another study: seed is 0 there, not 9"
 
 
 @pytest.mark.parametrize(

@@ -65,7 +65,7 @@ def resume_study(arguments: Resume) -> tuple[int, dict[str, Any]]:
         raise ValueError(
             f"{arguments.run} is a study of rejeu tune, whose trials have a length; leave out --steps and --minutes"
         )
-    study = studies.join(StudyFolder(arguments.run))
+    study = studies.open_study(StudyFolder(arguments.run))
     made = environment.from_run(study.plan.run, arguments.run, arguments)
     if made.env_id != study.plan.env_id:
         raise ValueError(f"{arguments.run} is a study of {study.plan.env_id}, not of {made.env_id}")

@@ -1,4 +1,4 @@
-"""The plan of a sweep as data, and the folder in which its jobs are trained.
+"""Folders of experiments, each with its plan, and the plan of a sweep.
 
 ::
 
@@ -13,16 +13,17 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple, TypeVar
 
 from filelock import FileLock
 from msgspec import Meta
 
 from rejeu.core import atomic
 from rejeu.core.errors import CheckpointError
-from rejeu.core.records import Malformed, convert, json_text, read_json, shown
+from rejeu.core.records import convert, json_text, read_json, shown
 from rejeu.core.validation import assign
 from rejeu.lab.experiments.work import HIDDEN, Job, Work
 from rejeu.lab.runs.config import RunConfig
@@ -34,6 +35,7 @@ MAX_BYTES = 2**26
 PATIENCE = 60.0
 """Seconds to wait while another process creates the folder."""
 
+P = TypeVar("P")
 NOTHING = RunConfig(env="")
 """A command line that names nothing to import."""
 
@@ -85,6 +87,10 @@ class Plan:
     resources: Resources = field(default_factory=Resources)
     schema: Annotated[int, Meta(ge=1, le=1)] = 1
 
+    def __post_init__(self) -> None:
+        if len({job.name.lower() for job in self.jobs}) < len(self.jobs):
+            raise ValueError("two jobs have the same name")
+
 
 class SweepFolder(NamedTuple):
     """The folder of a sweep."""
@@ -117,37 +123,21 @@ def open_folder(path: Path, plan: Plan, text: str | None, typed: RunConfig) -> S
         typed: what the command line named for import.
 
     Raises:
-        FileExistsError: if the path is a file, or a folder with other things.
-        ValueError: if it is the sweep of another plan.
+        FileExistsError, ValueError: as :func:`begin`.
     """
-    if path.exists() and not path.is_dir():
-        raise FileExistsError(f"{path} is a file; name a folder for the sweep")
-    if path.is_dir() and not is_sweep(path) and any(one.name != HIDDEN for one in path.iterdir()):
-        raise FileExistsError(f"{path} holds something else than a sweep; name another folder, or remove it first")
-    (path / HIDDEN).mkdir(parents=True, exist_ok=True)
-    with FileLock(path / HIDDEN / "lock", timeout=PATIENCE):
-        if is_sweep(path):
-            found = read_folder(path, typed)
-            check_same(found, plan)
-            return found
-        content = json_text(plan)
-        if text is not None:
-            atomic.write(path / PLAN, text)
-        atomic.write(path / SWEEP, content)
+    begin(path, SWEEP, plan, lambda file: read(file, Plan), difference)
+    if text is not None and not (path / PLAN).exists():
+        atomic.write(path / PLAN, text)
     return read_folder(path, typed)
 
 
-def check_same(folder: SweepFolder, plan: Plan) -> None:
-    """Raises ``ValueError`` if a folder is that of other jobs."""
-    if folder.jobs == plan.jobs:
-        return
-    known = {job.name: job for job in folder.jobs}
-    given = {job.name: job for job in plan.jobs}
-    differing = next((name for name in [*given, *known] if given.get(name) != known.get(name)), "their order")
-    raise ValueError(
-        f"{folder.path} is the sweep of another plan: {differing} differs; name another folder with --out, or continue that "
-        f"sweep with rejeu resume {quoted(folder.path)}"
-    )
+def difference(there: Plan, plan: Plan) -> str:
+    """Returns what is other in the jobs of two plans, as text; empty if they are the same."""
+    if there.jobs == plan.jobs:
+        return ""
+    known, new = ({job.name: job for job in one.jobs} for one in (there, plan))
+    differing = next((name for name in [*new, *known] if new.get(name) != known.get(name)), "their order")
+    return f"the sweep of another plan: {differing} differs"
 
 
 def read_folder(path: Path, typed: RunConfig = NOTHING) -> SweepFolder:
@@ -157,17 +147,64 @@ def read_folder(path: Path, typed: RunConfig = NOTHING) -> SweepFolder:
         FileNotFoundError: if it is none.
         CheckpointError: if it is damaged, or names code that the command line does not.
     """
-    if not is_sweep(path):
-        raise FileNotFoundError(f"{path} is no folder of a sweep: it holds no {SWEEP}")
-    try:
-        plan = convert(read_json(path / SWEEP, MAX_BYTES), Plan)
-        if len({job.name.lower() for job in plan.jobs}) < len(plan.jobs):
-            raise Malformed("two jobs have the same name")
-    except (Malformed, CheckpointError) as error:
-        raise CheckpointError(f"{path / SWEEP} is damaged: {shown(error, 1000)}") from None
+    plan = read(path / SWEEP, Plan)
     for job in plan.jobs:
         job.check_code(typed, path / SWEEP)
     if not os.access(path, os.W_OK):
         raise PermissionError(f"{path} cannot be written; check its permissions")
     (path / HIDDEN).mkdir(exist_ok=True)
     return SweepFolder(path, plan)
+
+
+def begin(path: Path, name: str, plan: P, read: Callable[[Path], P], difference: Callable[[P, P], str]) -> P:
+    """Writes the plan of an experiment to a new or empty folder, or joins the one that is there; returns the folder's plan.
+
+    Args:
+        path: the folder.
+        name: of the file of the plan.
+        plan: the plan.
+        read: reads such a file.
+        difference: returns in what the plan of the folder differs from this one and must not, as text.
+
+    Raises:
+        FileExistsError: if the path is a file, or a folder with other things.
+        ValueError: if it is the folder of another plan.
+    """
+    inside = {one.name for one in path.iterdir()} if path.is_dir() else {HIDDEN}
+    if name not in inside and (inside - {HIDDEN} or path.is_file()):
+        raise FileExistsError(
+            f"{path} exists and holds something else than {name}; name another folder, or remove it first"
+        )
+    atomic.make_folder(path / HIDDEN)
+    with FileLock(path / HIDDEN / "lock", timeout=PATIENCE):
+        if not (path / name).is_file():
+            atomic.write(path / name, json_text(plan))
+            return plan
+        there = read(path / name)
+    if differs := difference(there, plan):
+        resume = f"rejeu resume {quoted(path)}"
+        raise ValueError(f"{path} is {differs}; name another folder with --out, or continue that one with {resume}")
+    return there
+
+
+def read(path: Path, kind: type[P], most: int = MAX_BYTES, check: Callable[[P], object] = lambda plan: None) -> P:
+    """Returns the plan in a file, which is untrusted.
+
+    Args:
+        path: the file.
+        kind: class of the plan.
+        most: upper limit on its size in bytes.
+        check: raises ``ValueError`` or ``TypeError`` for an invalid plan.
+
+    Raises:
+        FileNotFoundError: if it is not there.
+        CheckpointError: if it is damaged or invalid.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path.parent} is no folder of an experiment: it holds no {path.name}")
+    try:
+        plan = convert(read_json(path, most), kind)
+        check(plan)
+        return plan
+    except (ValueError, TypeError) as error:
+        raise CheckpointError(f"{path} is damaged: {shown(error, 1000)}") from None

@@ -32,8 +32,10 @@ from rejeu.core import atomic
 from rejeu.core.errors import CheckpointError, MissingExtra
 from rejeu.core.records import json_text
 from rejeu.lab.experiments import space as spaces, study_plan as plans
+from rejeu.lab.experiments.folder import begin
 from rejeu.lab.experiments.process import hold
 from rejeu.lab.experiments.study_plan import StudyPlan
+from rejeu.lab.experiments.work import HIDDEN
 from rejeu.lab.reporting.runs import is_locked
 
 if TYPE_CHECKING:
@@ -75,7 +77,7 @@ class StudyFolder:
 
     path: Path
 
-    plan = File("study.json")
+    plan = File(plans.FILE)
     """The settings of the study."""
     journal = File("journal.log")
     """Optuna's journal."""
@@ -92,7 +94,7 @@ class StudyFolder:
 
     def lock(self) -> FileLock:
         """Returns the lock that is held while trials are entered."""
-        return FileLock(self.path / "study.lock")
+        return FileLock(self.path / HIDDEN / "lock")
 
 
 @dataclass(eq=False)
@@ -214,38 +216,31 @@ def best_of(trials: list[Trial]) -> Trial | None:
     return max((one for one in trials if one.state == "complete"), key=lambda one: one.value, default=None)
 
 
-def create(folder: StudyFolder, plan: StudyPlan) -> Study:
-    """Creates a study; its first trial has the values of the default, as far as they lie in the search space."""
-    require()
-    atomic.make_folder(folder.path)
-    with folder.lock():
-        study = connect(folder, plan)
-        if not study.get_trials(deepcopy=False):
-            values = plans.default_values(plan)
-            study.enqueue_trial(spaces.encoded(plan.search_space, values), user_attrs={INDEX: 0})
-        atomic.write(folder.plan, json_text(plan, 2))
-    return Study(folder, plan, study)
+def open_study(folder: StudyFolder, plan: StudyPlan | None = None) -> Study:
+    """Opens the study of a folder; with ``plan`` it is created if there is none.
 
-
-def join(folder: StudyFolder, plan: StudyPlan | None = None) -> Study:
-    """Opens a study that exists; with ``plan`` it must be that of the study, except for the number of trials and final seeds.
+    The plan of one that exists must be the same, except for the number of trials and of final seeds. The first trial has the
+    values of the default, as far as they lie in the search space.
 
     Raises:
-        FileNotFoundError: if there is none.
+        FileExistsError: if the folder holds something else.
+        FileNotFoundError: if there is no study, without ``plan``.
         ValueError: if the plan differs.
         CheckpointError: if a file is damaged.
     """
     require()
-    plans.read(folder.plan)  # before a lock is made in a folder that is no study
+    there = (
+        plans.read(folder.plan) if plan is None else begin(folder.path, plans.FILE, plan, plans.read, plans.difference)
+    )
+    plan = plan or there
     with folder.lock():
-        there = plans.read(folder.plan)
-        if plan is not None:
-            if differs := plans.difference(there, plan):
-                raise ValueError(f"{folder.path} is another study: {differs}; name another folder with --out")
-            if there != plan:
-                atomic.write(folder.plan, json_text(plan, 2))
-                there = plan
-        return Study(folder, there, connect(folder, there))
+        if there != plan:
+            atomic.write(folder.plan, json_text(plan))
+        study = connect(folder, plan)
+        if not study.get_trials(deepcopy=False):
+            values = plans.default_values(plan)
+            study.enqueue_trial(spaces.encoded(plan.search_space, values), user_attrs={INDEX: 0})
+    return Study(folder, plan, study)
 
 
 def connect(folder: StudyFolder, plan: StudyPlan) -> optuna.Study:

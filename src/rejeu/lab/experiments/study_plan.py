@@ -18,10 +18,11 @@ from rejeu.algorithms import config as configs
 from rejeu.algorithms.search import HINDSIGHT, Dimension, SearchSpace
 from rejeu.core import validation
 from rejeu.core.errors import CheckpointError
-from rejeu.core.records import EnvCount, Positive, Seed, convert, json_text, read_json, shown
-from rejeu.lab.experiments import space as spaces
+from rejeu.core.records import EnvCount, Positive, Seed, convert, json_text
+from rejeu.lab.experiments import folder as folders, space as spaces
 from rejeu.lab.runs.config import RunConfig
 
+FILE = "study.json"
 MAX_BYTES = 2**20
 """Upper limit on the size of a ``study.json``."""
 MAX_TRIALS = 100_000
@@ -238,14 +239,7 @@ def read(path: Path) -> StudyPlan:
         FileNotFoundError: if it is not there.
         CheckpointError: if it is damaged, or names an algorithm that is not registered.
     """
-    if not path.is_file():
-        raise FileNotFoundError(f"{path.parent} is no study folder: it holds no {path.name}")
-    try:
-        plan = convert(read_json(path, MAX_BYTES), StudyPlan)
-        check(plan, path)
-        return plan
-    except (ValueError, TypeError) as error:
-        raise CheckpointError(f"{path} is damaged: {shown(error, 1000)}") from None
+    return folders.read(path, StudyPlan, MAX_BYTES, lambda plan: check(plan, path))
 
 
 def check(plan: StudyPlan, path: Path) -> None:
@@ -268,5 +262,5 @@ def difference(plan: StudyPlan, other: StudyPlan) -> str:
     for one in dataclasses.fields(StudyPlan):
         ours, theirs = getattr(plan, one.name), getattr(other, one.name)
         if one.name not in ("trials", "final_seeds", "checkpoint_minutes") and ours != theirs:
-            return f"{one.name} is {str(ours)[:100]} there, not {str(theirs)[:100]}"
+            return f"another study: {one.name} is {str(ours)[:100]} there, not {str(theirs)[:100]}"
     return ""

@@ -178,18 +178,7 @@ def open_study(plan: StudyPlan, folder: Path | None) -> Study:
         ValueError: if it is the folder of another study.
         FileExistsError: if it is something else.
     """
-    folder = folder or dated("tune", plan.env_id, plan.algorithm)
-    where = StudyFolder(folder)
-    if where.plan.is_file():
-        return studies.join(where, plan)
-    inside = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
-    if inside - {where.journal.name, f"{where.journal.name}.held", "study.lock"} or (
-        folder.exists() and not folder.is_dir()
-    ):
-        raise FileExistsError(
-            f"{folder} exists and is neither empty nor a study folder; name another, or remove it first"
-        )
-    return studies.create(where, plan)
+    return studies.open_study(StudyFolder(folder or dated("tune", plan.env_id, plan.algorithm)), plan)
 
 
 def run(
