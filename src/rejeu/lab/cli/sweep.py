@@ -26,7 +26,7 @@ from rejeu.lab.cli.session import Session, installed_logs, make_evaluation_env
 from rejeu.lab.experiments.folder import Plan, SweepFolder, open_folder, read_folder
 from rejeu.lab.experiments.process import LocalLauncher, default_workers, hold, threads_of
 from rejeu.lab.experiments.sweep import SweepResult, imports_of, make_launcher, prepare, states_text, train
-from rejeu.lab.experiments.work import Job, RunOutcome, Work, again
+from rejeu.lab.experiments.work import Job, Work, again
 from rejeu.lab.reporting.comparison import By, Comparison, compare
 from rejeu.lab.runs import config as configs
 from rejeu.lab.runs.config import RunConfig
@@ -66,22 +66,16 @@ def complete(
     echo(f"sweep         {folder.path}, {len(folder.jobs)} runs, {launcher.capacity} at once")
     typed = dataclasses.replace(typed, imports=imports_of(folder, typed))
     with Interrupt() as stop:
-        outcomes = train(folder, launcher, stop, typed.imports, retry).outcomes()
-    status, comparison = finish(folder, outcomes, typed, stop)
-    result = SweepResult(folder.path, tuple(outcomes))
-    return status, {"folder": folder.path, **result.counts(), "runs": result.table(), "comparison": comparison}
+        scheduler = train(folder, launcher, stop, typed.imports, retry)
+    return finish(folder, scheduler.works, typed, stop)
 
 
-def finish(
-    folder: SweepFolder, outcomes: list[RunOutcome], typed: RunConfig, stop: Interrupt
-) -> tuple[int, list[dict[str, Any]] | None]:
-    """Says what has become of the jobs and compares the runs.
-
-    Returns the exit status, and the rows of the comparison, None if there is none.
-    """
-    states = {one.state for one in outcomes}
+def finish(folder: SweepFolder, works: list[Work], typed: RunConfig, stop: Interrupt) -> tuple[int, dict[str, Any]]:
+    """Says what has become of the jobs and compares the runs; returns the exit status and the result."""
+    result = SweepResult(folder.path, tuple(work.outcome() for work in works))
+    states = {one.state for one in result.outcomes}
     resume = f"rejeu resume {quoted(folder.path)}{again(folder.jobs, typed)}"
-    echo(f"{counted(len(outcomes), 'run')}: {states_text(outcomes)}")
+    echo(f"{counted(len(works), 'run')}: {states_text(result.outcomes)}")
     if "failed" in states:
         echo(f"{resume} tries failed runs again")
     comparison = summarize(folder.path, "setting" if len({job.setting for job in folder.jobs}) > 1 else None)
@@ -89,7 +83,8 @@ def finish(
     if stop.signal is not None:
         echo(f"stopped by {NAMES[stop.signal]}; {resume} continues")
         status = 128 + stop.signal
-    return status, None if comparison is None else comparison.table()
+    rows = None if comparison is None else comparison.table()
+    return status, {"folder": folder.path, **result.counts(), "runs": result.table(), "comparison": rows}
 
 
 def summarize(folder: Path, by: By | None = None) -> Comparison | None:
@@ -119,17 +114,7 @@ def train_all(arguments: Train) -> tuple[int, dict[str, Any]]:
     echo(f"run folders   {folder.path}, {len(jobs)} seeds from {jobs[0].seed}, {at_once} at once")
     with Interrupt() as stop:
         scheduler = train(folder, LocalLauncher(at_once, folder.plan.threads), stop, imports_of(folder, arguments))
-    return finish_seeds(folder, scheduler.outcomes(), arguments, stop)
-
-
-def finish_seeds(
-    folder: SweepFolder, outcomes: list[RunOutcome], arguments: Train, stop: Interrupt
-) -> tuple[int, dict[str, Any]]:
-    """Compares the seeds; returns the exit status and the result."""
-    status, comparison = finish(folder, outcomes, arguments, stop)
-    keys = ("path", "log", "exit_status", "state")
-    runs = [{"seed": one.job.seed, **{key: getattr(one, key) for key in keys}} for one in outcomes]
-    return status, {"folder": folder.path, "runs": runs, "comparison": comparison}
+    return finish(folder, scheduler.works, arguments, stop)
 
 
 def make_jobs(arguments: Train) -> tuple[Job, ...]:
@@ -208,7 +193,7 @@ def train_together(arguments: Train, begin: Begin) -> tuple[int, dict[str, Any]]
         if stop.signal is None:
             for work, status in zip(works, statuses, strict=True):
                 work.write_exit(status)
-    return finish_seeds(folder, [work.outcome() for work in works], arguments, stop)
+    return finish(folder, works, arguments, stop)
 
 
 def with_seed(first: Session, seed: int, stack: ExitStack) -> Session:

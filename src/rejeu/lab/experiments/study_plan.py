@@ -45,7 +45,7 @@ class StudyPlan:
     env_id: Annotated[str, Meta(pattern=r"^[\w./:-]{1,200}$")]
     """Id of the environment."""
     env_argument: str = ""
-    """How it was named on the command line; never imported because a file says so."""
+    """How it was named on the command line, if not by its id; never imported because a file says so."""
     env_kwargs: dict[str, Any] = field(default_factory=dict)
     """Keyword arguments of the environment."""
     wrappers: tuple[str, ...] = ()
@@ -126,24 +126,17 @@ def make(
     env_id: str,
     algorithm: str | None = None,
     *,
-    env_argument: str = "",
-    env_kwargs: Mapping[str, Any] | None = None,
-    wrappers: tuple[str, ...] = (),
     preset: Preset | None = None,
     fixed: Mapping[str, Any] | None = None,
     search: SearchSpace | None = None,
     only: tuple[str, ...] = (),
     steps: int | None = None,
-    n_envs: int | None = None,
-    backend: str | None = None,
-    evaluate_every: int | None = None,
-    evaluate_episodes: int | None = None,
     **others: Any,
 ) -> StudyPlan:
     """Returns the plan of a study, completed by the preset or the defaults, after all checks that need no training.
 
-    ``fixed`` are hyperparameters that are set instead of searched, and ``others`` are further fields of the plan. The rest is
-    as for :func:`rejeu.tune`, with None for what the preset or the default decides.
+    ``fixed`` are hyperparameters that are set instead of searched, and ``others`` are further fields of the plan, None for
+    what the preset or the default decides. The rest is as for :func:`rejeu.tune`.
 
     Raises:
         ValueError: for an unknown algorithm, an empty space, or a value out of range.
@@ -154,21 +147,21 @@ def make(
     values = {**base.hyperparameters, **fixed}
     space = choose_space(base.algorithm, values, fixed, search or {}, only)
     total = validation.whole("steps", steps or base.total_steps, least=1)
+    given = {name: value for name, value in others.items() if value is not None}
+    usual = {
+        "n_envs": base.n_envs,
+        "backend": "auto" if given.get("env_kwargs") or given.get("wrappers") else base.backend,
+        "evaluate_every": max(total // EVALUATIONS, 1),
+        "evaluate_episodes": base.evaluate_episodes,
+    }
     plan = StudyPlan(
         env_id=env_id,
-        env_argument=env_argument or env_id,
-        env_kwargs=dict(env_kwargs or {}),
-        wrappers=wrappers,
         algorithm=base.algorithm,
         default=dict(base.hyperparameters),
         fixed=values,
         space={key: spaces.to_json(one) for key, one in space.items()},
         steps=total,
-        n_envs=n_envs or base.n_envs,
-        backend=backend or ("auto" if env_kwargs or wrappers else base.backend),
-        evaluate_every=evaluate_every or max(total // EVALUATIONS, 1),
-        evaluate_episodes=evaluate_episodes or base.evaluate_episodes,
-        **others,
+        **{**usual, **given},
     )
     if 0 < plan.final_seeds < MIN_FINAL_SEEDS:
         raise ValueError(

@@ -146,7 +146,7 @@ def tune(
     plan = plans.make(
         with_checks.env_id,
         algorithm,
-        env_kwargs=env_kwargs,
+        env_kwargs=dict(env_kwargs or {}),
         preset=preset,
         fixed=hyperparameters,
         search=search,
