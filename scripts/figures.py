@@ -30,7 +30,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "src")]
 from benchmarks.bench.summary import best, by_round, ratio, step_seconds  # noqa: E402
 from benchmarks.bench.text import table, times  # noqa: E402
 from rejeu.agents import AGENTS, presets  # noqa: E402
-from rejeu.agents.presets import Result  # noqa: E402
+from rejeu.agents.presets import PresetResult  # noqa: E402
 from rejeu.algorithms import dqn, ppo  # noqa: E402
 from rejeu.algorithms.actor_critic import OnPolicyConfig  # noqa: E402
 from rejeu.algorithms.config import OffPolicyConfig  # noqa: E402
@@ -83,13 +83,13 @@ def load(name: str, folder: Path = DATA) -> Any:
     return json.loads((folder / name).read_text(encoding="utf-8"))
 
 
-def measured() -> list[Result]:
+def measured() -> list[PresetResult]:
     """Returns the results of all presets from ``benchmarks/results/learning``, with the unmodified preset first."""
     found = [result_of(load(path.name, path.parent)) for path in sorted((DATA / "learning").glob("*.json"))]
     return sorted(found, key=lambda result: (result.env_id, result.algorithm, result.setting))
 
 
-def result_of(data: dict[str, Any], judged_by_success: tuple[str, ...] = JUDGED_BY_SUCCESS) -> Result:
+def result_of(data: dict[str, Any], judged_by_success: tuple[str, ...] = JUDGED_BY_SUCCESS) -> PresetResult:
     """Returns the result in a file of ``benchmarks/learning.py`` or of ``rejeu train`` and ``evaluate``."""
     words = shlex.split(data["command"])
     runs = data["runs"]
@@ -109,7 +109,7 @@ def result_of(data: dict[str, Any], judged_by_success: tuple[str, ...] = JUDGED_
     low, high = interval or (min(values), max(values))
     minutes = None if "--steps" in options else options.get("--minutes")
     seconds = [run["seconds"] for run in runs]
-    return Result(
+    return PresetResult(
         env_id=env_id,
         algorithm=algorithm,
         setting=", ".join(settings),
@@ -310,7 +310,7 @@ def training_times() -> str:
     return table(("environment", "algorithm", "steps", "time for each seed"), [row for _, row in rows.values()])
 
 
-def time_of(result: Result) -> str:
+def time_of(result: PresetResult) -> str:
     """Returns the range of the training times over the seeds of a result."""
     low, high = (round(seconds) for seconds in result.seconds)
     return f"{low} s" if low == high else f"{low} to {high} s"

@@ -244,10 +244,10 @@ def test_a_disk_that_is_full_at_the_end_keeps_the_episodes(tmp_path: Path, monke
     record(tmp_path / "shown", Shaped(VECTOR, Discrete(2)), close=False)
     data = next((tmp_path / "shown").rglob("data"))
 
-    class Full(dataset.Sink):
+    class Full(dataset.Hdf5Output):
         error = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(dataset, "Sink", Full)
+    monkeypatch.setattr(dataset, "Hdf5Output", Full)
     with pytest.raises(OSError, match=r"main_data.hdf5 could not be written: No space left on device"):
         dataset.merge(data)
     assert len(demonstrations.read(data).episodes) == 2

@@ -24,7 +24,7 @@ from rejeu.lab.experiments.folder import NOTHING, Plan, open_folder
 from rejeu.lab.experiments.plan import PlanError, read_plan
 from rejeu.lab.experiments.sweep import imports_of
 from rejeu.lab.experiments.work import Job
-from rejeu.lab.reporting.runs import Run
+from rejeu.lab.reporting.runs import RunSummary
 from rejeu.lab.runs.config import RunConfig
 from rejeu.training.learner import Learner
 from tests.environments import Reach
@@ -204,7 +204,7 @@ def test_other_processes_are_told_what_to_import(awac):
 
 def test_a_report_shows_what_differs_and_the_command_that_repeats_the_run(awac):
     saved = to_json(awac.Config(beta=3.0, gamma=0.9))
-    run = Run(
+    run = RunSummary(
         path=Path("run"),
         name="run",
         algorithm="AWAC",

@@ -163,7 +163,7 @@ def test_each_episode_is_played_with_its_own_parameters():
         action, carry = algorithm.explorer.act(carry, actor, obs, np.array(ended), key, CLOCK)
         np.testing.assert_allclose(action, expected(actor, candidates), atol=1e-6)
     later = jax.tree.map(jnp.copy, actor)
-    later = ars.Actor(later.network, later.key, jnp.int32(1))
+    later = ars.Perturbation(later.network, later.key, jnp.int32(1))
     action, _ = algorithm.explorer.act(carry, later, obs, np.array([True, True]), key, CLOCK)
     np.testing.assert_allclose(action, expected(later, [0, 1]), atol=1e-6)
 

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 import rejeu
-from rejeu.agents.conversion import Policy, converted, parts_of
+from rejeu.agents.conversion import OriginalPolicy, converted, parts_of
 from rejeu.core import checkpoint, spaces
 from rejeu.core.algorithm import Clock, Transition
 from rejeu.core.errors import CheckpointError
@@ -70,7 +70,7 @@ def test_the_next_gradient_step_is_the_one_of_the_original(name):
     state, _ = jax.jit(agent.learner.algorithm.update)(agent.state, transition, clock)
     before = checkpoint.tree_to_arrays(agent.state)
     after = {key.removeprefix("after."): value for key, value in data.items() if key.startswith("after.")}
-    policy = Policy(after, agent.obs_leaves, [], agent.action_space, False)
+    policy = OriginalPolicy(after, agent.obs_leaves, [], agent.action_space, False)
     expected, _ = converted(parts_of(agent.name, policy, 1), policy, {})
     ours = checkpoint.tree_to_arrays(state)
     assert max(np.abs(ours[key] - before[key]).max() for key in expected) > 1e-5
@@ -252,7 +252,9 @@ def test_recent_episodes_and_outputs_are_those_of_the_file(tmp_path):
 def test_images_are_what_convolutions_read():
     leaf = spaces.leaves(gym.spaces.Box(0.0, 1.0, (1, 36, 36), np.float32))[0]
     weights = {"features_extractor.cnn.0.weight": np.zeros(1), "features_extractor.linear.0.bias": np.zeros(16)}
-    features = [Policy(one, (leaf,), [], gym.spaces.Discrete(2), False).n_features(leaf) for one in (weights, {})]
+    features = [
+        OriginalPolicy(one, (leaf,), [], gym.spaces.Discrete(2), False).n_features(leaf) for one in (weights, {})
+    ]
     assert features == [16, 36 * 36]
 
 

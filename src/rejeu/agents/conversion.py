@@ -58,7 +58,7 @@ class Part(NamedTuple):
     """How the names of its parameters begin in PyTorch."""
 
 
-class Policy(NamedTuple):
+class OriginalPolicy(NamedTuple):
     """A policy of Stable-Baselines3."""
 
     weights: Mapping[str, np.ndarray]
@@ -116,7 +116,7 @@ def linear(name: str, order: Any = ALL) -> Network:
     return {"weight": lambda view: view.get(f"{name}.weight").T[order], "bias": lambda view: view.get(f"{name}.bias")}
 
 
-def linear_or_zero(name: str, policy: Policy) -> Network:
+def linear_or_zero(name: str, policy: OriginalPolicy) -> Network:
     """Returns a linear layer, whose bias is 0 if it has none there."""
     layer = linear(name)
     if f"{name}.bias" not in policy.weights:
@@ -124,12 +124,12 @@ def linear_or_zero(name: str, policy: Policy) -> Network:
     return layer
 
 
-def action_layers(policy: Policy) -> list[str]:
+def action_layers(policy: OriginalPolicy) -> list[str]:
     """Returns the names of the layers of ARS, whose only one has no number in older versions."""
     return policy.layers("action_net") or ["action_net"]
 
 
-def searched(policy: Policy) -> Network:
+def searched(policy: OriginalPolicy) -> Network:
     """Returns the policy of ARS, whose actions are clipped where it is linear, and else squashed."""
     *hidden, last = action_layers(policy)
     if any(f"{name}.bias" not in policy.weights for name in hidden):
@@ -148,7 +148,7 @@ def mlp(names: Sequence[str], order: Any) -> Network:
     return layers
 
 
-def encoder(policy: Policy, prefix: str) -> Network:
+def encoder(policy: OriginalPolicy, prefix: str) -> Network:
     """Returns the CNNs of all images."""
     made: Network = {}
     images = [leaf for leaf in policy.leaves if policy.is_image(leaf)]
@@ -182,7 +182,7 @@ def joined(networks: Sequence[Network], join: Callable[..., np.ndarray]) -> Netw
     return {name: lambda view, name=name: join([one[name](view) for one in networks]) for name in networks[0]}  # type: ignore[misc]
 
 
-def plain(policy: Policy, extractor: str, hidden: Sequence[str], head: Network, extra: int = 0) -> Network:
+def plain(policy: OriginalPolicy, extractor: str, hidden: Sequence[str], head: Network, extra: int = 0) -> Network:
     """Returns an encoder, hidden layers and a head; ``extra`` is the number of inputs besides the features."""
     order = policy.order(extra)
     head = head if hidden else reordered(head, order)
@@ -195,7 +195,7 @@ def reordered(head: Network, order: Any) -> Network:
     return {**head, "weight": lambda view: weight(view)[order]}
 
 
-def q_network(policy: Policy, prefix: str, name: str, n_quantiles: int) -> Network:
+def q_network(policy: OriginalPolicy, prefix: str, name: str, n_quantiles: int) -> Network:
     """Returns a network of the values of all actions; quantiles of an action are adjacent here, and apart there."""
     *hidden, last = policy.layers(f"{prefix}.{name}")
     head = linear(last)
@@ -205,7 +205,7 @@ def q_network(policy: Policy, prefix: str, name: str, n_quantiles: int) -> Netwo
     return plain(policy, f"{prefix}.features_extractor", hidden, head)
 
 
-def gaussian_actor(policy: Policy, prefix: str) -> Network:
+def gaussian_actor(policy: OriginalPolicy, prefix: str) -> Network:
     """Returns an actor whose head gives mean and log standard deviation, or the mean only with state-dependent noise."""
     hidden = policy.layers(f"{prefix}.latent_pi")
     if (log_std := f"{prefix}.log_std") in policy.weights:
@@ -215,13 +215,13 @@ def gaussian_actor(policy: Policy, prefix: str) -> Network:
     return plain(policy, f"{prefix}.features_extractor", hidden, head)
 
 
-def actor(policy: Policy, prefix: str) -> Network:
+def actor(policy: OriginalPolicy, prefix: str) -> Network:
     """Returns a deterministic actor."""
     *hidden, last = policy.layers(f"{prefix}.mu")
     return plain(policy, f"{prefix}.features_extractor", hidden, linear(last))
 
 
-def critics(policy: Policy, prefix: str) -> list[Network]:
+def critics(policy: OriginalPolicy, prefix: str) -> list[Network]:
     """Returns the critics."""
     made: list[Network] = []
     while hidden := policy.layers(f"{prefix}.qf{len(made)}"):
@@ -233,7 +233,7 @@ def critics(policy: Policy, prefix: str) -> list[Network]:
     return made
 
 
-def renormalized(policy: Policy, network: Network, prefix: str, extra: int = 0) -> Network:
+def renormalized(policy: OriginalPolicy, network: Network, prefix: str, extra: int = 0) -> Network:
     """Returns a network of CrossQ: ``network`` with the normalization layers that are in the sequence ``prefix``."""
     found = [key.split(".")[-2] for key in policy.weights if key.startswith(f"{prefix}.") and key.endswith(".ra_mean")]
     names = {"scale": "scale", "offset": "bias", "mean": "ra_mean", "variance": "ra_var", "n_batches": "steps"}
@@ -245,7 +245,7 @@ def renormalized(policy: Policy, network: Network, prefix: str, extra: int = 0) 
     return network
 
 
-def actor_critic(policy: Policy, latent: bool) -> Network:
+def actor_critic(policy: OriginalPolicy, latent: bool) -> Network:
     """Returns policy and value of an on-policy algorithm.
 
     Layers that both shared in files of Stable-Baselines3 before 1.8 are copied to each.
@@ -285,14 +285,14 @@ def in_unit_range(space: spaces.Box, head: Network, log_std: str = "") -> Networ
     return made | ({"log_std": lambda view: view.shifted(view.get(log_std), -np.log(half))} if log_std else {})
 
 
-def encoders(policy: Policy) -> Network:
+def encoders(policy: OriginalPolicy) -> Network:
     """Returns the encoder of the policy, and that of the value where it has its own."""
     own = "pi_features_extractor" if policy.has("pi_features_extractor") else "features_extractor"
     made = under("encoder", encoder(policy, own))
     return made if shares_extractor(policy) else made | under("value_encoder", encoder(policy, "vf_features_extractor"))
 
 
-def shares_extractor(policy: Policy) -> bool:
+def shares_extractor(policy: OriginalPolicy) -> bool:
     """Returns whether policy and value of an on-policy algorithm read images through the same convolutions."""
     pairs = [(key, f"vf{key.removeprefix('pi')}") for key in policy.weights if key.startswith("pi_features_extractor.")]
     return all(address(policy.weights[pi]) == address(policy.weights[vf]) for pi, vf in pairs)
@@ -303,14 +303,14 @@ def address(array: np.ndarray) -> int:
     return int(array.__array_interface__["data"][0])
 
 
-def cell(policy: Policy, name: str) -> Network:
+def cell(policy: OriginalPolicy, name: str) -> Network:
     """Returns the LSTM of that name, whose gates are in the same order."""
     pairs = {"recurrent": "weight_hh_l0", "bias": "bias_ih_l0", "recurrent_bias": "bias_hh_l0"}
     made: Network = {ours: lambda view, key=f"{name}.{theirs}": view.get(key).T for ours, theirs in pairs.items()}  # type: ignore[misc]
     return made | {"inputs": lambda view: view.get(f"{name}.weight_ih_l0").T[policy.order()]}
 
 
-def parts_of(algorithm: str, policy: Policy, n_quantiles: int) -> list[Part]:
+def parts_of(algorithm: str, policy: OriginalPolicy, n_quantiles: int) -> list[Part]:
     """Returns how the state of an algorithm is made of a policy, field by field.
 
     Raises:
@@ -358,7 +358,7 @@ def parts_of(algorithm: str, policy: Policy, n_quantiles: int) -> list[Part]:
 
 
 def converted(
-    parts: Sequence[Part], policy: Policy, optimizers: Mapping[str, Any]
+    parts: Sequence[Part], policy: OriginalPolicy, optimizers: Mapping[str, Any]
 ) -> tuple[dict[str, np.ndarray], list[str]]:
     """Returns the arrays of the state by name, and the files of the optimizers that were left out.
 
@@ -395,7 +395,9 @@ def converted(
     return arrays, left_out
 
 
-def moments_of(optimizer: Any, policy: Policy, prefix: str) -> tuple[int, dict[str, Callable[[str], np.ndarray]]]:
+def moments_of(
+    optimizer: Any, policy: OriginalPolicy, prefix: str
+) -> tuple[int, dict[str, Callable[[str], np.ndarray]]]:
     """Returns the steps of an optimizer and its moments by PyTorch's names, each as a function of the parameter's name.
 
     There are none unless they are those of Adam or RMSprop on these parameters. PyTorch numbers parameters in the order

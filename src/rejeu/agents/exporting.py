@@ -21,7 +21,7 @@ from rejeu.envs.make import VectorEnv
 from rejeu.envs.masks import mask_leaf
 from rejeu.envs.registry import maker, register
 from rejeu.export import c_file, check, stablehlo_file, web_file
-from rejeu.export.check import Check, Recording, Run
+from rejeu.export.check import Check, Run, SeenSteps
 from rejeu.export.contract import CARD, FrameStack, Policy, frame_stack_of, policy_of
 from rejeu.replay.ring import stacked_leaves
 from rejeu.training import finite
@@ -217,7 +217,7 @@ def card_of(agent: BaseAgent, made: Policy, target: str, source: str, duration: 
 
 def record(
     agent: BaseAgent, one: Policy, make_env: Callable[[], Any] | None, stack: FrameStack | None = None
-) -> tuple[Recording, float | None, FrameStack | None]:
+) -> tuple[SeenSteps, float | None, FrameStack | None]:
     """Returns observations with the actions of ``predict``, the duration of a step in seconds if it is known, and the stack.
 
     Of stacks of frames the newest frames are kept; how an episode begins is read from its first observation.
@@ -262,7 +262,7 @@ def record(
     for port in one.of("noise"):  # with these numbers a sample is the mode
         number = 0.0 if port.drawn == "normal" else 0.5
         inputs[port.name] = np.full((len(rows), *port.shape), number, port.dtype)
-    return Recording(inputs, np.stack(actions), "sampled" if vector is None else vector.env_id), duration, stack
+    return SeenSteps(inputs, np.stack(actions), "sampled" if vector is None else vector.env_id), duration, stack
 
 
 def environment(agent: BaseAgent, make_env: Callable[[], Any] | None) -> tuple[VectorEnv | None, float | None]:

@@ -20,13 +20,13 @@ import numpy as np
 
 from rejeu.agents import BUILT_IN, zoo
 from rejeu.agents.agent import Agent
-from rejeu.agents.conversion import EXTRACTORS, Policy, action_layers, converted, parts_of, shares_extractor
+from rejeu.agents.conversion import EXTRACTORS, OriginalPolicy, action_layers, converted, parts_of, shares_extractor
 from rejeu.checkpoints.model_files import check_depths
 from rejeu.checkpoints.pickled import (
     MOST_FIELD,
     UNREADABLE,
     Name,
-    Record,
+    PickledCall,
     array_of,
     content_of,
     explained,
@@ -183,7 +183,7 @@ def described(value: Any) -> Any:
     Raises:
         Malformed: for another kind of space.
     """
-    kind = value.name.rpartition(".")[2] if isinstance(value, Record) and ".spaces." in value.name else ""
+    kind = value.name.rpartition(".")[2] if isinstance(value, PickledCall) and ".spaces." in value.name else ""
     state = value.state if kind else None
     if not isinstance(state, dict):
         raise Malformed("it is no space of Gymnasium")
@@ -196,7 +196,7 @@ def described(value: Any) -> Any:
         return {"Discrete": {"n": int(array_of(state["n"])), "start": int(array_of(state.get("start", 0)))}}
     if kind == "MultiDiscrete":
         n = array_of(state["nvec"])
-        start = array_of(state["start"]) if isinstance(state.get("start"), Record) else np.zeros_like(n)
+        start = array_of(state["start"]) if isinstance(state.get("start"), PickledCall) else np.zeros_like(n)
         return {"MultiDiscrete": {"nvec": n.tolist(), "start": start.tolist()}}
     if kind == "MultiBinary":
         shape = state["n"] if isinstance(state["n"], tuple | list) else [state["n"]]
@@ -258,8 +258,8 @@ def observation_space_of(own: gym.Space, given: gym.Space | None) -> gym.Space:
 def number_of(value: Any) -> Any:
     """Returns the number that a schedule of Stable-Baselines3 always gives; other values as they are."""
     for key in ("value_schedule", "val"):
-        value = value.state.get(key) if isinstance(value, Record) and isinstance(value.state, dict) else value
-    return array_of(value).item() if isinstance(value, Record) and value.name.endswith(".scalar") else value
+        value = value.state.get(key) if isinstance(value, PickledCall) and isinstance(value.state, dict) else value
+    return array_of(value).item() if isinstance(value, PickledCall) and value.name.endswith(".scalar") else value
 
 
 def settings_of(kind: Any, model: Model, notes: list[str], changed: Collection[str] = ()) -> dict[str, Any]:
@@ -281,10 +281,10 @@ def settings_of(kind: Any, model: Model, notes: list[str], changed: Collection[s
             notes.append(f"{name} is code in the file; {used} is used")
         if isinstance(value, bool | int | float | str) or name not in SCHEDULES:
             found[name] = value
-    if "train_freq" in names and isinstance(value := model.readable("train_freq"), Record | int):
-        n, unit = value.arguments if isinstance(value, Record) else (value, "step")
+    if "train_freq" in names and isinstance(value := model.readable("train_freq"), PickledCall | int):
+        n, unit = value.arguments if isinstance(value, PickledCall) else (value, "step")
         n, unit = (n, unit) if n != -1 else (model.readable("n_episodes_rollout"), "episode")  # of versions before 1.0
-        unit = unit.arguments[0] if isinstance(unit, Record) else unit
+        unit = unit.arguments[0] if isinstance(unit, PickledCall) else unit
         found["train_freq"] = n if unit == "step" else (n, unit)
     if isinstance(buffer := model.readable("replay_buffer_class"), Name) and buffer.name == "HerReplayBuffer":
         settings = model.readable("replay_buffer_kwargs")
@@ -292,7 +292,7 @@ def settings_of(kind: Any, model: Model, notes: list[str], changed: Collection[s
     elif OLD_HER in model.fields:
         found |= hindsight(model.readable)
     if "action_noise" in names and (noise := model.readable("action_noise")) is not None:
-        state = noise.state if isinstance(noise, Record) and isinstance(noise.state, dict) else {}
+        state = noise.state if isinstance(noise, PickledCall) and isinstance(noise.state, dict) else {}
         sigma = np.unique(array_of(state["_sigma"])) if "_sigma" in state and "_theta" not in state else np.zeros(2)
         if sigma.size == 1 and not array_of(state["_mu"]).any():
             found["action_noise"] = float(sigma[0])
@@ -306,12 +306,12 @@ def settings_of(kind: Any, model: Model, notes: list[str], changed: Collection[s
 def hindsight(setting: Callable[[str], Any]) -> dict[str, Any]:
     """Returns the hyperparameters of hindsight replay, from a function that returns a setting by its name."""
     known = {key: value for key in ("n_sampled_goal", OLD_HER) if (value := setting(key)) is not None}
-    if isinstance(strategy := known.get(OLD_HER), Record):
+    if isinstance(strategy := known.get(OLD_HER), PickledCall):
         known[OLD_HER] = ("future", "final", "episode")[strategy.arguments[0]]
     return {"replay_buffer_class": "HerReplayBuffer", "replay_buffer_kwargs": known}
 
 
-def policy_settings(model: Model, policy: Policy, algorithm: str) -> dict[str, Any]:
+def policy_settings(model: Model, policy: OriginalPolicy, algorithm: str) -> dict[str, Any]:
     """Returns ``policy_kwargs``, and hyperparameters that are among those of the policy there.
 
     The widths of layers are those of the weights.
@@ -375,7 +375,7 @@ def policy_settings(model: Model, policy: Policy, algorithm: str) -> dict[str, A
 
 def moments(field: str, value: Any) -> dict[str, np.ndarray]:
     """Returns the arrays of a running mean and variance."""
-    if not isinstance(value, Record) or not isinstance(value.state, dict):
+    if not isinstance(value, PickledCall) or not isinstance(value.state, dict):
         raise Malformed(f"it has no running statistics for {field}")
     mean, variance, count = (array_of(value.state[key]) for key in ("mean", "var", "count"))
     seen = min(float(count), normalization.MAX_COUNT)
@@ -501,7 +501,7 @@ def load_zip(
         weights = model.tensors["policy"]
         if OLD_HER in model.fields and not keys:
             file_space, keys, weights = with_goals(model, file_space)
-        policy = Policy(weights, spaces.leaves(file_space), keys, action_space, squashes)
+        policy = OriginalPolicy(weights, spaces.leaves(file_space), keys, action_space, squashes)
         settings = settings_of(cls.algorithm.Config, model, notes, changes)
         settings |= policy_settings(model, policy, algorithm)
         arrays: dict[str, np.ndarray] = {}
@@ -583,7 +583,7 @@ def restore_windows(agent: Agent, value: Callable[[str], Any]) -> None:
     for name in ("ep_info_buffer", "ep_success_buffer"):
         found, number = value(name), lambda x: array_of(x).item()
         with contextlib.suppress(*UNREADABLE):
-            for one in (found.state if isinstance(found, Record) else found) or ():
+            for one in (found.state if isinstance(found, PickledCall) else found) or ():
                 entry = {key: number(one[key]) for key in "rlt"} if name == "ep_info_buffer" else number(one)
                 getattr(agent, name).append(entry)
 

@@ -97,7 +97,7 @@ class Config(RolloutConfig):
         return total // n_envs
 
 
-class Actor(eqx.Module):
+class Perturbation(eqx.Module):
     """What choosing an action needs: the parameters, and what the perturbations are drawn from."""
 
     network: Network
@@ -110,7 +110,7 @@ class Actor(eqx.Module):
 class State(eqx.Module):
     """Everything that ARS learns; every leaf is an array."""
 
-    actor: Actor
+    actor: Perturbation
     n_updates: Array
     """Iterations so far, ``int32[]``."""
 
@@ -145,7 +145,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         network = Network(network_key, obs_leaves, n_outputs, widths, shape)
         if config.zero_policy and not widths:
             network = jax.tree.map(jnp.zeros_like, network)
-        return State(Actor(network, search_key, jnp.int32(0)), jnp.int32(0))
+        return State(Perturbation(network, search_key, jnp.int32(0)), jnp.int32(0))
 
     def act(network: Network, obs: PyTree) -> Array:
         outputs = network(obs)
@@ -153,19 +153,19 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
             return jnp.argmax(outputs, axis=-1).astype(jnp.int32)
         return jnp.tanh(outputs) if widths else jnp.clip(outputs, -1.0, 1.0)
 
-    def explore(actor: Actor, obs: PyTree, key: Array, clock: Clock) -> Array:
+    def explore(actor: Perturbation, obs: PyTree, key: Array, clock: Clock) -> Array:
         return act(actor.network, obs)
 
-    def exploit(actor: Actor, obs: PyTree) -> Array:
+    def exploit(actor: Perturbation, obs: PyTree) -> Array:
         return act(actor.network, obs)
 
-    def begin(actor: Actor, n_envs: int) -> Playing:
+    def begin(actor: Perturbation, n_envs: int) -> Playing:
         networks = jax.tree.map(lambda leaf: jnp.zeros((n_envs, *leaf.shape), leaf.dtype), actor.network)
         none = jnp.full((n_envs,), -1, jnp.int32)
         return Playing(networks, none, jnp.zeros_like(none))
 
     def play(
-        playing: Playing, actor: Actor, obs: PyTree, ended: Array, key: Array, clock: Clock
+        playing: Playing, actor: Perturbation, obs: PyTree, ended: Array, key: Array, clock: Clock
     ) -> tuple[Array, Playing]:
         n_envs = ended.shape[0]
         is_new = playing.n_rollouts != actor.n_rollouts
@@ -207,7 +207,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     return Algorithm(init, lambda state: state.actor, explore, exploit, update, Explorer(begin, play))
 
 
-def direction(actor: Actor, k: Array) -> Network:
+def direction(actor: Perturbation, k: Array) -> Network:
     """Returns the k-th direction of the present iteration: a tree like the network of independent standard normals."""
     key = jax.random.fold_in(nth(actor.key, actor.n_rollouts), k)
     leaves, structure = jax.tree.flatten(actor.network)
@@ -216,7 +216,7 @@ def direction(actor: Actor, k: Array) -> Network:
     return jax.tree.unflatten(structure, drawn)
 
 
-def perturbed(actor: Actor, candidate: Array, std: Any, n_delta: int) -> Network:
+def perturbed(actor: Perturbation, candidate: Array, std: Any, n_delta: int) -> Network:
     """Returns the parameters of an episode of an iteration.
 
     Episodes are numbered from 0: first all directions forward, then all backward, and so on for each of the evaluations.

@@ -124,7 +124,7 @@ class State(eqx.Module):
     """Rollouts learned from, ``int32[]``."""
 
 
-class Step(NamedTuple):
+class TrustRegionStep(NamedTuple):
     """The policy's step on a rollout, each ``float32[]``."""
 
     objective: Array
@@ -192,7 +192,7 @@ def warn_of_unused(factor: int, n_envs: int) -> None:
         )
 
 
-def policy_step(network: ActorCritic, data: Samples, config: Config) -> tuple[ActorCritic, Step]:
+def policy_step(network: ActorCritic, data: Samples, config: Config) -> tuple[ActorCritic, TrustRegionStep]:
     """Returns the network after the policy's step, and the figures of that step.
 
     What belongs to the value alone stays. Layers that policy and value share move with the policy.
@@ -222,17 +222,17 @@ def policy_step(network: ActorCritic, data: Samples, config: Config) -> tuple[Ac
         length = longest * config.line_search_shrinking_factor ** attempt.astype(jnp.float32)
         return jax.tree.map(lambda p, d: p + length * d, policy, direction)
 
-    def tried(attempt: Array) -> Step:
+    def tried(attempt: Array) -> TrustRegionStep:
         candidate = moved(attempt)
         reached, kl = objective(candidate), divergence(candidate)
-        return Step(reached, kl, ((reached > start) & (kl < config.target_kl)).astype(jnp.float32))
+        return TrustRegionStep(reached, kl, ((reached > start) & (kl < config.target_kl)).astype(jnp.float32))
 
-    def search(attempt: tuple[Array, Step]) -> tuple[Array, Step]:
+    def search(attempt: tuple[Array, TrustRegionStep]) -> tuple[Array, TrustRegionStep]:
         return attempt[0] + 1, tried(attempt[0] + 1)
 
     refused = lambda attempt: (attempt[1].accepted == 0) & (attempt[0] + 1 < config.line_search_max_iter)  # noqa: E731
     attempt, step = jax.lax.while_loop(refused, search, (jnp.int32(0), tried(jnp.int32(0))))
-    stays = Step(start, jnp.float32(0.0), jnp.float32(0.0))
+    stays = TrustRegionStep(start, jnp.float32(0.0), jnp.float32(0.0))
     accepted = step.accepted > 0
     policy, step = jax.tree.map(lambda new, old: jnp.where(accepted, new, old), (moved(attempt), step), (policy, stays))
     return eqx.combine(policy, of_value), step

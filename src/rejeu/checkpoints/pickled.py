@@ -1,7 +1,7 @@
 """Pickles and PyTorch's files read as data: nothing that they name is imported or called.
 
 A pickle is a program of opcodes, some of which name functions and call them. :func:`parse` follows the opcodes that build
-plain values. A name stays a :class:`Name`, and what would be called with it becomes a :class:`Record`, which only
+plain values. A name stays a :class:`Name`, and what would be called with it becomes a :class:`PickledCall`, which only
 holds the arguments; names of packages other than :data:`PACKAGES` are refused. The opcodes are decoded by the standard
 library's ``pickletools``, which disassembles pickles and executes none.
 
@@ -64,7 +64,7 @@ class Name(NamedTuple):
         return f"{self.module}.{self.name}"
 
 
-class Record:
+class PickledCall:
     """What a pickle would create by calling a name: the name, the arguments, and the attributes that it would set."""
 
     def __init__(self, name: Any, arguments: tuple[Any, ...]) -> None:
@@ -74,7 +74,7 @@ class Record:
 
 def parse(
     data: bytes | BinaryIO,
-    call: Callable[[Any, tuple[Any, ...]], Any] = Record,
+    call: Callable[[Any, tuple[Any, ...]], Any] = PickledCall,
     storage: Any = None,
     most: int = MOST_WRITTEN,
 ) -> Any:
@@ -139,7 +139,7 @@ def parse(
             )
         elif code == "BUILD":
             (state,) = popped(stack, 1)
-            if isinstance(stack[-1], Record):
+            if isinstance(stack[-1], PickledCall):
                 stack[-1].state = state
         elif code == "BINPERSID" and storage is not None:
             stack.append(storage(stack.pop()))
@@ -157,7 +157,7 @@ def check_size(value: Any, most: int) -> None:
     parts = [value]
     while parts:
         one = parts.pop()
-        if isinstance(one, Record):
+        if isinstance(one, PickledCall):
             inside: Any = [one.arguments, one.state]
         else:
             inside = [*one.values()] if isinstance(one, dict) else one if isinstance(one, list | tuple) else []
@@ -185,7 +185,7 @@ def add(target: Any, items: list[Any], pairs: bool) -> None:
             target[key] = value
     elif isinstance(target, list) and not pairs:
         target.extend(items)
-    elif isinstance(target, Record) and target.name == "collections.deque" and not pairs:
+    elif isinstance(target, PickledCall) and target.name == "collections.deque" and not pairs:
         target.state = target.state or []
         target.state.extend(items)
 
@@ -203,7 +203,7 @@ def array_of(value: Any) -> np.ndarray:
     """
     if isinstance(value, bool | int | float):
         return np.asarray(value)
-    if not isinstance(value, Record):
+    if not isinstance(value, PickledCall):
         raise Malformed("it has no array where one is expected")
     end = value.name.rpartition(".")[2]
     if end == "_frombuffer":
@@ -225,7 +225,7 @@ def dtype_of(value: Any) -> np.dtype:
     """Returns the dtype of numbers that a record of NumPy's, or the name of a class of scalars, describes."""
     if isinstance(value, Name) and value.module == "numpy":
         dtype = np.dtype(value.name)
-    elif isinstance(value, Record) and value.name == "numpy.dtype":
+    elif isinstance(value, PickledCall) and value.name == "numpy.dtype":
         dtype = np.dtype(value.arguments[0])
         if isinstance(value.state, tuple) and value.state[1] == ">":
             dtype = dtype.newbyteorder(">")
@@ -393,6 +393,10 @@ def read_normalization(path: Path) -> dict[str, Any]:
     if len(data) > MOST_FIELD:
         raise Malformed(f"it has more than {MOST_FIELD:,} bytes")
     found = parse(data)
-    if not isinstance(found, Record) or not found.name.endswith("VecNormalize") or not isinstance(found.state, dict):
+    if (
+        not isinstance(found, PickledCall)
+        or not found.name.endswith("VecNormalize")
+        or not isinstance(found.state, dict)
+    ):
         raise Malformed("it holds no VecNormalize")
     return found.state

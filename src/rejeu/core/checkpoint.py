@@ -38,7 +38,7 @@ MAX_TABLE = 4 * 2**20
 METADATA = "__metadata__"
 
 
-class Spec(NamedTuple):
+class ArraySpec(NamedTuple):
     """Shape and dtype of an array in a file."""
 
     shape: tuple[int, ...]
@@ -72,13 +72,13 @@ class TensorFile:
             raise Malformed(f"its table has {size} bytes, expected at most {MAX_TABLE}")
         self._file = safe_open(path, framework="numpy", backend="pread")
         self.metadata: dict[str, str] = self._file.metadata() or {}
-        self.specs: dict[str, Spec] = {}
+        self.specs: dict[str, ArraySpec] = {}
         """By name, in the order of the offsets."""
         for name in self._file.offset_keys():
             array = self._file.get_slice(name)
             if (dtype := array.get_dtype()) not in DTYPES:
                 raise Malformed(f"{shown(name)} has the dtype {shown(dtype)}, which rejeu does not write")
-            self.specs[name] = Spec(tuple(array.get_shape()), np.dtype(DTYPES[dtype]))
+            self.specs[name] = ArraySpec(tuple(array.get_shape()), np.dtype(DTYPES[dtype]))
 
     def read(self, name: str) -> np.ndarray:
         """Returns an array.
@@ -204,7 +204,7 @@ class Contents:
         self.path = path
         self.header = header
         """Of the current schema."""
-        self.specs: dict[str, Spec] = file.specs
+        self.specs: dict[str, ArraySpec] = file.specs
         """Shape and dtype of each array, by name."""
         self._file, self._sums = file, sums
 

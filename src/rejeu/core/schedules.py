@@ -1,8 +1,8 @@
 """Schedules: hyperparameters as functions of the progress of a run.
 
 A schedule is called with ``progress`` in [0, 1], a Python number or a traced array, and returns the value.
-:class:`Linear`, :class:`Exponential` and :class:`Table` are saved with a model. Any other function that JAX can trace is a
-schedule too; a file mentions its name only, so it must be given again to ``load``::
+:class:`Linear`, :class:`Exponential` and :class:`TableSchedule` are saved with a model. Any other function that JAX can trace
+is a schedule too; a file mentions its name only, so it must be given again to ``load``::
 
     rejeu.SAC("MlpPolicy", env, learning_rate=lambda progress: 3e-4 * jnp.cos(progress * jnp.pi / 2))
 """
@@ -71,7 +71,7 @@ class Exponential:
 
 
 @dataclass(frozen=True)
-class Table:
+class TableSchedule:
     """Values at equal steps of the progress from 0 to 1, joined by straight lines: any function, as data.
 
     >>> Table((1.0, 0.5, 0.0))(0.25)
@@ -114,10 +114,10 @@ ROUNDING = 1e-6
 """Relative error by which the end of a schedule may fall below its limit, such as the end of a cosine."""
 Schedule = Callable[[Any], Any]
 """A function from the progress in [0, 1] to a value: one of ``SCHEDULES`` or one of your own."""
-SCHEDULES: dict[str, type[Linear] | type[Exponential] | type[Table]] = {
+SCHEDULES: dict[str, type[Linear] | type[Exponential] | type[TableSchedule]] = {
     "linear": Linear,
     "exponential": Exponential,
-    "table": Table,
+    "table": TableSchedule,
 }
 
 
@@ -144,7 +144,7 @@ def parse(name: str, value: Any, least: float = -math.inf) -> float | Schedule:
 
 
 def _parse(name: str, value: Any) -> float | Schedule:
-    if isinstance(value, Linear | Exponential | Table):
+    if isinstance(value, Linear | Exponential | TableSchedule):
         return value
     if isinstance(value, bool):
         raise TypeError(f"{name}={value!r} must be a number or a schedule")
@@ -158,7 +158,7 @@ def _parse(name: str, value: Any) -> float | Schedule:
         if isinstance(value, Mapping) and value.get("schedule") in SCHEDULES:
             given = {key: part for key, part in value.items() if key != "schedule"}
             if value["schedule"] == "table":
-                return Table(**given)
+                return TableSchedule(**given)
             kind: Any = SCHEDULES[value["schedule"]]
             return kind(**{key: float(number) for key, number in given.items()})
     except (TypeError, ValueError) as error:

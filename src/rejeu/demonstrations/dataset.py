@@ -34,7 +34,7 @@ SLACK, ROOM, PACKED, IMAGES = 2**20, 16, 32, 256
 that the file itself has compressed only a part counts, of general ones and of JPEG images."""
 
 
-class Rows:
+class ArrayReader:
     """Reads arrays from the files of a dataset, until more was asked for than they can hold. Mutable."""
 
     def __init__(self, files: list[Path], is_jpeg: bool) -> None:
@@ -85,7 +85,7 @@ def read(data: Path) -> tuple[list[tuple[Any, ...]], gym.Space, gym.Space, EnvSp
     files = [path for path in (data / MAIN, *parts(data)) if path.is_file()]
     try:
         metadata = metadata_of(data, files)
-        rows = Rows(files, bool(metadata.get("jpeg_encoding", True)))
+        rows = ArrayReader(files, bool(metadata.get("jpeg_encoding", True)))
         if (form := metadata.get("data_format", "hdf5")) != "hdf5":
             raise ValueError(f"it is in the format {shown(form)}, and only hdf5 is read")
         most = max(spaces.MAX_NUMBERS, rows.left)
@@ -191,7 +191,7 @@ def put(group: Any, name: str, rows: Sequence[Any]) -> None:
         group.create_dataset(name, data=list(rows) if isinstance(first, str) else np.stack(rows))
 
 
-class Sink(io.FileIO):
+class Hdf5Output(io.FileIO):
     """A file for HDF5, which ends the process where a write fails; here the first error is kept for later. Mutable."""
 
     error: OSError | None = None
@@ -217,7 +217,7 @@ def merge(data: Path) -> None:
 
     waiting = parts(data)
     sources = [path for path in (data / MAIN, *waiting) if path.is_file()]
-    with atomic.replacing(data / MAIN) as replaced, Sink(replaced.name, "r+b") as sink:
+    with atomic.replacing(data / MAIN) as replaced, Hdf5Output(replaced.name, "r+b") as sink:
         with h5py.File(sink, "w", libver="latest", track_order=True) as file:
             for path in sources:
                 with h5py.File(path, "r") as source:

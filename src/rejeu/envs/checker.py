@@ -68,7 +68,7 @@ class Finding(NamedTuple):
     """What was received, what was expected, and the fix."""
 
 
-class Seen(NamedTuple):
+class SeenStep(NamedTuple):
     """One step, with copies of the returned values."""
 
     obs: Any
@@ -153,7 +153,7 @@ def _played(env: gym.Env, effort: Effort) -> dict[str, Finding]:
     return found
 
 
-def _play(env: gym.Env, found: dict[str, Finding], effort: Effort) -> list[Seen] | None:
+def _play(env: gym.Env, found: dict[str, Finding], effort: Effort) -> list[SeenStep] | None:
     """Takes random steps and records each kind of problem once. Returns the steps, None if they had to stop."""
     space = env.observation_space
     env.action_space.seed(SEED)
@@ -167,7 +167,7 @@ def _play(env: gym.Env, found: dict[str, Finding], effort: Effort) -> list[Seen]
         with suppress(Exception):  # whatever step raises after a wrong reset
             _check_step(env.step(env.action_space.sample()), space, found)
         return None
-    seen: list[Seen] = []
+    seen: list[SeenStep] = []
     limit, length = known_limit(env), 0
     lengths: list[int] = []
     at_limit: list[bool] = []
@@ -184,7 +184,7 @@ def _play(env: gym.Env, found: dict[str, Finding], effort: Effort) -> list[Seen]
             return None
         obs, reward, terminated, truncated, info = validation.convert_step(answer)
         kept = jax.tree.map(np.array, plain(space, obs))
-        seen.append(Seen(kept, reward, terminated, truncated, copy.deepcopy(info)))
+        seen.append(SeenStep(kept, reward, terminated, truncated, copy.deepcopy(info)))
         length += 1
         if terminated or truncated:
             lengths.append(length)
@@ -288,7 +288,7 @@ def _gymnasium_messages(env: gym.Env, skip_render_check: bool) -> list[str]:
     ]
 
 
-def goal_findings(env: gym.Env, seen: Sequence[Seen]) -> list[Finding]:
+def goal_findings(env: gym.Env, seen: Sequence[SeenStep]) -> list[Finding]:
     """Returns the problems with the goals of an environment, from some of its steps: the first of each function."""
     try:
         check_goal_space(env.observation_space)
@@ -307,7 +307,7 @@ def goal_findings(env: gym.Env, seen: Sequence[Seen]) -> list[Finding]:
     return [Finding(*fault) for fault in first if fault is not None]
 
 
-def _goal_faults(name: str, function: Callable[..., Any], rows: Sequence[Seen]) -> Iterator[tuple[Level, str]]:
+def _goal_faults(name: str, function: Callable[..., Any], rows: Sequence[SeenStep]) -> Iterator[tuple[Level, str]]:
     """Yields the problems with ``compute_reward`` or ``compute_terminated``, the worst first."""
     for row in rows:
         own = function(*_goals(row), row.info)
@@ -324,7 +324,7 @@ def _goal_faults(name: str, function: Callable[..., Any], rows: Sequence[Seen]) 
     yield from _against_batches(name, function, rows)
 
 
-def _against_step(name: str, own: Any, row: Seen) -> Iterator[tuple[Level, str]]:
+def _against_step(name: str, own: Any, row: SeenStep) -> Iterator[tuple[Level, str]]:
     """Yields the difference between a step and the function for one goal."""
     if name == "compute_terminated" and bool(own) != row.terminated:
         yield (
@@ -340,7 +340,7 @@ def _against_step(name: str, own: Any, row: Seen) -> Iterator[tuple[Level, str]]
         yield "error", f"{text}; they must agree: let step call compute_reward"
 
 
-def _against_batches(name: str, function: Callable[..., Any], rows: Sequence[Seen]) -> Iterator[tuple[Level, str]]:
+def _against_batches(name: str, function: Callable[..., Any], rows: Sequence[SeenStep]) -> Iterator[tuple[Level, str]]:
     """Yields the difference between the results for many goals at once and for each alone."""
     achieved, desired = (np.array([_goals(row)[k] for row in rows]) for k in range(2))
     achieved, desired = np.concatenate([achieved] * 2), np.concatenate([np.roll(desired, 1, axis=0), achieved])
@@ -368,7 +368,7 @@ def _against_batches(name: str, function: Callable[..., Any], rows: Sequence[See
         )
 
 
-def _goals(row: Seen) -> tuple[Any, Any]:
+def _goals(row: SeenStep) -> tuple[Any, Any]:
     _, achieved, desired = (row.obs[key] for key in GOAL_KEYS)
     return achieved, desired
 

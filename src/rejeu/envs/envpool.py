@@ -46,7 +46,7 @@ MANY_OPERATIONS = 20_000
 """Number of operations from which a progress bar is shown during replay."""
 
 
-class Operation(NamedTuple):
+class LoggedOperation(NamedTuple):
     """One step or reset of the environments."""
 
     which: np.ndarray | None
@@ -121,7 +121,7 @@ class ActionLog:
         """Returns the log as plain data (see :mod:`rejeu.core.records`)."""
         return {"n_operations": self.n_operations, "blocks": [*self._blocks, _compressed(self._open)]}
 
-    def operations(self, saved: dict[str, Any]) -> Iterator[Operation]:
+    def operations(self, saved: dict[str, Any]) -> Iterator[LoggedOperation]:
         """Yields the operations of a log that :meth:`to_plain` returned, oldest first.
 
         Raises:
@@ -147,10 +147,10 @@ class ActionLog:
                     action = _part(data, at, rows * self._row_bytes).view(self._dtype).reshape(rows, *self._shape)
                     check_env_actions(self._space, action, "the record of actions")
                     at += rows * self._row_bytes
-                yield Operation(which, action)
+                yield LoggedOperation(which, action)
 
 
-def replay(log: ActionLog, saved: dict[str, Any], title: str) -> Iterator[Operation]:
+def replay(log: ActionLog, saved: dict[str, Any], title: str) -> Iterator[LoggedOperation]:
     """Yields the operations of a saved log. On a terminal, a progress bar is shown for long logs.
 
     Raises:

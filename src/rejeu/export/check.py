@@ -31,7 +31,7 @@ DECISIVE = ("argmax", "floor", "gt")
 COMPILERS = ("cc", "gcc", "clang")
 
 
-class Recording(NamedTuple):
+class SeenSteps(NamedTuple):
     """Observations, in the order in which a policy saw them, and its actions."""
 
     inputs: dict[str, np.ndarray]
@@ -72,7 +72,7 @@ Run = Callable[[Mapping[str, np.ndarray]], tuple[np.ndarray, np.ndarray]]
 """Returns actions ``(n, *shape)`` and times in seconds ``(n,)`` for inputs ``(n, *shape)`` in order."""
 
 
-def compare(policy: Policy, recording: Recording, run: Run) -> Check:
+def compare(policy: Policy, recording: SeenSteps, run: Run) -> Check:
     """Returns how a file compares with ``predict``.
 
     Args:

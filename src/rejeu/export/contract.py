@@ -15,7 +15,7 @@ from rejeu.core import spaces
 from rejeu.core.algorithm import Algorithm, Clock, Masked, PyTree
 from rejeu.core.spaces import Leaf
 from rejeu.exploration import explorer as exploration
-from rejeu.export.program import Program, trace
+from rejeu.export.program import TracedProgram, trace
 
 Role = Literal["observation", "action_mask", "state", "episode_start", "noise", "action"]
 CARD = 1
@@ -101,7 +101,7 @@ def frame_stack_of(leaves: tuple[Leaf, ...], n: int) -> FrameStack:
 class Policy(NamedTuple):
     """A policy as a program. Every array has a leading batch axis."""
 
-    program: Program
+    program: TracedProgram
     inputs: tuple[Port, ...]
     """In the order of the program's arguments: observation, then ``action_mask``, state and ``episode_start``, noise."""
     outputs: tuple[Port, ...]

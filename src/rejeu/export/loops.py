@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rejeu.export.program import Operation, Program, Value, unsupported
+from rejeu.export.program import Operation, TracedProgram, Value, unsupported
 
 TEMPLATES = Path(__file__).parent / "templates"
 PRIMITIVES = tomllib.loads((Path(__file__).parent / "primitives.toml").read_text(encoding="utf-8"))
@@ -96,7 +96,7 @@ class Printer:
         self.known: dict[Value, Array] = {}
         self._depth = 0
 
-    def run(self, program: Program, arguments: Sequence[str]) -> list[Array]:
+    def run(self, program: TracedProgram, arguments: Sequence[str]) -> list[Array]:
         """Adds the statements of a program whose arguments have these names, and returns its outputs."""
         for value, name in zip(program.arguments, arguments, strict=True):
             self.known[value] = memory(name, value.shape, value.dtype)

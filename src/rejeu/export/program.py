@@ -113,7 +113,7 @@ class Operation(NamedTuple):
         return self.primitive.name
 
 
-class Program(NamedTuple):
+class TracedProgram(NamedTuple):
     """A function of arrays as operations in the order of their execution."""
 
     inputs: tuple[Value, ...]
@@ -137,7 +137,7 @@ class Program(NamedTuple):
         """Inputs, then draws."""
         return (*self.inputs, *(value for _, value in self.draws))
 
-    def ending_in(self, outputs: Sequence[Value]) -> Program:
+    def ending_in(self, outputs: Sequence[Value]) -> TracedProgram:
         """Returns the program of other outputs, without the operations that these do not need."""
         needed, kept = {*outputs}, []
         for operation in reversed(self.operations):
@@ -145,7 +145,7 @@ class Program(NamedTuple):
                 needed |= {*operation.inputs}
                 kept.append(operation)
         draws = tuple((kind, value) for kind, value in self.draws if value in needed)
-        return Program(self.inputs, draws, tuple(reversed(kept)), tuple(outputs))
+        return TracedProgram(self.inputs, draws, tuple(reversed(kept)), tuple(outputs))
 
 
 def unsupported(operation: Operation, target: str, detail: str = "") -> ValueError:
@@ -157,7 +157,7 @@ def unsupported(operation: Operation, target: str, detail: str = "") -> ValueErr
     )
 
 
-def trace(function: Callable[..., Any], *examples: Any, draws: bool = False) -> Program:
+def trace(function: Callable[..., Any], *examples: Any, draws: bool = False) -> TracedProgram:
     """Returns a function of arrays as a program.
 
     Args:
@@ -175,7 +175,7 @@ def trace(function: Callable[..., Any], *examples: Any, draws: bool = False) -> 
     constants = [Value(np.shape(one), one.dtype, np.asarray(one)) for one in closed.consts]
     outputs = tracing.inline(closed.jaxpr, [*constants, *leaves])
     inputs = tuple(leaves[:-1] if draws else leaves)
-    program = Program(inputs, tuple(tracing.draws), tuple(tracing.operations), ()).ending_in(outputs)
+    program = TracedProgram(inputs, tuple(tracing.draws), tuple(tracing.operations), ()).ending_in(outputs)
     for operation in program.operations:
         if not {*operation.inputs}.isdisjoint({*leaves} - {*inputs}):
             raise unsupported(operation, "a file", ": it draws random numbers that cannot be an input")

@@ -16,7 +16,7 @@ from rejeu.envs import functional
 from rejeu.envs.functional import FunctionalEnv
 from rejeu.export.contract import Policy
 from rejeu.export.loops import TEMPLATES, Language, Printer, indented, memory
-from rejeu.export.program import Program, trace
+from rejeu.export.program import TracedProgram, trace
 
 ENVIRONMENTS = {
     name: f"jax/{name.removeprefix('rejeu/')}"
@@ -92,12 +92,12 @@ def write(script: str) -> bytes:
     return (TEMPLATES / "web.html").read_text(encoding="utf-8").replace("/* script */", script).encode()
 
 
-def draws_of(program: Program) -> list[tuple[str, int]]:
+def draws_of(program: TracedProgram) -> list[tuple[str, int]]:
     """Returns distribution and number of the random numbers that a program takes."""
     return [(kind, math.prod(value.sizes)) for kind, value in program.draws]
 
 
-def function(name: str, program: Program) -> str:
+def function(name: str, program: TracedProgram) -> str:
     """Returns a function from arrays to arrays."""
     printer, arguments = Printer(JAVASCRIPT), [f"a{i}" for i in range(len(program.arguments))]
     results: list[str] = []

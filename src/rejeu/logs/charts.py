@@ -143,7 +143,7 @@ def episode_chart(episodes: Episodes, evaluations: Table, column: str, window: i
 
     Args:
         episodes: of training.
-        evaluations: with the columns of :attr:`rejeu.lab.reporting.runs.Run.evaluations`.
+        evaluations: with the columns of :attr:`rejeu.lab.reporting.runs.RunSummary.evaluations`.
         column: "return", "success" or "length".
         window: episodes in the moving mean; None for :func:`window_of` their number.
     """

@@ -233,7 +233,7 @@ def discounts_of(gamma: float, n_steps: int) -> np.ndarray:
     return (gamma ** np.arange(n_steps + 1)[:, None] * np.array([1, 0])).astype(np.float32).reshape(-1)
 
 
-class Window(NamedTuple):
+class StepWindow(NamedTuple):
     """The steps that n-step returns sum, ``(batch, n)`` each."""
 
     position: Any
@@ -244,7 +244,7 @@ class Window(NamedTuple):
     """Which of these entered a terminal state."""
 
 
-def look_ahead(xp: Any, ring: Any, index: Callable[..., Any], rows: Any, n: int) -> Window:
+def look_ahead(xp: Any, ring: Any, index: Callable[..., Any], rows: Any, n: int) -> StepWindow:
     """Returns the up to ``n`` steps from each of ``rows`` to its episode's end or to the newest step."""
     times = rows.time[:, None] + xp.arange(n)[None]
     position = index(rows.env[:, None], times)
@@ -252,7 +252,7 @@ def look_ahead(xp: Any, ring: Any, index: Callable[..., Any], rows: Any, n: int)
     is_step = (kind != LAST) & (times < ring.head[rows.env][:, None])
     continues = xp.cumprod(is_step & (kind != TERMINATED), axis=1).astype(bool)
     valid = xp.concatenate([is_step[:, :1], is_step[:, 1:] & continues[:, :-1]], axis=1)
-    return Window(position, valid, (kind == TERMINATED) & valid)
+    return StepWindow(position, valid, (kind == TERMINATED) & valid)
 
 
 class NewGoals(NamedTuple):
@@ -305,7 +305,7 @@ def outcome(
     return Outcome(rewards, window.valid.sum(axis=1), window.terminal.any(axis=1))
 
 
-def with_new_goals(xp: Any, rewards: Any, window: Window, reached: Any, goals: NewGoals) -> tuple[Any, Window]:
+def with_new_goals(xp: Any, rewards: Any, window: StepWindow, reached: Any, goals: NewGoals) -> tuple[Any, StepWindow]:
     """Returns rewards ``(batch, n)`` and window of transitions some of which have new goals.
 
     ``reached`` are the goals achieved by each of their steps, ``(n_goals, n, ...)``. Arrays of NumPy are mutated.
@@ -318,7 +318,7 @@ def with_new_goals(xp: Any, rewards: Any, window: Window, reached: Any, goals: N
         goes_on = xp.cumsum(ends, axis=1)[:, :-1] == 0
         valid = replaced(valid, (which, slice(1, None)), valid[which][:, 1:] & goes_on)
         terminal = replaced(terminal, which, ends) & valid
-    return rewards, Window(window.position, valid, terminal)
+    return rewards, StepWindow(window.position, valid, terminal)
 
 
 def replaced(array: Any, which: Any, values: Any) -> Any:

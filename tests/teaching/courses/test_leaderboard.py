@@ -68,7 +68,7 @@ def test_models_are_ranked_and_other_files_get_one_line_each(folder, tmp_path, c
 def test_the_places_of_a_model_are_those_that_the_intervals_allow():
     def model(name, *returns):
         returns = np.array(returns)
-        return leaderboard.Model(name, "DQN", 0, 0, Evaluation(returns, returns, returns))
+        return leaderboard.Entrant(name, "DQN", 0, 0, Evaluation(returns, returns, returns))
 
     wide, high, low = model("wide", 0.0, 10.0, 20.0), model("high", 14.0, 15.0, 16.0), model("low", 1.0, 2.0, 3.0)
     assert wide.interval[0] < low.interval[0] < low.interval[1] < high.interval[0] < high.interval[1] < wide.interval[1]

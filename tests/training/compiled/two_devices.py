@@ -14,7 +14,7 @@ import rejeu
 from rejeu.callbacks import Checkpoint
 from rejeu.core import devices
 from rejeu.training.compiled import trainer as device_trainer
-from rejeu.training.compiled.trainer import DeviceTrainer, Group
+from rejeu.training.compiled.trainer import DeviceTrainer, RunGroup
 from tests.agents.test_together import ON_POLICY, SMALL, assert_same_runs
 
 CASES: dict[str, Any] = {
@@ -30,7 +30,7 @@ def share(name: str) -> None:
     used: list[int] = []
     start = DeviceTrainer.start
 
-    def counted(trainer: DeviceTrainer, group: Group, limits: Any) -> None:
+    def counted(trainer: DeviceTrainer, group: RunGroup, limits: Any) -> None:
         start(trainer, group, limits)
         used.append(len(jax.tree.leaves(group.carry.state)[0].sharding.device_set))
 

@@ -105,7 +105,7 @@ def read(path: str | Path) -> Preset:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Result:
+class PresetResult:
     """What an algorithm reached in an environment, over several seeds."""
 
     env_id: str
@@ -161,13 +161,13 @@ def _percent(share: float) -> str:
 
 
 @cache
-def results() -> tuple[Result, ...]:
+def results() -> tuple[PresetResult, ...]:
     """Returns every result; of several for one preset the first is of the preset as it is."""
     content = resources.files("rejeu.agents.presets").joinpath("results.json").read_bytes()
-    return msgspec.json.decode(content, type=tuple[Result, ...])
+    return msgspec.json.decode(content, type=tuple[PresetResult, ...])
 
 
-def find_result(env_id: str, algorithm: str, name: str = "") -> Result | None:
+def find_result(env_id: str, algorithm: str, name: str = "") -> PresetResult | None:
     """Returns the first result of an algorithm in an environment, with the preset of this name; None if there is none."""
     wanted = env_id, algorithm, name
     preset_of = lambda command: command.partition("--preset ")[2].partition(" ")[0]  # noqa: E731
@@ -255,7 +255,7 @@ __all__ = [
     "ALGORITHM_FOR",
     "ALL",
     "Preset",
-    "Result",
+    "PresetResult",
     "default",
     "every",
     "find",

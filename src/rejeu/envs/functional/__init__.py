@@ -26,7 +26,7 @@ MakeDrawing = Callable[["FunctionalEnv", str], "Drawing"]
 """Returns the drawing of an environment for a render mode, ``"rgb_array"`` or ``"human"``."""
 
 
-class Entry(NamedTuple):
+class FunctionalSpec(NamedTuple):
     """A registered environment."""
 
     kind: str | Callable[..., FunctionalEnv]
@@ -40,20 +40,22 @@ class Entry(NamedTuple):
     """The function that returns its drawing, or one of rejeu's by module and name; None if it cannot be drawn."""
 
 
-REGISTRY: dict[str, Entry] = {
-    "jax/CartPole-v1": Entry(f"{__name__}.cart_pole:CartPole", 500, 475.0, f"{__name__}.drawing:cart_pole"),
-    "jax/Pendulum-v1": Entry(f"{__name__}.pendulum:Pendulum", 200, None, f"{__name__}.drawing:pendulum"),
-    "jax/MountainCar-v0": Entry(
+REGISTRY: dict[str, FunctionalSpec] = {
+    "jax/CartPole-v1": FunctionalSpec(f"{__name__}.cart_pole:CartPole", 500, 475.0, f"{__name__}.drawing:cart_pole"),
+    "jax/Pendulum-v1": FunctionalSpec(f"{__name__}.pendulum:Pendulum", 200, None, f"{__name__}.drawing:pendulum"),
+    "jax/MountainCar-v0": FunctionalSpec(
         f"{__name__}.mountain_car:MountainCar", 200, -110.0, f"{__name__}.drawing:mountain_car"
     ),
-    "jax/MountainCarContinuous-v0": Entry(
+    "jax/MountainCarContinuous-v0": FunctionalSpec(
         f"{__name__}.mountain_car:MountainCarContinuous", 999, 90.0, f"{__name__}.drawing:mountain_car"
     ),
-    "jax/Acrobot-v1": Entry(f"{__name__}.acrobot:Acrobot", 500, -100.0, f"{__name__}.drawing:acrobot"),
-    "jax/Ball-v0": Entry(f"{__name__}.ball:Ball", None, None, f"{__name__}.drawing:ball"),
-    "jax/PointMaze-v0": Entry(f"{__name__}.point_maze:PointMaze", 200, None, f"{__name__}.drawing:Maze"),
-    "jax/BitFlipping-v0": Entry(f"{__name__}.bit_flipping:BitFlipping", None, None, f"{__name__}.drawing:Bits"),
-    "jax/Parking-v0": Entry(f"{__name__}.parking:Parking", 500, None, f"{__name__}.drawing:ParkingLot"),
+    "jax/Acrobot-v1": FunctionalSpec(f"{__name__}.acrobot:Acrobot", 500, -100.0, f"{__name__}.drawing:acrobot"),
+    "jax/Ball-v0": FunctionalSpec(f"{__name__}.ball:Ball", None, None, f"{__name__}.drawing:ball"),
+    "jax/PointMaze-v0": FunctionalSpec(f"{__name__}.point_maze:PointMaze", 200, None, f"{__name__}.drawing:Maze"),
+    "jax/BitFlipping-v0": FunctionalSpec(
+        f"{__name__}.bit_flipping:BitFlipping", None, None, f"{__name__}.drawing:Bits"
+    ),
+    "jax/Parking-v0": FunctionalSpec(f"{__name__}.parking:Parking", 500, None, f"{__name__}.drawing:ParkingLot"),
 }
 """The environments by id."""
 
@@ -117,7 +119,7 @@ def register(
     """
     if not env_id.startswith("jax/"):
         raise ValueError(f"env_id={env_id!r} must begin with 'jax/', such as jax/Walk-v0")
-    entry = Entry(kind, max_episode_steps, reward_threshold, drawing)
+    entry = FunctionalSpec(kind, max_episode_steps, reward_threshold, drawing)
     if REGISTRY.get(env_id, entry) != entry:
         raise ValueError(f"{env_id} is registered already; choose another name or version")
     REGISTRY[env_id] = entry

@@ -25,7 +25,7 @@ from gymnasium.vector.utils import CloudpickleWrapper
 
 from rejeu.core.errors import WorkerError
 from rejeu.envs.workers import process
-from rejeu.envs.workers.process import Copied, Description, Encoder, Failure
+from rejeu.envs.workers.process import Copied, Handover, WorkerDescription, WorkerFailure
 
 CLOSE_SECONDS = 5.0
 """Seconds that workers have to exit before they are terminated."""
@@ -237,7 +237,7 @@ class Workers:
         """Whether the workers were terminated."""
         return not self._finalizer.alive
 
-    def _made(self, workers: Sequence[Worker]) -> list[Description]:
+    def _made(self, workers: Sequence[Worker]) -> list[WorkerDescription]:
         """Waits until environments are made, all at the same time, and returns their descriptions."""
         deadline = None if self.timeout is None else time.monotonic() + max(self.timeout, START_SECONDS)
         try:
@@ -247,7 +247,7 @@ class Workers:
         except Lost as lost:
             raise WorkerError(f"{lost}; what it printed says why. {self._starter.advice}") from None
         for worker, made in zip(workers, answers, strict=True):
-            if isinstance(made, Failure):
+            if isinstance(made, WorkerFailure):
                 raise WorkerError(f"environment {worker.number} could not be made in a worker process:\n{made.trace}")
         return answers
 
@@ -272,7 +272,7 @@ class Workers:
     def answers(self, numbers: Iterable[int]) -> dict[int, Any]:
         """Waits for the answers to requests and returns them by the index of the environment.
 
-        Each is the answer of the environment, or a :class:`~rejeu.envs.workers.process.Failure`. For a worker that was
+        Each is the answer of the environment, or a :class:`~rejeu.envs.workers.process.WorkerFailure`. For a worker that was
         lost and replaced, it is :class:`Restarted`. Its environment is made, and must be reset.
 
         Raises:
@@ -406,7 +406,7 @@ START_METHOD = "forkserver" if sys.platform == "linux" else "spawn"
 class ProcessWorker(Worker):
     """A handle of a worker process on this machine."""
 
-    def __init__(self, number: int, make: Callable[[], gym.Env], context: Any, encoder: Encoder) -> None:
+    def __init__(self, number: int, make: Callable[[], gym.Env], context: Any, encoder: Handover) -> None:
         """Starts the process. ``encoder`` is passed to :func:`rejeu.envs.workers.process.serve`."""
         pipe, theirs = context.Pipe()
         super().__init__(number, pipe)
@@ -458,7 +458,7 @@ class Processes(Starter):
     def __init__(
         self,
         start_method: str | None = None,
-        encoders: Callable[[Any], Callable[[int], Encoder]] | None = None,
+        encoders: Callable[[Any], Callable[[int], Handover]] | None = None,
         preload: str | None = None,
     ) -> None:
         """Prepares the start of processes.

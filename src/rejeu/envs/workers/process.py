@@ -30,7 +30,7 @@ CONNECT_SECONDS = 30.0
 """Seconds that a worker has to connect to the machine that has started it."""
 
 
-class Failure(NamedTuple):
+class WorkerFailure(NamedTuple):
     """An error in a worker, as text, since not every exception can be pickled."""
 
     kind: Literal["raised", "bad answer", "no attribute"]
@@ -38,7 +38,7 @@ class Failure(NamedTuple):
     trace: str
 
 
-class Description(NamedTuple):
+class WorkerDescription(NamedTuple):
     """Sent by a worker when its environment is made."""
 
     observation_space: gym.Space
@@ -75,7 +75,7 @@ def rows(space: gym.Space, buffers: Sequence[Any], n_envs: int) -> list[np.ndarr
     ]
 
 
-class Encoder(ABC):
+class Handover(ABC):
     """How a worker hands over observations. Abstract; sent to the worker, which calls it once."""
 
     @abstractmethod
@@ -83,7 +83,7 @@ class Encoder(ABC):
         """Returns a function that takes an observation, and returns what is sent in its place."""
 
 
-class ToSharedMemory(Encoder):
+class ToSharedMemory(Handover):
     """Writes observations into shared memory, and sends None."""
 
     def __init__(self, buffers: Sequence[Any], n_envs: int, number: int) -> None:
@@ -95,7 +95,7 @@ class ToSharedMemory(Encoder):
         return lambda obs: put(number, obs)
 
 
-class ToLeaves(Encoder):
+class ToLeaves(Handover):
     """Sends observations as the list of their leaves, arrays of the kept dtypes."""
 
     def __call__(self, space: gym.Space) -> Callable[[Any], list[np.ndarray]]:
@@ -109,14 +109,14 @@ class ToLeaves(Encoder):
         return encode
 
 
-class Copied(Encoder):
+class Copied(Handover):
     """Sends observations with their structure and the dtypes of the space."""
 
     def __call__(self, space: gym.Space) -> Callable[[Any], Any]:
         return partial(validation.copy_observation, space)
 
 
-def serve(pipe: Connection, make: CloudpickleWrapper, encoder: Encoder) -> None:
+def serve(pipe: Connection, make: CloudpickleWrapper, encoder: Handover) -> None:
     """Answers requests for one environment, until it is closed or the main process exits.
 
     The global generators of NumPy and Python, of which an environment may draw, are its own: seeded at random here, and from
@@ -137,13 +137,13 @@ def serve(pipe: Connection, make: CloudpickleWrapper, encoder: Encoder) -> None:
             raise TypeError(fault)
         encode = encoder(env.observation_space)
         keep = ToLeaves()(env.observation_space) if isinstance(encoder, ToSharedMemory) else encode
-        send(pipe, Description(env.observation_space, env.action_space, env.metadata, env.render_mode))
+        send(pipe, WorkerDescription(env.observation_space, env.action_space, env.metadata, env.render_mode))
         while (request := receive(pipe))[0] != "close":
             send(pipe, _answered(env, request, encode, keep))
     except (EOFError, ConnectionError):
         pass
     except Exception as error:  # any exception of the constructor: the main process raises it
-        send(pipe, Failure("raised", str(error), traceback.format_exc()))
+        send(pipe, WorkerFailure("raised", str(error), traceback.format_exc()))
     finally:
         if env is not None:
             env.close()
@@ -164,7 +164,7 @@ class RemoteWorker:
         except EOFError:
             return
         except Exception as error:  # unpickling a function of a module that is missing here can raise anything
-            send(pipe, Failure("raised", str(error), traceback.format_exc()))
+            send(pipe, WorkerFailure("raised", str(error), traceback.format_exc()))
             return
         serve(pipe, make, encoder)
 
@@ -200,14 +200,14 @@ def receive_exactly(connected: socket.socket, n: int) -> bytes:
 
 
 def _answered(env: gym.Env, request: Any, encode: Callable[[Any], Any], keep: Callable[[Any], Any]) -> Any:
-    """Returns the answer of the environment, or a :class:`Failure`."""
+    """Returns the answer of the environment, or a :class:`WorkerFailure`."""
     try:
         return _answer(env, encode, keep, *request)
     except BadEnvironmentError as error:
-        return Failure("bad answer", str(error), traceback.format_exc())
+        return WorkerFailure("bad answer", str(error), traceback.format_exc())
     except Exception as error:  # the environment can raise anything
         kind: Literal["raised", "no attribute"] = "no attribute" if isinstance(error, AttributeError) else "raised"
-        return Failure(kind, str(error), traceback.format_exc())
+        return WorkerFailure(kind, str(error), traceback.format_exc())
 
 
 def _answer(env: gym.Env, encode: Callable[[Any], Any], keep: Callable[[Any], Any], name: str, *arguments: Any) -> Any:

@@ -21,13 +21,13 @@ from rejeu.envs.base import SUCCESS_KEYS, Seed, Step, VectorEnv, describe_spec, 
 from rejeu.envs.goals import GoalFunctions
 from rejeu.envs.workers import process
 from rejeu.envs.workers.pool import RESTARTED, TIMEOUT, Processes, Restarted, Starter, Workers
-from rejeu.envs.workers.process import Failure, ToSharedMemory
+from rejeu.envs.workers.process import ToSharedMemory, WorkerFailure
 
 INDEX = np.uint16
 """Data type of the indices of environments in a record."""
 
 
-class Result(NamedTuple):
+class Arrival(NamedTuple):
     """What an environment returned for an action, and the observation to act on next."""
 
     obs: list[np.ndarray]
@@ -52,7 +52,7 @@ class SavedResult(msgspec.Struct, forbid_unknown_fields=True):
     begun: list[np.ndarray] | None
 
 
-def to_saved(env: int, result: Result) -> dict[str, Any]:
+def to_saved(env: int, result: Arrival) -> dict[str, Any]:
     """Returns a result of environment ``env`` as plain data."""
     success = success_of(result.info)
     saved = {"env": env, **result._asdict(), "success": None if np.isnan(success) else success}
@@ -60,7 +60,7 @@ def to_saved(env: int, result: Result) -> dict[str, Any]:
     return saved
 
 
-def from_saved(saved: Any, leaves: Sequence[Leaf]) -> tuple[int, Result]:
+def from_saved(saved: Any, leaves: Sequence[Leaf]) -> tuple[int, Arrival]:
     """Returns the index of the environment, and what :func:`to_saved` was given.
 
     Raises:
@@ -76,7 +76,7 @@ def from_saved(saved: Any, leaves: Sequence[Leaf]) -> tuple[int, Result]:
     if (one.terminated or one.truncated) != (one.begun is not None):
         raise ValueError("a result that waits does not say where the next episode begins")
     info = {} if one.success is None else {SUCCESS_KEYS[0]: one.success}
-    return one.env, Result(one.obs, one.reward, one.terminated, one.truncated, info, one.begun)
+    return one.env, Arrival(one.obs, one.reward, one.terminated, one.truncated, info, one.begun)
 
 
 class InWorkers(VectorEnv):
@@ -131,7 +131,7 @@ class InWorkers(VectorEnv):
         self._seed = seed
         self._seeds: list[int | None] = [None] * n_envs
         """Last seed of each environment."""
-        self._results: dict[int, Result] = {}
+        self._results: dict[int, Arrival] = {}
         """Results that have arrived and were not taken yet, by environment, the oldest first."""
         self._begun: dict[int, list[np.ndarray]] = {}
         """First observations of episodes that environments have begun by themselves, where no result was taken since."""
@@ -285,11 +285,11 @@ class InWorkers(VectorEnv):
         """Waits until at least one environment that steps on its own has answered."""
         said = self.workers.first(self._pending)
         for i, answer in said.items():
-            if isinstance(answer, Failure):
+            if isinstance(answer, WorkerFailure):
                 self._pending.discard(i)
             else:
                 self._arrived(i, answer)
-        self._heard({i: answer for i, answer in said.items() if isinstance(answer, Failure)}, "step")
+        self._heard({i: answer for i, answer in said.items() if isinstance(answer, WorkerFailure)}, "step")
 
     def _arrived(self, i: int, answer: Any) -> None:
         """Keeps the result of an environment. One whose worker was lost has none until its new episode has begun."""
@@ -303,17 +303,17 @@ class InWorkers(VectorEnv):
         if i in self._lost:
             before = [np.array(store[i]) for store in self._stores]
             why = {RESTARTED: self._lost.pop(i).why}
-            self._results[i] = Result(before, 0.0, False, True, why, begun)
+            self._results[i] = Arrival(before, 0.0, False, True, why, begun)
             return
         _, reward, terminated, truncated, info, final, _ = answer
-        self._results[i] = Result(
+        self._results[i] = Arrival(
             begun if final is None else final, reward, terminated, truncated, info, None if final is None else begun
         )
 
     def _heard(self, said: dict[int, Any], what: str) -> dict[int, Any]:
         """Returns the answers. Raises if one of them is a failure."""
         self._restarted.update(i for i, answer in said.items() if isinstance(answer, Restarted))
-        failed = {i: answer for i, answer in said.items() if isinstance(answer, Failure)}
+        failed = {i: answer for i, answer in said.items() if isinstance(answer, WorkerFailure)}
         if not failed:
             return said
         first, failure = next(iter(failed.items()))
@@ -327,7 +327,7 @@ class InWorkers(VectorEnv):
 
     def call(self, name: str) -> list[Any]:
         said = self.workers.ask(dict.fromkeys(range(self.n_envs), ("call", process.call_method, name, (), {})))
-        if any(isinstance(answer, Failure) and answer.kind == "no attribute" for answer in said.values()):
+        if any(isinstance(answer, WorkerFailure) and answer.kind == "no attribute" for answer in said.values()):
             raise AttributeError(name)
         self._lost |= {i: answer for i, answer in self._heard(said, name).items() if isinstance(answer, Restarted)}
         return [None if i in self._lost else said[i] for i in range(self.n_envs)]
@@ -360,7 +360,7 @@ class InWorkers(VectorEnv):
         replies = self.workers.ask({i: ("restore", one) for i, one in enumerate(saved)})
         for i, answer in replies.items():
             if not isinstance(answer, bool):
-                why = answer.message if isinstance(answer, Failure) else answer.why
+                why = answer.message if isinstance(answer, WorkerFailure) else answer.why
                 raise ValueError(f"environment {i} cannot be restored: {why}")
         for store, leaf in zip(self._stores, jax.tree.leaves(obs), strict=True):
             store[...] = leaf

@@ -21,7 +21,7 @@ from rejeu.lab.cli.commands import Compare, Report, Runs, Status
 from rejeu.lab.reporting import run_list
 from rejeu.lab.reporting.comparison import Comparison, compare
 from rejeu.lab.reporting.report import make_server, write_report
-from rejeu.lab.reporting.runs import Run, best_row
+from rejeu.lab.reporting.runs import RunSummary, best_row
 from rejeu.logs import formatting
 from rejeu.logs.formatting import counted
 
@@ -83,7 +83,7 @@ def run_status(arguments: Status) -> tuple[int, dict[str, Any]]:
     return EXIT[found.state], facts
 
 
-def describe(run: Run) -> dict[str, Any]:
+def describe(run: RunSummary) -> dict[str, Any]:
     """Returns what is worth knowing of a run, as plain values."""
     compiling = run.metrics.column("time/compile_seconds")
     seconds = run.seconds - (float(compiling[-1]) if len(compiling) and np.isfinite(compiling[-1]) else 0.0)
@@ -116,7 +116,7 @@ def describe(run: Run) -> dict[str, Any]:
     }
 
 
-def best_evaluation(run: Run) -> dict[str, float] | None:
+def best_evaluation(run: RunSummary) -> dict[str, float] | None:
     """Returns the best evaluation; None if there is none."""
     row = best_row(run.evaluations)
     if row is None:

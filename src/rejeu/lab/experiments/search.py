@@ -26,7 +26,7 @@ from rejeu.lab.experiments.study import State, Study, Trial
 from rejeu.lab.experiments.study_plan import MIN_FINAL_SEEDS, Measure
 from rejeu.lab.experiments.work import Job, Work
 from rejeu.lab.reporting.comparison import Comparison, compare
-from rejeu.lab.reporting.runs import EVALUATIONS, Run, read_run
+from rejeu.lab.reporting.runs import EVALUATIONS, RunSummary, read_run
 from rejeu.lab.runs.config import RunConfig
 from rejeu.logs import statistics
 from rejeu.logs.tables import read_table
@@ -247,13 +247,13 @@ def compared(study: Study, best: Trial, failed: list[str]) -> Final:
     return Final(verdict, (value, low, high), comparison, tuple(failed), study.plan.measure)
 
 
-def finished(folder: Path) -> list[Run]:
+def finished(folder: Path) -> list[RunSummary]:
     """Returns the finished runs in a folder."""
     found = [read_run(path) for path in sorted(folder.glob("seed_*")) if (path / "config.json").is_file()]
     return [run for run in found if run.state == "finished"]
 
 
-def last_values(runs: Sequence[Run], column: str) -> np.ndarray:
+def last_values(runs: Sequence[RunSummary], column: str) -> np.ndarray:
     """Returns a column of the last evaluation of each run, ``float64 (n_runs,)``."""
     return np.array([run.evaluations.column(column)[-1] for run in runs])
 

@@ -28,7 +28,7 @@ from rejeu.lab.reporting.grouping import (
     settings,
 )
 from rejeu.lab.reporting.run_list import read_all
-from rejeu.lab.reporting.runs import Run
+from rejeu.lab.reporting.runs import RunSummary
 from rejeu.logs import statistics
 from rejeu.logs.charts import GROUP_COLORS, group_chart
 from rejeu.logs.formatting import cell, counted, csv_text, markdown_table, number
@@ -56,7 +56,7 @@ class Group:
     label: str
     env_id: str
     """The environment; several where scores are normalized."""
-    runs: tuple[Run, ...]
+    runs: tuple[RunSummary, ...]
     scores: tuple[np.ndarray, ...]
     """Final scores of the runs, one array for each environment."""
     run_scores: tuple[float, ...]
@@ -256,7 +256,7 @@ class Comparison:
 
 
 def compare(
-    runs: str | Path | Run | Iterable[str | Path | Run],
+    runs: str | Path | RunSummary | Iterable[str | Path | RunSummary],
     by: By | None = None,
     *,
     x: Axis = "steps",
@@ -331,7 +331,7 @@ def compare(
     return Comparison(groups, improvements, kind, x, score, statistic, threshold, tuple(notes))
 
 
-def comparable(runs: Sequence[Run], axis: Axis, score: Score, notes: list[str]) -> list[Curve]:
+def comparable(runs: Sequence[RunSummary], axis: Axis, score: Score, notes: list[str]) -> list[Curve]:
     """Returns the curves of the runs that can be compared, cut to the same length; notes say which cannot and why.
 
     Raises:

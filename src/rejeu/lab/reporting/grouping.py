@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 
 from rejeu.core.records import shown
-from rejeu.lab.reporting.runs import Run
+from rejeu.lab.reporting.runs import RunSummary
 from rejeu.logs.tables import HUGE, flat
 
 By = Literal["algorithm", "setting", "env"]
@@ -23,7 +23,7 @@ MAX_LABEL = 200
 """Characters of a label that are shown."""
 
 
-def group_labels(runs: Sequence[Run], by: By | None) -> tuple[By, list[str]]:
+def group_labels(runs: Sequence[RunSummary], by: By | None) -> tuple[By, list[str]]:
     """Returns what makes a group, and the label of the group of each run."""
     labels: dict[By, list[str]] = {
         "algorithm": [algorithm_label(run) for run in runs],
@@ -41,7 +41,7 @@ def group_labels(runs: Sequence[Run], by: By | None) -> tuple[By, list[str]]:
     return chosen, labels[chosen]
 
 
-def settings(runs: Sequence[Run]) -> list[str]:
+def settings(runs: Sequence[RunSummary]) -> list[str]:
     """Returns for each run the algorithm, and the settings in which the runs of this algorithm differ."""
     values = [dict(flat(run.hyperparameters)) | {"n_envs": run.n_envs} for run in runs]
     written = [{name: whole_text(value) for name, value in one.items()} for one in values]
@@ -63,12 +63,12 @@ def differing_names(settings: Sequence[Mapping[str, str]]) -> list[str]:
     return [name for name in names if len({one.get(name, "") for one in settings}) > 1]
 
 
-def algorithm_label(run: Run) -> str:
+def algorithm_label(run: RunSummary) -> str:
     """Returns the algorithm of a run; of one that does not say, the name of the folder above."""
     return run.algorithm or run.path.parent.name
 
 
-def env_label(run: Run) -> str:
+def env_label(run: RunSummary) -> str:
     """Returns the environment of a run with its keyword arguments."""
     kwargs = ", ".join(f"{name}={whole_text(value)}" for name, value in sorted(run.env_kwargs.items()))
     return shortened(f"{run.env_id}({kwargs})" if kwargs else run.env_id)
@@ -102,7 +102,7 @@ FINAL = 0.1
 class Curve:
     """The returns of one run over steps or time. Mutable while a comparison is made."""
 
-    def __init__(self, run: Run, x: np.ndarray, y: np.ndarray, problem: str = "") -> None:
+    def __init__(self, run: RunSummary, x: np.ndarray, y: np.ndarray, problem: str = "") -> None:
         self.run, self.x, self.y, self.problem = run, x, y, problem
         self.env = env_label(run)
         self.label = ""
@@ -111,7 +111,7 @@ class Curve:
         self.evaluation: tuple[np.ndarray, np.ndarray] | None = None
 
     @classmethod
-    def of(cls, run: Run, axis: Axis, score: Score) -> Curve:
+    def of(cls, run: RunSummary, axis: Axis, score: Score) -> Curve:
         """Returns the curve of a run, or one with a ``problem``."""
         name, table = run.name, run.evaluations
         when, value = table.column("step" if axis == "steps" else "seconds"), table.column("mean_return")

@@ -19,7 +19,17 @@ import numpy as np
 from rejeu.algorithms.catalog import CATALOG
 from rejeu.core.errors import MissingExtra
 from rejeu.core.records import Malformed, parse_json, shown
-from rejeu.lab.reporting.runs import CONFIG, EPISODES, MAX_NAME, MAX_STEP, METRICS, Run, is_file, ordered, read_run
+from rejeu.lab.reporting.runs import (
+    CONFIG,
+    EPISODES,
+    MAX_NAME,
+    MAX_STEP,
+    METRICS,
+    RunSummary,
+    is_file,
+    ordered,
+    read_run,
+)
 from rejeu.logs.formatting import counted
 from rejeu.logs.tables import EMPTY, MAX_COLUMNS, Episodes, Table, read_bytes, read_table
 
@@ -29,7 +39,7 @@ MAX_RUNS = 10_000
 SKIPPED = {"checkpoints", "videos", "node_modules", "__pycache__"}
 
 
-def read(path: str | Path, table_only: bool = False) -> Run:
+def read(path: str | Path, table_only: bool = False) -> RunSummary:
     """Returns the run in a folder, or of a ``monitor.csv``, whichever program wrote it.
 
     Args:
@@ -52,7 +62,7 @@ def read(path: str | Path, table_only: bool = False) -> Run:
     return read_run(path)
 
 
-def read_all(paths: str | Path | Run | Iterable[str | Path | Run]) -> tuple[list[Run], list[str]]:
+def read_all(paths: str | Path | RunSummary | Iterable[str | Path | RunSummary]) -> tuple[list[RunSummary], list[str]]:
     """Returns the runs of several paths, and notes about what could not be read.
 
     A folder that is no run itself is searched for run folders.
@@ -60,9 +70,9 @@ def read_all(paths: str | Path | Run | Iterable[str | Path | Run]) -> tuple[list
     Raises:
         FileNotFoundError: if a path does not exist, or holds no run.
     """
-    found: dict[Any, Path | Run] = {}
-    for one in [paths] if isinstance(paths, str | Path | Run) else paths:
-        if isinstance(one, Run):
+    found: dict[Any, Path | RunSummary] = {}
+    for one in [paths] if isinstance(paths, str | Path | RunSummary) else paths:
+        if isinstance(one, RunSummary):
             found[one] = one
             continue
         inside = find(Path(one))
@@ -75,12 +85,12 @@ def read_all(paths: str | Path | Run | Iterable[str | Path | Run]) -> tuple[list
     with ThreadPoolExecutor(2) as pool:  # NumPy computes outside of Python's lock
         read = [*pool.map(read_or_note, found.values())]
     notes = [one for one in read if isinstance(one, str)]
-    runs = distinct([one for one in read if isinstance(one, Run)])
+    runs = distinct([one for one in read if isinstance(one, RunSummary)])
     notes += [f"{run.name}: {note}" for run in runs for note in run.notes if "damaged" in note]
     return runs, notes
 
 
-def distinct(runs: list[Run]) -> list[Run]:
+def distinct(runs: list[RunSummary]) -> list[RunSummary]:
     """Returns the runs; those of the same name, such as ``seed_0``, get the name of the folder above in front of it."""
     counts = Counter(run.name for run in runs)
     return [
@@ -89,10 +99,10 @@ def distinct(runs: list[Run]) -> list[Run]:
     ]
 
 
-def read_or_note(path: Path | Run) -> Run | str:
+def read_or_note(path: Path | RunSummary) -> RunSummary | str:
     """Returns a run as comparisons need it, or a note if it cannot be read."""
     try:
-        return path if isinstance(path, Run) else read(path, table_only=True)
+        return path if isinstance(path, RunSummary) else read(path, table_only=True)
     except (OSError, ValueError, MissingExtra) as error:
         return shown(f"{path} is left out: {error}", 300)
 
@@ -166,7 +176,7 @@ def files(folder: Path, pattern: re.Pattern[str]) -> list[Path]:
     return sorted(path for path in folder.iterdir() if pattern.fullmatch(path.name) and is_file(path))[:MAX_FILES]
 
 
-def read_monitor(path: Path) -> Run:
+def read_monitor(path: Path) -> RunSummary:
     """Returns the run of a ``monitor.csv``, or of all such files in a folder as the environments of one run.
 
     Raises:
@@ -203,7 +213,7 @@ def read_monitor(path: Path) -> Run:
     episodes = Episodes.of(table)
     folder = path if path.is_dir() else path.parent
     said = named(folder)
-    return Run(
+    return RunSummary(
         path=path.resolve(),
         name=shown(folder.name, MAX_NAME),
         format="monitor",
@@ -248,7 +258,7 @@ def named(folder: Path) -> tuple[str, str, int | None]:
     return algorithm, shown(found[1], MAX_NAME), int(found[2][:9])
 
 
-def read_tensorboard(folder: Path) -> Run:
+def read_tensorboard(folder: Path) -> RunSummary:
     """Returns the run of a folder with TensorBoard files: its scalars are the metrics.
 
     Raises:
@@ -274,7 +284,7 @@ def read_tensorboard(folder: Path) -> Run:
     metrics = ordered(table_of(values)) if values else EMPTY
     algorithm, env_id, number = named(folder)
     seconds = metrics.column("time/time_elapsed")
-    return Run(
+    return RunSummary(
         path=folder.resolve(),
         name=shown(folder.name, MAX_NAME),
         format="tensorboard",

@@ -49,7 +49,7 @@ State = Literal["running", "finished", "interrupted", "crashed", "unknown"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Run:
+class RunSummary:
     """What is known of one run; see :func:`read_run`."""
 
     path: Path
@@ -128,7 +128,7 @@ class Run:
         return " ".join(quoted(shown(word, MAX_WORD)) for word in ["rejeu", *words])
 
 
-def read_run(path: str | Path, columns: Collection[str] | None = None) -> Run:
+def read_run(path: str | Path, columns: Collection[str] | None = None) -> RunSummary:
     """Returns what is known of the run in a folder that ``rejeu train`` wrote or is writing.
 
     Args:
@@ -154,7 +154,7 @@ def read_run(path: str | Path, columns: Collection[str] | None = None) -> Run:
     replays = read_table(files.replays) if is_file(files.replays) else EMPTY
     tables = (table, metrics, evaluations)
     times = (table.column("seconds"), metrics.column("time/time_elapsed"), evaluations.column("seconds"))
-    run = Run(
+    run = RunSummary(
         path=folder,
         name=shown(folder.name, MAX_NAME),
         versions={shown(name): shown(version) for name, version in versions.items() if version is not None},
@@ -236,7 +236,7 @@ def ordered(table: Table) -> Table:
     return Table(columns, notes)
 
 
-def state_of(run: Run) -> State:
+def state_of(run: RunSummary) -> State:
     """Returns the state of a run, from its lock and from what was written; no file is believed to say it."""
     has_model = "agent.safetensors" in run.models
     locks = [is_locked(path) for path in (run.path / "lock", run.path / "checkpoints" / "lock") if is_file(path)]

@@ -20,7 +20,7 @@ import numpy as np
 from gymnasium import spaces
 
 from rejeu.core import schedules
-from rejeu.core.schedules import Exponential, Linear, Table
+from rejeu.core.schedules import Exponential, Linear, TableSchedule
 
 __all__ = [
     "ConstantSchedule",
@@ -142,10 +142,10 @@ def of_progress(value: Any) -> Any:
         return float(value.val)
     if isinstance(value, LinearSchedule):
         return value.to_linear()
-    if isinstance(value, Linear | Exponential | Table) or not callable(value):
+    if isinstance(value, Linear | Exponential | TableSchedule) or not callable(value):
         return value
     values = [float(value(1.0 - i / TABLE_INTERVALS)) for i in range(TABLE_INTERVALS + 1)]
-    return values[0] if len(set(values)) == 1 else Table(tuple(values))
+    return values[0] if len(set(values)) == 1 else TableSchedule(tuple(values))
 
 
 def of_remaining(value: Any) -> Any:

@@ -45,7 +45,7 @@ PROBLEMS = (ArithmeticError, LookupError, MemoryError, OSError, RuntimeError, Ty
 
 
 @dataclass(frozen=True)
-class Model:
+class Entrant:
     """A model that was evaluated."""
 
     name: str
@@ -72,7 +72,7 @@ class Leaderboard:
 
     env_id: str
     episodes: int
-    rows: tuple[Model, ...]
+    rows: tuple[Entrant, ...]
     problems: tuple[tuple[str, str], ...]
     """Name and reason."""
     language: Language = "en"
@@ -192,7 +192,7 @@ def build(
         language: of the leaderboard.
         report: called with a line for each model.
     """
-    done: list[Model] = []
+    done: list[Entrant] = []
     problems = []
     written, board = texts()[language], Leaderboard(env_id, episodes, (), (), language)
     if len(paths) > MAX_MODELS:
@@ -233,7 +233,7 @@ def evaluated(
     seconds: float,
     success_threshold: float | None,
     language: Language,
-) -> Model:
+) -> Entrant:
     """Returns a model with its evaluation.
 
     Raises:
@@ -260,10 +260,10 @@ def evaluated(
     result = evaluate(within_budget, env, episodes, success_threshold, seed)
     if not np.isfinite(result.returns).all():
         raise Unranked(texts_of["not_finite"])
-    return Model(name, agent.name, agent.num_timesteps, agent.seed, result)
+    return Entrant(name, agent.name, agent.num_timesteps, agent.seed, result)
 
 
-def ranked(models: Iterable[Model]) -> tuple[Model, ...]:
+def ranked(models: Iterable[Entrant]) -> tuple[Entrant, ...]:
     """Returns the models by mean return, with the places that their intervals allow."""
     done = sorted(models, key=lambda one: (-one.evaluation.mean_return, one.name))
     lows, highs = np.array([one.interval for one in done]).reshape(-1, 2).T
@@ -312,7 +312,7 @@ def markdown(board: Leaderboard) -> str:
     return "\n".join(lines).rstrip() + "\n"
 
 
-def cells_of(row: Model, board: Leaderboard) -> list[str]:
+def cells_of(row: Entrant, board: Leaderboard) -> list[str]:
     """Returns the cells of a row, in the order of the columns."""
     to, result = board.texts["to"], row.evaluation
     low, high = row.interval

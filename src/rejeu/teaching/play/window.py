@@ -41,7 +41,7 @@ class Event(NamedTuple):
     """SDL's name of the key in lower case."""
 
 
-class Entry(NamedTuple):
+class LegendEntry(NamedTuple):
     """An action in the legend."""
 
     keys: list[Keycap]
@@ -87,7 +87,7 @@ class Window:
         self.canvas: Any = None
         """The surface at its natural size."""
         self._screen: Any = None
-        self._legend: list[Entry] = []
+        self._legend: list[LegendEntry] = []
         self._sizes: list[tuple[int, int]] = []
 
     def open(self, game: Game, keys: KeyMap | None) -> None:
@@ -184,10 +184,10 @@ class Window:
         self.pygame.draw.rect(self.canvas, color, plate, border_radius=8)
         self.canvas.blit(drawn, (plate.x + 14, plate.y + 6))
 
-    def _arrange(self, width: int) -> list[list[tuple[Entry, int]]]:
+    def _arrange(self, width: int) -> list[list[tuple[LegendEntry, int]]]:
         """Returns the rows of the legend, each entry with its left edge; the window's keys come last."""
-        entries = [*self._legend, *(Entry([(key, frozenset())], said(label)) for key, label in HELP)]
-        rows: list[list[tuple[Entry, int]]] = [[]]
+        entries = [*self._legend, *(LegendEntry([(key, frozenset())], said(label)) for key, label in HELP)]
+        rows: list[list[tuple[LegendEntry, int]]] = [[]]
         left = MARGIN
         for entry in entries:
             wide = sum(self._key_width(text) + 4 for text, _ in entry.keys) + self._fonts[20].size(entry.label)[0] + 16
@@ -220,11 +220,11 @@ class Window:
         self.canvas.blit(drawn, (corner[0] - drawn.get_width() if right else corner[0], corner[1]))
 
 
-def legend(keys: KeyMap) -> list[Entry]:
+def legend(keys: KeyMap) -> list[LegendEntry]:
     """Returns the entries of the legend in the order of the bindings: all keys of each action, and its description."""
-    entries: dict[Any, Entry] = {}
+    entries: dict[Any, LegendEntry] = {}
     for binding in keys.bindings:
-        entry = entries.setdefault(binding.action, Entry([], said(binding.label)))
+        entry = entries.setdefault(binding.action, LegendEntry([], said(binding.label)))
         entry.keys.append(("+".join(sorted(binding.keys)), equivalent_keys(binding, keys.bindings)))
     return list(entries.values())
 

@@ -18,12 +18,12 @@ from rejeu.algorithms.rollout_config import RolloutConfig
 from rejeu.core.algorithm import Clock, Rollout
 from rejeu.core.prng import nth
 from rejeu.envs.functional.protocol import FunctionalEnv
-from rejeu.training.compiled.program import Carry, Limits, Loop, Program, capacity_of, step_envs
+from rejeu.training.compiled.program import Carry, ChunkLimits, Loop, Program, capacity_of, step_envs
 from rejeu.training.on_policy import begin_episodes
 from rejeu.training.run import Run
 
 
-class Counts(NamedTuple):
+class RolloutCounts(NamedTuple):
     """Counters of a run, equal for all seeds."""
 
     step: Array
@@ -44,7 +44,9 @@ class OnPolicyProgram(Program):
     def batch(self, env: FunctionalEnv, carry: Carry, experience: Rollout, clock: Clock, number: Any) -> Rollout:
         return rollout_of(experience, carry.counts.length)
 
-    def turns(self, env: FunctionalEnv, loop: Loop, limits: Limits, may_go_on: Callable[[Array, Loop], Array]) -> Loop:
+    def turns(
+        self, env: FunctionalEnv, loop: Loop, limits: ChunkLimits, may_go_on: Callable[[Array, Loop], Array]
+    ) -> Loop:
         n_steps = self.config.n_steps
 
         def fills(inner: tuple[Array, Loop]) -> Array:
@@ -83,8 +85,8 @@ class OnPolicyProgram(Program):
             size = turns * n_envs - (run.step + n_turns * n_envs - last)
         return bool(turns) and self.config.learns_from_part(size, n_envs)
 
-    def counts_of(self, run: Run) -> Counts:
-        return Counts(jnp.uint32(run.step), jnp.int32(run.replay.length))
+    def counts_of(self, run: Run) -> RolloutCounts:
+        return RolloutCounts(jnp.uint32(run.step), jnp.int32(run.replay.length))
 
     def action_of(self, run: Run) -> None:
         return None
@@ -96,7 +98,7 @@ class OnPolicyProgram(Program):
         steps: Any = jax.tree.map(jnp.array, run.replay.rollout())
         return steps if steps.carry != () else steps._replace(carry=jax.tree.map(jnp.array, run.carry))
 
-    def download(self, run: Run, experience: Rollout, counts: Counts) -> None:
+    def download(self, run: Run, experience: Rollout, counts: RolloutCounts) -> None:
         buffer, n = run.buffer, int(counts.length)
         buffer.length = n
         buffer.started, buffer.carry = np.array(experience.started), jax.tree.map(jnp.array, experience.carry)
@@ -111,7 +113,7 @@ class OnPolicyProgram(Program):
         """Does nothing: the length of the rollout is copied with it."""
 
 
-def take_turn(program: OnPolicyProgram, env: FunctionalEnv, loop: Loop, limits: Limits, i: Array) -> Loop:
+def take_turn(program: OnPolicyProgram, env: FunctionalEnv, loop: Loop, limits: ChunkLimits, i: Array) -> Loop:
     """Returns what the ``i``-th turn of a chunk passes on, apart from the update."""
     config, carry, steps = program.config, loop.carry, loop.experience
     counts, before, t = carry.counts, carry.episodes, carry.counts.length
@@ -132,7 +134,7 @@ def take_turn(program: OnPolicyProgram, env: FunctionalEnv, loop: Loop, limits: 
         valid=put(steps.valid, result.kept),
         running_return=put(steps.running_return, episodes.running_return),
     )
-    counts = Counts(counts.step + jnp.sum(result.kept, dtype=jnp.uint32), t + 1)
+    counts = RolloutCounts(counts.step + jnp.sum(result.kept, dtype=jnp.uint32), t + 1)
     return loop._replace(carry=loop.carry._replace(explorer=explorer, counts=counts), experience=steps)
 
 

@@ -50,7 +50,7 @@ Remake = Callable[[Any], tuple[Algorithm, Explorer]]
 """Makes the algorithm of a configuration, and its exploration."""
 
 
-class Limits(NamedTuple):
+class ChunkLimits(NamedTuple):
     """The limits of a chunk."""
 
     n_turns: Any
@@ -160,7 +160,7 @@ class Loop(NamedTuple):
     """Whether a reward or an observation was not finite in this chunk, ``bool[]``."""
 
 
-class Report(NamedTuple):
+class ChunkReport(NamedTuple):
     """The results of a chunk of turns."""
 
     metrics: Metrics
@@ -198,7 +198,9 @@ class Program(ABC):
         """Returns the batch of the ``number``-th gradient step of a turn that ends at ``clock``."""
 
     @abstractmethod
-    def turns(self, env: FunctionalEnv, loop: Loop, limits: Limits, may_go_on: Callable[[Array, Loop], Array]) -> Loop:
+    def turns(
+        self, env: FunctionalEnv, loop: Loop, limits: ChunkLimits, may_go_on: Callable[[Array, Loop], Array]
+    ) -> Loop:
         """Returns what turns pass on, which are taken while ``may_go_on(number of turns, loop)``."""
 
     @abstractmethod
@@ -233,7 +235,9 @@ class Program(ABC):
     def pull_counts(self, run: Run, carry: Carry) -> None:
         """Copies what only this kind of learning counts into a run."""
 
-    def chunk(self, env: FunctionalEnv, carry: Carry, experience: Any, limits: Limits) -> tuple[Carry, Any, Report]:
+    def chunk(
+        self, env: FunctionalEnv, carry: Carry, experience: Any, limits: ChunkLimits
+    ) -> tuple[Carry, Any, ChunkReport]:
         """Returns carry, experience and report after a number of turns."""
         program = self.with_hyperparameters(carry.hyper)
         first_episode = carry.episodes.n_finished
@@ -256,7 +260,7 @@ class Program(ABC):
         learned = loop.learned
         is_finite = check(jax.tree.leaves(learned.state), {})
         counted = learned.metrics, learned.n_updates, learned.n_bad
-        report = Report(*counted, is_finite, loop.nonfinite_env, loop.result, loop.log)
+        report = ChunkReport(*counted, is_finite, loop.nonfinite_env, loop.result, loop.log)
         carry = loop.carry._replace(state=program.packing.pack(learned.state), in_a_row=learned.in_a_row)
         return carry, loop.experience, report
 
@@ -342,7 +346,9 @@ def plain(space: gym.Space, obs: PyTree) -> PyTree:
     return jax.tree.unflatten(spaces.structure(space), parts)
 
 
-def step_envs(program: Program, env: FunctionalEnv, loop: Loop, action: Array, limits: Limits, turn: Array) -> Loop:
+def step_envs(
+    program: Program, env: FunctionalEnv, loop: Loop, action: Array, limits: ChunkLimits, turn: Array
+) -> Loop:
     """Takes one step of all environments, and starts new episodes where some ended.
 
     Args:

@@ -23,7 +23,7 @@ from rejeu.envs.functional.protocol import FunctionalEnv
 from rejeu.envs.functional.vector import JaxVector, joined, split
 from rejeu.envs.masks import functional_vector
 from rejeu.training.checks import check_bounds, check_finite, check_obs
-from rejeu.training.compiled.program import Carry, EpisodeLog, EpisodeState, Limits, Program, Report
+from rejeu.training.compiled.program import Carry, ChunkLimits, ChunkReport, EpisodeLog, EpisodeState, Program
 from rejeu.training.finite import MAX_SKIPPED, NonFiniteUpdate
 from rejeu.training.learner import Learner, Readings
 from rejeu.training.run import Episode, Progress, Run
@@ -38,7 +38,7 @@ SHARED = ("counts", "valid")
 
 
 @dataclass
-class Group:
+class RunGroup:
     """Runs that one call of the program trains. If there are several, arrays have a leading axis, except ``SHARED``."""
 
     carry: Any
@@ -81,10 +81,10 @@ class DeviceTrainer:
         self.mesh: Mesh | None = mesh_of(size, devices)
         """The devices that share the runs; None if one computes all."""
         self.hyper = {id(run): one for run, one in zip(runs, hyper or [{}] * len(runs), strict=True)}
-        self.groups: list[Group] = []
+        self.groups: list[RunGroup] = []
         self.carries: dict[int, Carry] = {}
         """The carry after the last chunk by run, on the host apart from large arrays of a single run."""
-        self.reports: dict[int, Report] = {}
+        self.reports: dict[int, ChunkReport] = {}
         """Of the last chunk by run, on the host."""
 
     def carry_of(self, run: Run, progress: float) -> Carry:
@@ -110,14 +110,14 @@ class DeviceTrainer:
         self.groups = [self._pushed(filled(part, self.size), leader, progress) for part in parts]
         self.carries = {}
 
-    def _pushed(self, runs: Sequence[Run], leader: Run, progress: float) -> Group:
+    def _pushed(self, runs: Sequence[Run], leader: Run, progress: float) -> RunGroup:
         if self.size == 1:
             experience = self.program.uploaded(runs[0])
-            return Group(self.carry_of(runs[0], progress), experience)
+            return RunGroup(self.carry_of(runs[0], progress), experience)
         experience = spread(lambda run: jax.device_get(self.program.uploaded(run)), runs, self.mesh)
         experience = with_shared(experience, lambda: self.program.uploaded(leader))
         carry = spread(lambda run: self.carry_of(run, progress), runs, self.mesh)
-        return Group(with_shared(carry, lambda: self.carry_of(leader, progress)), experience)
+        return RunGroup(with_shared(carry, lambda: self.carry_of(leader, progress)), experience)
 
     def compiled(self, function: Callable[..., Any], **options: Any) -> Any:
         """Returns ``function(program, env, ...)`` compiled for this program, as a function of the other arguments."""
@@ -127,7 +127,7 @@ class DeviceTrainer:
             self.learner.programs[key] = jax.jit(partial(with_env, function, self.program, self.env_static), **options)
         return partial(self.learner.programs[key], self.env_arrays)
 
-    def take(self, limits: Limits, active: Iterable[int]) -> None:
+    def take(self, limits: ChunkLimits, active: Iterable[int]) -> None:
         """Takes a chunk of turns in the groups of the runs ``active``; while one is copied to the host, the next computes."""
         busy = sorted({i // self.size for i in active})
         try:
@@ -139,7 +139,7 @@ class DeviceTrainer:
             self.undo()
             raise
 
-    def start(self, group: Group, limits: Limits) -> None:
+    def start(self, group: RunGroup, limits: ChunkLimits) -> None:
         """Starts a chunk of turns, and does not wait for it."""
         before, n_rows, options = group.experience, self.program.rows_changed(int(limits.n_turns)), {}
         back: Callable[[Any], Any] = lambda experience: before  # noqa: E731
@@ -205,7 +205,7 @@ class DeviceTrainer:
         experience = group.experience if self.size == 1 else of_run(group.experience, which % self.size)
         self.program.download(self.runs[which], experience, copies(group.carry.counts))
 
-    def raise_fault(self, which: int, limits: Limits) -> NoReturn:
+    def raise_fault(self, which: int, limits: ChunkLimits) -> NoReturn:
         """Raises the error of a chunk of which nothing was pulled; the run is put before the fault.
 
         Raises:
@@ -231,7 +231,7 @@ class DeviceTrainer:
             run.copy_replay()
         raise AssertionError("the chunk was not finite, and its turns are")
 
-    def _repeat(self, limits: Limits, in_a_row: int) -> None:
+    def _repeat(self, limits: ChunkLimits, in_a_row: int) -> None:
         """Takes a chunk from the state of the only run, after so many bad updates in a row."""
         self.push(float(limits.progress[0]), self.runs[0])
         self.groups[0].carry = self.groups[0].carry._replace(in_a_row=jnp.int32(in_a_row))
@@ -246,7 +246,7 @@ class DeviceTrainer:
         check_obs(run, carry.episodes.obs, int(carry.counts.step), "reset returned")
         raise AssertionError("the environment was not finite, and what it returned is")
 
-    def _raise_bad_update(self, run: Run, limits: Limits, in_a_row: int) -> NoReturn:
+    def _raise_bad_update(self, run: Run, limits: ChunkLimits, in_a_row: int) -> NoReturn:
         """Raises the error of the first bad update of the next turn, with the state before it and its batch."""
         number = 0
         while True:
@@ -269,8 +269,8 @@ def with_env(function: Callable[..., Any], program: Any, static: Any, arrays: An
 
 
 def take_chunk(
-    mesh: Mesh | None, n: int, program: Program, env: FunctionalEnv, carry: Any, limits: Limits, experience: Any
-) -> tuple[Any, Any, Report]:
+    mesh: Mesh | None, n: int, program: Program, env: FunctionalEnv, carry: Any, limits: ChunkLimits, experience: Any
+) -> tuple[Any, Any, ChunkReport]:
     """Returns carry, experience and report of ``n`` runs, which the devices of a mesh share, after a chunk."""
     one = lambda carry, limits, experience: program.chunk(env, carry, experience, limits)  # noqa: E731
     axes = axes_of(carry), None, axes_of(experience)

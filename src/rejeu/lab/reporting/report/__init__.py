@@ -22,7 +22,7 @@ from rejeu.agents.agent import Agent
 from rejeu.algorithms import config as configs
 from rejeu.core import atomic
 from rejeu.lab.reporting.report import page, sections
-from rejeu.lab.reporting.runs import CONFIG, EPISODES, EVALUATIONS, METRICS, WARNINGS, Run, read_run
+from rejeu.lab.reporting.runs import CONFIG, EPISODES, EVALUATIONS, METRICS, WARNINGS, RunSummary, read_run
 from rejeu.logs.evaluation import Evaluation
 from rejeu.logs.tables import Episodes, Table, evaluation_table
 
@@ -59,11 +59,11 @@ def write_report(
     return write_page(read, Path(out))
 
 
-def record(agent: Agent, path: Path, evaluations: Sequence[tuple[int, Evaluation]]) -> Run:
+def record(agent: Agent, path: Path, evaluations: Sequence[tuple[int, Evaluation]]) -> RunSummary:
     """Returns the training of an agent so far as a run; ``path`` is only for its name."""
     env = agent.run.env
     history = agent.history
-    return Run(
+    return RunSummary(
         path=path.absolute(),
         name=path.stem,
         algorithm=agent.name,
@@ -87,12 +87,12 @@ def given_config(agent: Agent) -> Any:
     return dataclasses.replace(config, policy_kwargs=default.policy_kwargs) if is_default else config
 
 
-def write_page(runs: Sequence[Run], out: Path) -> Path:
+def write_page(runs: Sequence[RunSummary], out: Path) -> Path:
     """Writes the page of runs that were read or made, and returns its path."""
     return atomic.write(out, render(runs, out.absolute().parent))
 
 
-def render(runs: Sequence[Run], folder: Path | None, live: bool = False) -> str:
+def render(runs: Sequence[RunSummary], folder: Path | None, live: bool = False) -> str:
     """Returns the page as text.
 
     Args:
@@ -111,7 +111,7 @@ PATIENCE = 10.0
 """Seconds after which runs are read again though no file has changed: a process may have ended."""
 
 
-class Live:
+class LivePage:
     """The page and the data of runs that are followed. Thread-safe."""
 
     def __init__(self, paths: Sequence[Path]) -> None:
@@ -166,7 +166,7 @@ def stamp(path: Path) -> tuple[int, int] | None:
     return found.st_mtime_ns, found.st_size
 
 
-def handler(live: Live, hosts: Callable[[], set[str]]) -> type[BaseHTTPRequestHandler]:
+def handler(live: LivePage, hosts: Callable[[], set[str]]) -> type[BaseHTTPRequestHandler]:
     """Returns a request handler that answers for the page and its data, and to no other host name."""
 
     class Handler(BaseHTTPRequestHandler):
@@ -214,7 +214,7 @@ def make_server(paths: Sequence[Path], port: int = 0) -> tuple[ThreadingHTTPServ
         port: 0 for a free one.
     """
     names: set[str] = set()
-    server = ThreadingHTTPServer((HOST, port), handler(Live(paths), lambda: names))
+    server = ThreadingHTTPServer((HOST, port), handler(LivePage(paths), lambda: names))
     server.daemon_threads = True
     names |= {f"{name}:{server.server_port}" for name in (HOST, "localhost")}
     return server, f"http://{HOST}:{server.server_port}/"

@@ -19,7 +19,7 @@ from urllib.parse import quote
 import numpy as np
 
 from rejeu.core.records import shown
-from rejeu.lab.reporting.runs import MAX_WORD, Run, best_row
+from rejeu.lab.reporting.runs import MAX_WORD, RunSummary, best_row
 from rejeu.lab.runs.config import RunConfig
 from rejeu.logs import charts as chart_data
 from rejeu.logs.formatting import counted, quoted
@@ -55,7 +55,7 @@ class Parts(NamedTuple):
     """For the script."""
 
 
-def title_of(runs: Sequence[Run]) -> str:
+def title_of(runs: Sequence[RunSummary]) -> str:
     """Returns the title of a page."""
     if len(runs) > 1:
         return f"{len(runs)} runs"
@@ -63,7 +63,7 @@ def title_of(runs: Sequence[Run]) -> str:
 
 
 @np.errstate(all="ignore")  # files may hold any number
-def build(runs: Sequence[Run], folder: Path | None) -> Parts:
+def build(runs: Sequence[RunSummary], folder: Path | None) -> Parts:
     """Returns the content of a report; ``folder`` as for :func:`rejeu.lab.reporting.report.render`."""
     parts, budget = [], BUDGET
     charts: dict[str, Any] = {}
@@ -79,7 +79,7 @@ def build(runs: Sequence[Run], folder: Path | None) -> Parts:
     return Parts(parts, {"charts": charts, "histograms": histograms})
 
 
-def charts_of(run: Run, prefix: str) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+def charts_of(run: RunSummary, prefix: str) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """Returns the charts of a run by id, and groups of their ids and titles for the template."""
     found: list[tuple[str, str, str, Any]] = [
         (CURVES, column, title, chart_data.episode_chart(run.episodes, run.evaluations, column))
@@ -97,7 +97,7 @@ def charts_of(run: Run, prefix: str) -> tuple[dict[str, Any], list[dict[str, Any
     return charts, [{"title": heading, "charts": entries} for heading, entries in groups.items() if entries]
 
 
-def histogram_of(run: Run) -> dict[str, Any] | None:
+def histogram_of(run: RunSummary) -> dict[str, Any] | None:
     """Returns the histogram of the training episodes."""
     episodes = run.episodes
     columns = {
@@ -111,14 +111,14 @@ def histogram_of(run: Run) -> dict[str, Any] | None:
     return chart_data.histogram(episodes.returns, columns)
 
 
-def replays_of(run: Run) -> dict[str, Any] | None:
+def replays_of(run: RunSummary) -> dict[str, Any] | None:
     """Returns the histogram of the episodes that the trained agent played from known seeds; None without any."""
     columns = {name: run.replays.column(name) for name in ("seed", "return", "length", "success")}
     return chart_data.histogram(columns["return"], columns, replay_command(run))
 
 
 def describe(
-    run: Run, key: str, groups: list[dict[str, Any]], found: list[Video], notes: list[str], histograms: set[str]
+    run: RunSummary, key: str, groups: list[dict[str, Any]], found: list[Video], notes: list[str], histograms: set[str]
 ) -> dict[str, Any]:
     """Returns what the template shows of a run."""
     rows = hyperparameters(run)
@@ -188,7 +188,7 @@ def duration(seconds: float) -> str:
     return f"{hours:,} h {minutes} min" if hours else f"{minutes} min {rest} s"
 
 
-def tiles(run: Run) -> list[Tile]:
+def tiles(run: RunSummary) -> list[Tile]:
     """Returns the figures of the headline."""
     mean, found = run.evaluations.column("mean_return"), []
     best = best_row(run.evaluations)
@@ -207,7 +207,7 @@ def tiles(run: Run) -> list[Tile]:
     ]
 
 
-def evaluation_tiles(run: Run, title: str, row: int) -> list[Tile]:
+def evaluation_tiles(run: RunSummary, title: str, row: int) -> list[Tile]:
     """Returns the figures of one evaluation: the success rate, if it is known, with the return below, else the return."""
     table = run.evaluations
     mean, rate = table.column("mean_return")[row], table.column("success_rate")[row]
@@ -223,7 +223,7 @@ def evaluation_tiles(run: Run, title: str, row: int) -> list[Tile]:
     return [Tile(f"{title}, {at}", number(mean), note)]
 
 
-def training_tiles(run: Run) -> list[Tile]:
+def training_tiles(run: RunSummary) -> list[Tile]:
     """Returns the figures of the last training episodes of a run without evaluations."""
     returns = run.episodes.returns[-LAST:]
     returns = returns[np.isfinite(returns)]
@@ -233,7 +233,7 @@ def training_tiles(run: Run) -> list[Tile]:
     return [Tile(title, number(float(np.mean(returns))), "return; no evaluation yet")]
 
 
-def facts(run: Run) -> list[str]:
+def facts(run: RunSummary) -> list[str]:
     """Returns the line below the headline."""
     backend = None if run.config is None else run.config.backend
     found = [counted(len(run.episodes), "episode")]
@@ -244,7 +244,7 @@ def facts(run: Run) -> list[str]:
     return found
 
 
-def evaluation_rows(run: Run) -> list[dict[str, Any]]:
+def evaluation_rows(run: RunSummary) -> list[dict[str, Any]]:
     """Returns the table of evaluations; of many rows the best and others, evenly spaced."""
     table = run.evaluations
     (low, high), (least, most) = chart_data.interval(table, "return"), chart_data.interval(table, "success")
@@ -266,7 +266,7 @@ def evaluation_rows(run: Run) -> list[dict[str, Any]]:
     ]
 
 
-def evaluations_note(run: Run) -> str:
+def evaluations_note(run: RunSummary) -> str:
     """Returns which evaluations are listed; empty if all are."""
     n = len(run.evaluations)
     return f"{MAX_EVALUATIONS} of {n:,} evaluations, evenly spaced" if n > MAX_EVALUATIONS else ""
@@ -288,7 +288,7 @@ def value_text(value: Any) -> str:
     return shown(value if isinstance(value, str) else json.dumps(value), 200)
 
 
-def hyperparameters(run: Run) -> list[dict[str, Any]]:
+def hyperparameters(run: RunSummary) -> list[dict[str, Any]]:
     """Returns all hyperparameters, and which differ from the default."""
     return [
         {
@@ -301,7 +301,7 @@ def hyperparameters(run: Run) -> list[dict[str, Any]]:
     ]
 
 
-def settings(run: Run) -> list[tuple[str, str]]:
+def settings(run: RunSummary) -> list[tuple[str, str]]:
     """Returns the configuration of the run without the hyperparameters, where it differs from what is usual."""
     if run.config is None:
         return []
@@ -311,7 +311,7 @@ def settings(run: Run) -> list[tuple[str, str]]:
     return [(name, value_text(value)) for name, value in rows]
 
 
-def replay_command(run: Run) -> str:
+def replay_command(run: RunSummary) -> str:
     """Returns the command that shows episodes of the trained agent; empty if there is no model."""
     if run.format != "rejeu" or not run.models:
         return ""
@@ -319,7 +319,7 @@ def replay_command(run: Run) -> str:
     return f"rejeu watch {path_word(run.path)}{which} --seed N --episodes 1{env_options(run)}"
 
 
-def env_options(run: Run) -> str:
+def env_options(run: RunSummary) -> str:
     """Returns what commands about the run need to make its environment again, and to import; empty if its id is enough."""
     return "".join(f" {quoted(shown(word, MAX_WORD))}" for word in run.environment_words())
 
@@ -347,7 +347,7 @@ class Video(NamedTuple):
     megabytes: float
 
 
-def collect(run: Run, folder: Path | None, budget: int) -> tuple[list[Video], list[str], int]:
+def collect(run: RunSummary, folder: Path | None, budget: int) -> tuple[list[Video], list[str], int]:
     """Returns first, last and best video of a run, notes on damaged ones, and the bytes that were embedded.
 
     Args:

@@ -10,7 +10,7 @@ import gymnasium as gym
 from rejeu.core.errors import BadEnvironmentError, WorkerError
 from rejeu.envs.validation import with_location
 from rejeu.envs.workers.pool import RESTARTED, TIMEOUT, Processes, ProcessWorker, Restarted, Workers
-from rejeu.envs.workers.process import Failure
+from rejeu.envs.workers.process import WorkerFailure
 from rejeu.sb3.common.vec_env.base_vec_env import Indices, SingleEnvs, StepResult, stacked
 
 __all__ = ["SubprocVecEnv"]
@@ -122,7 +122,7 @@ class SubprocVecEnv(SingleEnvs):
         """Returns the replies of some processes; ends all processes if one of the replies is a failure."""
         replies = self.workers.answers(indices)
         for i, answer in replies.items():
-            if isinstance(answer, Failure):
+            if isinstance(answer, WorkerFailure):
                 if attribute_errors and answer.kind == "no attribute":
                     raise AttributeError(answer.message)
                 self.close()

@@ -81,7 +81,7 @@ class NotReady(Exception):
         return [str(self)]
 
 
-class Session:
+class NotebookState:
     """The state of the checks in a notebook. Mutable."""
 
     def __init__(self) -> None:
@@ -102,7 +102,7 @@ class Session:
         return text[chosen()].format(**values)
 
 
-SESSION = Session()
+SESSION = NotebookState()
 
 
 @cache

@@ -19,7 +19,7 @@ N = 4_000
 """Draws of a strategy, enough that every time occurs."""
 
 
-class Step(NamedTuple):
+class GoalStep(NamedTuple):
     """A step of an episode in a goal environment."""
 
     obs: dict[str, np.ndarray]
@@ -59,8 +59,8 @@ def compute_reward(student: Any) -> None:
 def relabel(student: Any) -> None:
     """Checks ``relabel(step, goal)`` with the reward of bits."""
     a, b, c = (np.array(bits, np.int8) for bits in ([0, 0, 1], [0, 1, 1], [1, 1, 1]))
-    missed = Step(_observe(a, c), 1, -1.0, _observe(b, c), False)
-    reached = Step(_observe(a, b), 1, 0.0, _observe(b, b), True)
+    missed = GoalStep(_observe(a, c), 1, -1.0, _observe(b, c), False)
+    reached = GoalStep(_observe(a, b), 1, 0.0, _observe(b, b), True)
     _one_relabeling(call(student, missed, a), missed, a, achieved=False)
     _one_relabeling(call(student, reached, c), reached, c, achieved=False)
     _one_relabeling(call(student, missed, b), missed, b, achieved=True)
@@ -70,9 +70,9 @@ def _observe(achieved: np.ndarray, desired: np.ndarray) -> dict[str, np.ndarray]
     return {"observation": achieved, "achieved_goal": achieved, "desired_goal": desired}
 
 
-def _one_relabeling(result: Any, step: Step, goal: np.ndarray, achieved: bool) -> None:
+def _one_relabeling(result: Any, step: GoalStep, goal: np.ndarray, achieved: bool) -> None:
     """Checks a relabeled step; ``achieved``: whether the step reaches its new goal."""
-    mistakes(not_a_step=getattr(result, "_fields", None) != Step._fields)
+    mistakes(not_a_step=getattr(result, "_fields", None) != GoalStep._fields)
     for name in ("obs", "next_obs"):
         seen, before = getattr(result, name), getattr(step, name)
         if not isinstance(seen, dict) or seen.keys() != before.keys() or not np.array_equal(seen["desired_goal"], goal):
@@ -99,7 +99,7 @@ def hindsight(student: Any) -> None:
     states = [np.array([(t >> bit) & 1 for bit in range(4)], np.int8) for t in range(7)]
     goal = np.array([1, 1, 1, 1], np.int8)
     pairs = pairwise(states)
-    episode = [Step(_observe(s, goal), t, -1.0, _observe(n, goal), False) for t, (s, n) in enumerate(pairs)]
+    episode = [GoalStep(_observe(s, goal), t, -1.0, _observe(n, goal), False) for t, (s, n) in enumerate(pairs)]
     result = call(student, episode, 40, np.random.default_rng(0))
     if not isinstance(result, list) or not all(
         isinstance(step, tuple) and hasattr(step, "next_obs") for step in result
