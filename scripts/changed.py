@@ -15,7 +15,9 @@ import subprocess
 import sys
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
+from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 from structure import imports, parse  # beside this file
 
@@ -61,8 +63,20 @@ def reached(start: Iterable[str], edges: dict[str, set[str]]) -> set[str]:
     return found
 
 
-def tests_of(changed: Iterable[str]) -> list[str]:
-    """Returns the test files of changed files, as paths below the repository, sorted."""
+class Graph(NamedTuple):
+    """What imports what."""
+
+    paths: dict[str, str]
+    """Modules of the package and of the tests by their path below the repository."""
+    needs: dict[str, set[str]]
+    """What each test file imports, directly or through modules of ``tests``, and itself."""
+    importers: dict[str, set[str]]
+    """The modules of the package that import a module."""
+
+
+@cache
+def graph() -> Graph:
+    """Reads all files once."""
     package, tests = parse(ROOT / "src"), parse(ROOT, "tests")
     behind, known = definitions(package), {*package, *tests}
     edges: dict[str, set[str]] = defaultdict(set)
@@ -72,13 +86,20 @@ def tests_of(changed: Iterable[str]) -> list[str]:
     for name, (path, tree) in package.items():
         for source, _ in imports(name, path, tree, set(package)):
             importers[source].add(name)
-    within_tests = {name: {one for one in found if one in tests} for name, found in edges.items()}
+    within_tests = defaultdict(set, {name: {one for one in found if one in tests} for name, found in edges.items()})
     needs = {
-        name: set[str]().union(*(edges[one] for one in reached([name], defaultdict(set, within_tests)))) | {name}
+        name: set[str]().union(*(edges[one] for one in reached([name], within_tests))) | {name}
         for name in tests
         if name.rpartition(".")[2].startswith("test_")
     }
-    paths = {path.relative_to(ROOT).as_posix(): name for name, (path, _) in {**package, **tests}.items()}
+    return Graph(
+        {path.relative_to(ROOT).as_posix(): name for name, (path, _) in (package | tests).items()}, needs, importers
+    )
+
+
+def tests_of(changed: Iterable[str]) -> list[str]:
+    """Returns the test files of changed files, as paths below the repository, sorted."""
+    paths, needs, importers = graph()
     found: set[str] = set()
     for module in (paths[one] for one in changed if one in paths):
         found |= {name for name in needs if f"test_{module.rpartition('.')[2]}" == name.rpartition(".")[2]}
@@ -87,7 +108,7 @@ def tests_of(changed: Iterable[str]) -> list[str]:
             ring = set[str]().union(*(importers[one] for one in ring)) - seen
             seen |= ring
         found |= of_ring if ring else set()
-    return sorted(tests[name][0].relative_to(ROOT).as_posix() for name in found)
+    return sorted(path for path, name in paths.items() if name in found)
 
 
 def main() -> None:
