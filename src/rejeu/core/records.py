@@ -88,7 +88,16 @@ def json_text(value: Any, indent: int = 1) -> str:
     Raises:
         TypeError, ValueError: if a value is not one of JSON, or not finite.
     """
-    return json.dumps(value, indent=indent, allow_nan=False, default=dataclasses.asdict) + "\n"
+    return json.dumps(value, indent=indent, allow_nan=False, default=_as_dict) + "\n"
+
+
+def _as_dict(value: Any) -> dict[str, Any]:
+    """Returns a mapping, or the fields of a dataclass, as a dict."""
+    if isinstance(value, Mapping):
+        return dict(value)
+    if isinstance(value, type):
+        raise TypeError(f"{value!r} is no value of JSON")
+    return {one.name: getattr(value, one.name) for one in dataclasses.fields(value)}
 
 
 def convert(value: Any, kind: type[T]) -> T:

@@ -388,7 +388,8 @@ def test_a_plan_of_a_study_keeps_every_option():
     given |= {"evaluate_episodes": 6, "trial_seeds": 2, "final_seeds": 8, "pruner": "halving", "measure": "success"}
     given |= {"checkpoint_minutes": 2.0, "env_kwargs": {"g": 9.8}, "wrappers": ("a:B",), "env_argument": "my_env.py"}
     plan = study_plan.make("Pendulum-v1", "SAC", **given)
-    assert {key: getattr(plan, key) for key in given} == given
+    kept = {**vars(plan.default), **vars(plan), "steps": plan.default.total_steps}
+    assert {key: kept[key] for key in given} == given
     assert (plan.column, plan.run.env_kwargs, plan.run.wrappers) == ("success_rate", {"g": 9.8}, ("a:B",))
     assert plan.run.env_argument == "my_env.py"
     of_preset = {"env_id": "Pendulum-v1", "algorithm": "SAC", "hyperparameters": {"gamma": 0.5}, "source": "a test"}

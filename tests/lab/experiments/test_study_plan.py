@@ -14,23 +14,31 @@ from rejeu.lab.experiments import study_plan as plans
 
 def test_a_plan_takes_what_is_not_said_from_the_preset():
     plan = plans.make("Pendulum-v1")
-    assert (plan.algorithm, plan.steps, plan.n_envs, plan.backend) == ("SAC", 20_000, 1, "envpool")
-    assert (plan.evaluate_every, plan.evaluate_episodes) == (2_000, 20)
-    assert (
-        plan.fixed == plan.default == {"learning_rate": 1e-3, "batch_size": 64, "policy_kwargs": {"net_arch": [64, 64]}}
-    )
+    one = plan.default
+    assert (one.algorithm, one.total_steps, one.n_envs, one.backend) == ("SAC", 20_000, 1, "envpool")
+    assert (one.evaluate_every, one.evaluate_episodes) == (2_000, 20)
+    values = {"learning_rate": 1e-3, "batch_size": 64, "policy_kwargs": {"net_arch": [64, 64]}}
+    assert plan.fixed == one.hyperparameters == values
+
+
+def test_trials_count_successes_as_runs_of_the_preset_do():
+    plan = plans.make("Acrobot-v1", preset=presets.named("Rainbow", "Acrobot-v1"))
+    default = dataclasses.replace(plan.default, success_threshold=-90.0)
+    preset = dataclasses.replace(plan, default=default).preset({"gamma": 0.5}, "a test")
+    assert (preset.success_threshold, preset.name) == (-90.0, "")
 
 
 def test_without_a_preset_the_algorithm_is_named_and_its_defaults_are_compared_with():
     with pytest.raises(ValueError, match="Blackjack-v1 has no preset; name the algorithm to tune, such as --algo PPO"):
         plans.make("Blackjack-v1")
     plan = plans.make("Blackjack-v1", "ppo")
-    assert (plan.algorithm, plan.default, plan.steps) == ("PPO", {}, 100_000)
+    default = plan.default
+    assert (default.algorithm, default.hyperparameters, default.total_steps) == ("PPO", {}, 100_000)
 
 
 def test_an_environment_in_jax_is_tuned_on_its_own_backend(tmp_path):
     plan = plans.make("jax/CartPole-v1", "PPO")
-    assert plan.backend == "jax"
+    assert plan.default.backend == "jax"
     path = presets.write(plan.preset({}, "a test"), tmp_path / "preset.json")
     assert presets.read(path).backend == "jax"
 
@@ -95,19 +103,20 @@ def test_what_is_written_is_read(tmp_path):
 @pytest.mark.parametrize(
     "change",
     [
-        {"algorithm": "os"},
-        {"env_id": "module;evil"},
+        {"default": {"algorithm": "os"}},
+        {"default": {"env_id": ""}},
         {"trials": 10**9},
         {"space": {"gamma": {"kind": "Uniform", "low": 1, "high": 0}}},
         {"space": {"unknown": {"kind": "Uniform", "low": 0, "high": 1}}},
         {"space": {"gamma": 3}},
         {"fixed": {"policy_kwargs": 3}},
-        {"backend": "evil"},
+        {"default": {"backend": "evil"}},
     ],
 )
 def test_a_damaged_file_is_one_line(tmp_path, change):
     path = tmp_path / "study.json"
-    content = json.loads(json_text(plans.make("Pendulum-v1"))) | change
+    content = json.loads(json_text(plans.make("Pendulum-v1")))
+    content |= change | {"default": {**content["default"], **change.get("default", {})}}
     path.write_text(json.dumps(content), encoding="utf-8")
     with pytest.raises(CheckpointError, match=r"study\.json is damaged: ") as error:
         plans.read(path)

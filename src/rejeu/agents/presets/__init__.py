@@ -10,7 +10,6 @@ writes the results.
 from __future__ import annotations
 
 import dataclasses
-import json
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -25,7 +24,7 @@ from msgspec import Meta
 
 from rejeu.core import atomic
 from rejeu.core.errors import CheckpointError
-from rejeu.core.records import EnvCount, Malformed, Positive, convert, read_json, shown
+from rejeu.core.records import EnvCount, Malformed, Positive, convert, json_text, read_json, shown
 
 MAX_BYTES = 2**20
 """Upper limit on the size of a file."""
@@ -77,12 +76,11 @@ def write(preset: Preset, path: str | Path) -> Path:
     Raises:
         TypeError: if a hyperparameter is not a JSON value, such as a network of your own.
     """
-    fields = {one.name: getattr(preset, one.name) for one in dataclasses.fields(preset)}
     try:
-        text = json.dumps({**fields, "hyperparameters": dict(preset.hyperparameters)}, indent=2, allow_nan=False)
+        text = json_text(preset, 2)
     except (TypeError, ValueError) as error:
         raise TypeError(f"the preset of {preset.env_id} has hyperparameters that a file cannot hold: {error}") from None
-    return atomic.write(Path(path), f"{text}\n")
+    return atomic.write(Path(path), text)
 
 
 def read(path: str | Path) -> Preset:

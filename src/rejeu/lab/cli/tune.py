@@ -67,8 +67,8 @@ def resume_study(arguments: Resume) -> tuple[int, dict[str, Any]]:
         )
     study = studies.open_study(StudyFolder(arguments.run))
     made = environment.from_run(study.plan.run, arguments.run, arguments)
-    if made.env_id != study.plan.env_id:
-        raise ValueError(f"{arguments.run} is a study of {study.plan.env_id}, not of {made.env_id}")
+    if made.env_id != study.plan.default.env_id:
+        raise ValueError(f"{arguments.run} is a study of {study.plan.default.env_id}, not of {made.env_id}")
     return complete(study, made, arguments.workers)
 
 
@@ -123,9 +123,9 @@ def rows(trials: list[Trial], plan: StudyPlan) -> list[Row]:
     found = [Row("trials", ended, plan.trials, text)]
     for one in trials:
         if one.state == "running":
-            step = max(one.evaluations, default=0)
-            about = f"{step:,} of {plan.steps:,} steps, {plan.measure} {number(one.value)}  {tuning.settings(one)}"
-            found.append(Row(f"trial {one.index}", step, plan.steps, about))
+            step, steps = max(one.evaluations, default=0), plan.default.total_steps
+            about = f"{step:,} of {steps:,} steps, {plan.measure} {number(one.value)}  {tuning.settings(one)}"
+            found.append(Row(f"trial {one.index}", step, steps, about))
     return found
 
 
@@ -135,10 +135,10 @@ def header(study: Study, made: Environment) -> list[str]:
     done = sum(one.state not in ("waiting", "running") for one in study.trials())
     seeds = f", {plan.trial_seeds} seeds each" if plan.trial_seeds > 1 else ""
     return [
-        f"environment   {made}, {plan.n_envs} at once",
-        f"algorithm     {plan.algorithm}, seed {plan.seed}, pruner {plan.pruner}",
-        f"trials        {plan.trials} of {plan.steps:,} steps{seeds}, evaluated on "
-        f"{counted(plan.evaluate_episodes, 'episode')} every {plan.evaluate_every:,} steps"
+        f"environment   {made}, {plan.default.n_envs} at once",
+        f"algorithm     {plan.default.algorithm}, seed {plan.seed}, pruner {plan.pruner}",
+        f"trials        {plan.trials} of {plan.default.total_steps:,} steps{seeds}, evaluated on "
+        f"{counted(plan.default.evaluate_episodes, 'episode')} every {plan.default.evaluate_every:,} steps"
         + f"; {done} have ended"
         * bool(done),
         *(f"{'search' if i == 0 else '':<14}{name}: {one}" for i, (name, one) in enumerate(plan.search_space.items())),

@@ -198,8 +198,8 @@ def winner_name(best: Trial) -> str:
 
 def is_default(study: Study, winner: Preset) -> bool:
     """Returns whether a preset has the hyperparameters of the default."""
-    config = AGENTS[study.plan.algorithm].algorithm.Config
-    own = (validation.build(config, values) for values in (winner.hyperparameters, study.plan.default))
+    config = AGENTS[study.plan.default.algorithm].algorithm.Config
+    own = (validation.build(config, values) for values in (winner.hyperparameters, study.plan.default.hyperparameters))
     return next(own) == next(own)
 
 
@@ -207,7 +207,7 @@ def final_trainings(study: Study, best: Trial, run: RunConfig) -> list[Work]:
     """Returns all trainings of the comparison, in pairs; their presets are written."""
     named = {
         winner_name(best): study.preset_of(best, f"trial {best.index}"),
-        DEFAULT: study.plan.preset(study.plan.default, "the default"),
+        DEFAULT: study.plan.preset(study.plan.default.hyperparameters, "the default"),
     }
     for name, preset in named.items():
         presets.write(preset, study.folder.final / name / "preset.json")

@@ -159,7 +159,7 @@ class Study:
         """Adds an evaluation to a trial; returns whether the trial is to be pruned."""
         with readable(self.folder.journal):
             trial.report(value, step)
-            return step < self.plan.steps and trial.should_prune()
+            return step < self.plan.default.total_steps and trial.should_prune()
 
     def finish(self, trial: optuna.Trial, index: int, state: State, value: float = math.nan, reason: str = "") -> None:
         """Ends a trial and releases its lock. A trial without a finite value has failed."""
@@ -323,7 +323,7 @@ def make_pruner(plan: StudyPlan) -> optuna.pruners.BasePruner:
     from optuna import pruners
 
     if plan.pruner == "median":
-        return pruners.MedianPruner(n_startup_trials=STARTUP_TRIALS, n_warmup_steps=plan.steps // 3)
+        return pruners.MedianPruner(n_startup_trials=STARTUP_TRIALS, n_warmup_steps=plan.default.total_steps // 3)
     if plan.pruner == "halving":
-        return pruners.SuccessiveHalvingPruner(min_resource=plan.evaluate_every)
+        return pruners.SuccessiveHalvingPruner(min_resource=plan.default.evaluate_every)
     return pruners.NopPruner()

@@ -18,7 +18,7 @@ from rejeu.algorithms import config as configs
 from rejeu.algorithms.search import HINDSIGHT, Dimension, SearchSpace
 from rejeu.core import validation
 from rejeu.core.errors import CheckpointError
-from rejeu.core.records import EnvCount, Positive, Seed, convert, json_text
+from rejeu.core.records import Seed, convert, json_text
 from rejeu.lab.experiments import folder as folders, space as spaces
 from rejeu.lab.runs.config import RunConfig
 
@@ -34,6 +34,9 @@ EVALUATIONS = 10
 SAMPLING, TRIALS, FINAL = range(3)
 """Streams of random numbers: of the sampler, of the seeds of trials, of the seeds of the final comparison."""
 
+OF_DEFAULT = {"n_envs", "backend", "evaluate_every", "evaluate_episodes"}
+"""Fields of a preset that are settings of a study."""
+
 Pruner = Literal["median", "halving", "none"]
 Measure = Literal["return", "success"]
 
@@ -42,27 +45,20 @@ Measure = Literal["return", "success"]
 class StudyPlan:
     """The settings of a study. Everything that a repetition needs, except for the number of workers."""
 
-    env_id: Annotated[str, Meta(pattern=r"^[\w./:-]{1,200}$")]
-    """Id of the environment."""
+    default: Preset
+    """What the winner is compared with, and what every training shares: environment, algorithm, steps and evaluations.
+
+    Its hyperparameters are those of the given preset or of rejeu's; empty for the algorithm's defaults."""
     env_argument: str = ""
-    """How it was named on the command line, if not by its id; never imported because a file says so."""
+    """How the environment was named on the command line, if not by its id; never imported because a file says so."""
     env_kwargs: dict[str, Any] = field(default_factory=dict)
     """Keyword arguments of the environment."""
     wrappers: tuple[str, ...] = ()
     """Names of its wrappers, innermost first."""
-    algorithm: str
-    default: dict[str, Any]
-    """Hyperparameters that the winner is compared with: of rejeu's preset, or empty for the algorithm's defaults."""
     fixed: dict[str, Any]
-    """Hyperparameters of every trial, before those that are searched: ``default`` with what the user set."""
+    """Hyperparameters of every trial, before those that are searched: of the default, with what the user set."""
     space: dict[str, dict[str, Any]]
     """Where the others are searched; see :func:`rejeu.lab.experiments.space.to_json`."""
-    steps: Positive
-    """Environment steps of a trial."""
-    n_envs: EnvCount
-    backend: Annotated[str, Meta(pattern="^(auto|envpool|gymnasium|gymnasium-async|jax)$")]
-    evaluate_every: Positive
-    evaluate_episodes: Annotated[int, Meta(ge=1, le=10_000)]
     trials: Annotated[int, Meta(ge=1, le=MAX_TRIALS)] = 30
     trial_seeds: Annotated[int, Meta(ge=1, le=1000)] = 1
     """Seeds of each trial, whose evaluations are averaged."""
@@ -79,7 +75,7 @@ class StudyPlan:
     def run(self) -> RunConfig:
         """The environment of all trainings."""
         kwargs, wrappers = self.env_kwargs, self.wrappers
-        return RunConfig(env=self.env_id, env_argument=self.env_argument, env_kwargs=kwargs, wrappers=wrappers)
+        return RunConfig(env=self.default.env_id, env_argument=self.env_argument, env_kwargs=kwargs, wrappers=wrappers)
 
     @property
     def search_space(self) -> dict[str, Dimension]:
@@ -109,17 +105,7 @@ class StudyPlan:
 
     def preset(self, hyperparameters: Mapping[str, Any], source: str) -> Preset:
         """Returns a preset with these hyperparameters and what all trainings of the study have in common."""
-        return Preset(
-            env_id=self.env_id,
-            algorithm=self.algorithm,
-            hyperparameters=hyperparameters,
-            n_envs=self.n_envs,
-            total_steps=self.steps,
-            evaluate_every=self.evaluate_every,
-            evaluate_episodes=self.evaluate_episodes,
-            backend=self.backend,
-            source=source,
-        )
+        return dataclasses.replace(self.default, hyperparameters=hyperparameters, source=source)
 
 
 def make(
@@ -148,20 +134,15 @@ def make(
     space = choose_space(base.algorithm, values, fixed, search or {}, only)
     total = validation.whole("steps", steps or base.total_steps, least=1)
     given = {name: value for name, value in others.items() if value is not None}
-    usual = {
-        "n_envs": base.n_envs,
-        "backend": "auto" if given.get("env_kwargs") or given.get("wrappers") else base.backend,
-        "evaluate_every": max(total // EVALUATIONS, 1),
-        "evaluate_episodes": base.evaluate_episodes,
-    }
+    usual: dict[str, Any] = {"name": "", "evaluate_every": max(total // EVALUATIONS, 1)}
+    if given.get("env_kwargs") or given.get("wrappers"):
+        usual["backend"] = "auto"
+    of_default = usual | {name: given.pop(name) for name in OF_DEFAULT & given.keys()}
     plan = StudyPlan(
-        env_id=env_id,
-        algorithm=base.algorithm,
-        default=dict(base.hyperparameters),
+        default=dataclasses.replace(base, env_id=env_id, total_steps=total, **of_default),
         fixed=values,
         space={key: spaces.to_json(one) for key, one in space.items()},
-        steps=total,
-        **{**usual, **given},
+        **given,
     )
     if 0 < plan.final_seeds < MIN_FINAL_SEEDS:
         raise ValueError(
@@ -237,7 +218,7 @@ def read(path: Path) -> StudyPlan:
 
 def check(plan: StudyPlan, path: Path) -> None:
     """Raises ``ValueError`` or ``TypeError`` if the algorithm of a plan from a file does not take its hyperparameters."""
-    config_class = agent_of_file(plan.algorithm, path).algorithm.Config
+    config_class = agent_of_file(plan.default.algorithm, path).algorithm.Config
     for name, dimension in plan.search_space.items():
         for value in dimension.ends():
             validation.build(config_class, spaces.applied(plan.fixed, {name: value}))
@@ -245,15 +226,16 @@ def check(plan: StudyPlan, path: Path) -> None:
 
 def default_values(plan: StudyPlan) -> dict[str, Any]:
     """Returns the values of the searched hyperparameters in the default, as far as they lie in the search space."""
-    config = validation.build(AGENTS[plan.algorithm].algorithm.Config, plan.fixed)
+    config = validation.build(AGENTS[plan.default.algorithm].algorithm.Config, plan.fixed)
     values = spaces.values_at(configs.to_json(config), plan.search_space)
     return {name: value for name, value in values.items() if plan.search_space[name].contains(value)}
 
 
 def difference(plan: StudyPlan, other: StudyPlan) -> str:
     """Returns the first setting in which two plans differ and which a study cannot change, as text; empty if none does."""
-    for one in dataclasses.fields(StudyPlan):
-        ours, theirs = getattr(plan, one.name), getattr(other, one.name)
-        if one.name not in ("trials", "final_seeds", "checkpoint_minutes") and ours != theirs:
-            return f"another study: {one.name} is {str(ours)[:100]} there, not {str(theirs)[:100]}"
+    one, two = ({**vars(known.default), **vars(known), "default": None} for known in (plan, other))
+    for name, ours in one.items():
+        if name not in ("trials", "final_seeds", "checkpoint_minutes") and ours != two[name]:
+            typed = name.removeprefix("total_")  # --steps
+            return f"another study: {typed} is {str(ours)[:100]} there, not {str(two[name])[:100]}"
     return ""

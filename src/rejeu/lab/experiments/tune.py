@@ -63,8 +63,8 @@ class Result:
         compared = None if self.final is None else self.final.comparison
         return {
             "study": self.folder,
-            "env_id": self.plan.env_id,
-            "algorithm": self.plan.algorithm,
+            "env_id": self.plan.default.env_id,
+            "algorithm": self.plan.default.algorithm,
             "seed": self.plan.seed,
             "complete": self.complete,
             "signal": self.signal,
@@ -164,7 +164,7 @@ def tune(
     )
     study = open_study(plan, None if folder is None else Path(folder))
     echo: Echo = print if verbose else lambda text: None
-    config = RunConfig(env=plan.env_id, env_kwargs=plan.env_kwargs, imports=tuple(imports))
+    config = RunConfig(env=plan.default.env_id, env_kwargs=plan.env_kwargs, imports=tuple(imports))
     with Interrupt() as stop:
         result = run(study, config, workers, stop, lines(echo, study), echo)
     echo(str(result))
@@ -178,7 +178,7 @@ def open_study(plan: StudyPlan, folder: Path | None) -> Study:
         ValueError: if it is the folder of another study.
         FileExistsError: if it is something else.
     """
-    return studies.open_study(StudyFolder(folder or dated("tune", plan.env_id, plan.algorithm)), plan)
+    return studies.open_study(StudyFolder(folder or dated("tune", plan.default.env_id, plan.default.algorithm)), plan)
 
 
 def run(
@@ -201,7 +201,7 @@ def run(
     """
     plan, folder = study.plan, study.folder
     at_once = workers or default_workers()
-    imports = tuple(modules_of(plan.algorithm, config.imports))
+    imports = tuple(modules_of(plan.default.algorithm, config.imports))
     config = dataclasses.replace(config, imports=imports, checkpoint_minutes=plan.checkpoint_minutes)
     search = Search(study, config, at_once, stop)
     search.run(watch)
@@ -233,7 +233,9 @@ def announcement(plan: StudyPlan, trials: Sequence[Trial] = (), workers: int = 1
     >>> announcement(plans.make("Pendulum-v1", steps=2000))
     '5 fresh seeds each, 10 trainings of 2,000 steps'
     """
-    text = f"{plan.final_seeds} fresh seeds each, {2 * plan.final_seeds} trainings of {plan.steps:,} steps"
+    text = (
+        f"{plan.final_seeds} fresh seeds each, {2 * plan.final_seeds} trainings of {plan.default.total_steps:,} steps"
+    )
     seconds = [one.seconds for one in trials if one.state == "complete" and math.isfinite(one.seconds)]
     if not seconds:
         return text
