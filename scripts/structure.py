@@ -4,8 +4,8 @@
 
 SRC is the folder that contains ``rejeu`` (default: ``src``). The layers are the list under "Layout" in docs/design.md, and the
 limits the table under "Size". A line counts if it holds code: not a comment, a docstring or a blank line. Every Python file of
-the package counts. Exits with status 1 if there is a cycle, an access to a private attribute, an import against the layers, or
-more lines than a limit.
+the package counts. Exits with status 1 if there is a cycle, an access to a private attribute, an import against the layers,
+more lines than a limit, or the name of an algorithm as text outside of :data:`NAMES_ALGORITHMS`.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import json
 import re
 import sys
 import tokenize
+import tomllib
 from collections import Counter, defaultdict
 from collections.abc import Iterator
 from itertools import pairwise
@@ -28,7 +29,7 @@ from scipy.sparse.csgraph import connected_components
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = "rejeu"
-ENFORCED = ("cycles", "private_accesses", "private_imports", "layering_violations", "over_the_limit")
+ENFORCED = ("cycles", "private_accesses", "private_imports", "layering_violations", "over_the_limit", "algorithm_names")
 """Lists that must be empty."""
 PUBLIC_IN_SPITE_OF_ITS_NAME = {"_replace", "_asdict", "_fields", "_field_defaults", "_make", "_exit", "_getframe"}
 """Documented methods of named tuples, and of ``os`` and ``sys``."""
@@ -38,6 +39,16 @@ LAYOUT = {tokenize.NEWLINE, tokenize.NL, tokenize.COMMENT, tokenize.INDENT, toke
 """Kinds of token that are not code."""
 HANDS_OVER = ("rejeu.agents.agent", "__init__")
 """An agent writes its report, and shows its environments as the original does, by public names of the package."""
+NAMES_ALGORITHMS = {
+    "algorithms": "the algorithms themselves, and their catalog",
+    "sb3": "names of the original",
+    "sb3_contrib": "names of the original",
+    "agents.conversion": "what the original's files hold",
+    "agents.zip_files": "what the original's files hold",
+    "agents.presets": "the default for a kind of action space",
+    "export.numpy_policy": "layers are read by the algorithm's name, until it interprets the traced program",
+}
+"""Where names of algorithms may stand as text, and why; elsewhere they come from ``algorithms/catalog.toml``."""
 EXCEPTIONS = PUBLIC_IN_SPITE_OF_ITS_NAME | GYMNASIUM_STATE
 
 
@@ -158,6 +169,19 @@ def layering_violations(found: list[tuple[str, str, int]], order: list[str]) -> 
     return violations
 
 
+def algorithm_names(src: Path, modules: dict[str, tuple[Path, ast.Module]]) -> list[str]:
+    """Returns the places outside of :data:`NAMES_ALGORITHMS` where a string is the name of an algorithm."""
+    names = tomllib.loads((src / PACKAGE / "algorithms" / "catalog.toml").read_text(encoding="utf-8"))
+    allowed = tuple(f"{PACKAGE}.{room}." for room in NAMES_ALGORITHMS)
+    return [
+        f"{module}:{node.lineno} {node.value}"
+        for module, (_, tree) in modules.items()
+        if not f"{module}.".startswith(allowed)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value in names
+    ]
+
+
 def code_lines(path: Path) -> list[str]:
     """Returns a module's lines that hold code, stripped: those with a token that is not a comment or a docstring."""
     held: set[int] = set()
@@ -242,6 +266,7 @@ def measure(src: Path) -> dict[str, Any]:
         "private_imports": [f"{m}:{line} {text}" for m, (_, t) in modules.items() for line, text in private_imports(t)],
         "layering_violations": layering_violations(found, layers()),
         "over_the_limit": over_the_limit(lines),
+        "algorithm_names": algorithm_names(src, modules),
     }
 
 

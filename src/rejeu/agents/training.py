@@ -14,6 +14,7 @@ import numpy as np
 from rejeu.agents import device
 from rejeu.agents.base import BaseAgent, Best
 from rejeu.algorithms import config as configs
+from rejeu.algorithms.catalog import CATALOG
 from rejeu.callbacks.base import Callback, called, in_order, listed, listening, stateful
 from rejeu.callbacks.progress_bar import ProgressBar
 from rejeu.core import schedules, xla
@@ -28,6 +29,7 @@ TABLE_SECONDS = 2.0
 """Least time between two tables that ``verbose=1`` prints; other outputs get every row."""
 HINT_SECONDS, HINT_RATE = 10.0, 200.0
 """After so many seconds of training, at fewer steps a second, a run may get a hint."""
+DETERMINISTIC = {name for name, one in CATALOG.items() if one.is_deterministic}
 LOG_FOLDER = "logs"
 """Folder of the folders of logs, in the current folder."""
 LOGGED_AS = {"exploration_rate": "rollout/exploration_rate"}
@@ -188,7 +190,8 @@ def train(
 
     The other arguments are those of :meth:`Agent.learn`.
     """
-    warn_without_noise(agent)
+    if agent.name in DETERMINISTIC:
+        warn_without_noise(agent)
     bar = [ProgressBar.of(call, taken=agent.run.step - call.first_step)] if progress_bar else []
     callbacks = in_order([*listed(callback), *bar])
     agent.stops, agent.n_together = device.stops_of(agent, call, callbacks), 1

@@ -31,8 +31,12 @@ class Entry(NamedTuple):
     """Where the network that acts is in its state; empty if it has a memory."""
     is_squashed: bool = False
     """Whether Box actions come through a hyperbolic tangent."""
+    is_deterministic: bool = False
+    """Whether the policy for Box actions does not explore by itself."""
     is_projected: bool = False
     """Whether the networks have normalized layers, whose weights are scaled after each step."""
+    zoo: str = ""
+    """In folders of RL Zoo, if that is not the name in lowercase."""
 
     def load(self) -> ModuleType:
         """Imports the file of the algorithm."""
@@ -46,3 +50,5 @@ CATALOG = {
     ).items()
 }
 """Every algorithm by its name, in the order of ``rejeu list --algorithms``."""
+OFFLINE = next(name for name, one in CATALOG.items() if one.kind == "offline")
+"""The first that learns from recorded episodes: the default of ``rejeu train --offline``."""

@@ -29,8 +29,6 @@ from rejeu.exploration.parameter_space import ParameterNoise
 
 PerDimension = Any
 """A number for all action dimensions, or a sequence of one for each; kept as a tuple of floats."""
-DETERMINISTIC = ("DDPG", "TD3")
-"""Algorithms whose policy for continuous actions does not explore by itself."""
 
 
 @runtime_checkable
@@ -354,9 +352,9 @@ def check_fits(noise: Noise | None, action_space: spaces.Space) -> None:
 
 
 def warn_without_noise(agent: Any) -> None:
-    """Warns at the start of a run if an agent's policy is deterministic and it has no exploration noise."""
-    is_deterministic = agent.name in DETERMINISTIC and isinstance(agent.action_space, spaces.Box)
-    if is_deterministic and agent.make_noise() is None and agent.run.step == 0:
+    """Warns at the start of a run if an agent whose policy for Box actions is deterministic has no exploration noise."""
+    is_continuous = isinstance(agent.action_space, spaces.Box)
+    if is_continuous and agent.make_noise() is None and agent.run.step == 0:
         warnings.warn(
             f"{agent.name} trains without exploration noise: its policy is deterministic, so after the random steps of "
             f"learning_starts={agent.config.learning_starts} it explores nothing new; set action_noise=0.1 (--set "

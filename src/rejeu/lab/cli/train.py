@@ -17,6 +17,7 @@ from gymnasium import spaces
 from rejeu.agents import AGENTS, OffPolicyAgent, choose_algorithm, find_agent, find_preset, presets
 from rejeu.agents.presets import Preset
 from rejeu.algorithms import config as configs
+from rejeu.algorithms.catalog import OFFLINE
 from rejeu.checkpoints.run_folder import RunFolder, check_free, create
 from rejeu.core import devices, validation
 from rejeu.core.interrupt import Interrupt
@@ -67,9 +68,9 @@ def with_dataset(arguments: Train) -> Train:
     """
     if arguments.offline is None:
         return arguments
-    name = arguments.algorithm or ("IQL" if arguments.preset is None else None)
+    name = arguments.algorithm or (OFFLINE if arguments.preset is None else None)
     if name is not None and not issubclass(find_agent(name), OffPolicyAgent):
-        raise ValueError(f"--offline needs an algorithm with a replay buffer, such as IQL; {name} has none")
+        raise ValueError(f"--offline needs an algorithm with a replay buffer, such as {OFFLINE}; {name} has none")
     given = {"demonstrations": str(arguments.offline), "offline": True}
     return replace(arguments, algorithm=name, hyperparameters={**arguments.hyperparameters, **given}, offline=None)
 

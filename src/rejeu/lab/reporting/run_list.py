@@ -160,7 +160,7 @@ MONITOR = re.compile(r"(.*\.)?monitor\.csv")
 EVENTS = re.compile(r"events\.out\.tfevents\..+")
 FILES = (MONITOR, EVENTS)
 ZOO_NAME = re.compile(r"(.+-v\d+)_(\d+)")
-ALGORITHMS = {name.lower(): name for name in CATALOG} | {"her": "HER", "ppo_lstm": "RecurrentPPO"}
+ALGORITHMS = {key: one.name for one in CATALOG.values() for key in (one.name.lower(), one.zoo) if key} | {"her": "HER"}
 """Algorithms by the names of RL Zoo's folders."""
 MAX_FILES = 4096
 """Upper limit on the files of one run."""

@@ -1,0 +1,28 @@
+"""``scripts/structure.py`` finds names of algorithms that are written where the catalog should be read."""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+
+
+def structure():
+    """Returns the script as a module."""
+    spec = importlib.util.spec_from_file_location("structure", ROOT / "scripts" / "structure.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_name_of_an_algorithm_stands_in_its_room_alone():
+    tree = ast.parse('"""SAC and TD3."""\nname = "SAC"\nother = f"{name} SAC", "sac"\nnames = ("TQC", "HER")\n')
+    rooms = ("algorithms.sac", "agents.zip_files", "sb3.algorithms", "agents.agent", "lab.cli", "algorithms_too")
+    found = structure().algorithm_names(ROOT / "src", {f"rejeu.{room}": (ROOT, tree) for room in rooms})
+    assert found == [
+        f"rejeu.{room}:{place}"
+        for room in ("agents.agent", "lab.cli", "algorithms_too")
+        for place in ("2 SAC", "4 TQC")
+    ]
