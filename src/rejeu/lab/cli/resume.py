@@ -31,12 +31,13 @@ def run_resume(arguments: Resume) -> tuple[int, dict[str, Any]]:
     """Trains, as ``rejeu train``, ``rejeu sweep`` or ``rejeu tune`` does.
 
     Raises:
-        ValueError: for options of a sweep with the folder of a run.
+        ValueError: for options of a sweep with the folder of a run, or of a run with that of a sweep or a study.
     """
-    if is_sweep(arguments.run):
-        return sweep.resume(arguments)
-    if StudyFolder(arguments.run).plan.is_file():
-        return tune.resume_study(arguments)
+    holds_sweep = is_sweep(arguments.run)
+    if holds_sweep or StudyFolder(arguments.run).plan.is_file():
+        if arguments.steps is not None or arguments.minutes is not None:
+            raise ValueError(f"{arguments.run} holds runs that have a length; leave out --steps and --minutes")
+        return sweep.resume(arguments) if holds_sweep else tune.resume_study(arguments)
     if arguments.workers is not None:
         raise ValueError(f"{arguments.run} is a single run; --workers is for the folder of a sweep or a study")
     return resume(arguments)

@@ -24,7 +24,7 @@ from rejeu.lab.cli.environment import find_id
 from rejeu.lab.cli.output import Stopwatch, echo, header
 from rejeu.lab.cli.session import Session, installed_logs, make_evaluation_env
 from rejeu.lab.experiments.folder import Plan, SweepFolder, open_folder, read_folder
-from rejeu.lab.experiments.process import LocalLauncher, default_workers, hold, threads_of
+from rejeu.lab.experiments.process import default_workers, hold, threads_of
 from rejeu.lab.experiments.sweep import SweepResult, imports_of, make_launcher, prepare, states_text, train
 from rejeu.lab.experiments.work import Job, Work, again
 from rejeu.lab.reporting.comparison import By, Comparison, compare
@@ -44,18 +44,11 @@ def run_sweep(arguments: Sweep) -> tuple[int, dict[str, Any]]:
 
 
 def resume(arguments: Resume) -> tuple[int, dict[str, Any]]:
-    """Completes the sweep in a folder, failed runs included; returns the exit status and the result.
-
-    Raises:
-        ValueError: for options that only a single run has.
-    """
-    if arguments.steps is not None or arguments.minutes is not None:
-        raise ValueError(
-            f"{arguments.run} is a sweep, which trains to its goals; --steps and --minutes are for a single run"
-        )
+    """Completes the sweep in a folder, failed runs included; returns the exit status and the result."""
     given = {key: getattr(arguments, key) for key in ("env_kwargs", "wrappers", "imports")}
     typed = RunConfig(env=arguments.env or "", **given)
-    return complete(read_folder(arguments.run, typed), typed, arguments.workers, arguments.ray, retry=True)
+    folder = read_folder(arguments.run, typed)
+    return complete(folder, typed, arguments.workers, arguments.ray, retry=True)
 
 
 def complete(
@@ -63,7 +56,7 @@ def complete(
 ) -> tuple[int, dict[str, Any]]:
     """Trains what is missing in a folder, compares the runs, and returns the exit status and the result."""
     launcher = make_launcher(folder, workers, ray)
-    echo(f"sweep         {folder.path}, {len(folder.jobs)} runs, {launcher.capacity} at once")
+    echo(f"run folders   {folder.path}, {counted(len(folder.jobs), 'run')}, {launcher.capacity} at once")
     typed = dataclasses.replace(typed, imports=imports_of(folder, typed))
     with Interrupt() as stop:
         scheduler = train(folder, launcher, stop, typed.imports, retry)
@@ -109,12 +102,9 @@ def summarize(folder: Path, by: By | None = None) -> Comparison | None:
 def train_all(arguments: Train) -> tuple[int, dict[str, Any]]:
     """Trains all seeds and compares them; returns the exit status and the result."""
     jobs = make_jobs(arguments)
-    at_once = min(arguments.jobs or default_workers(), len(jobs))
-    folder = open_folder(choose_folder(arguments), Plan(jobs=jobs, threads=threads_of(at_once)), None, arguments)
-    echo(f"run folders   {folder.path}, {len(jobs)} seeds from {jobs[0].seed}, {at_once} at once")
-    with Interrupt() as stop:
-        scheduler = train(folder, LocalLauncher(at_once, folder.plan.threads), stop, imports_of(folder, arguments))
-    return finish(folder, scheduler.works, arguments, stop)
+    threads = threads_of(min(arguments.jobs or default_workers(), len(jobs)))
+    folder = open_folder(choose_folder(arguments), Plan(jobs=jobs, threads=threads), None, arguments)
+    return complete(folder, arguments, arguments.jobs, None, retry=False)
 
 
 def make_jobs(arguments: Train) -> tuple[Job, ...]:

@@ -58,13 +58,9 @@ def resume_study(arguments: Resume) -> tuple[int, dict[str, Any]]:
     """Continues the study of a folder; returns the exit status and the result.
 
     Raises:
-        ValueError: for ``--steps`` or ``--minutes``, or an environment that is not that of the study.
+        ValueError: for an environment that is not that of the study.
         CheckpointError: if the command line must name it again.
     """
-    if arguments.steps is not None or arguments.minutes is not None:
-        raise ValueError(
-            f"{arguments.run} is a study of rejeu tune, whose trials have a length; leave out --steps and --minutes"
-        )
     study = studies.open_study(StudyFolder(arguments.run))
     made = environment.from_run(study.plan.run, arguments.run, arguments)
     if made.env_id != study.plan.default.env_id:

@@ -120,7 +120,6 @@ class JobProgress(NamedTuple):
     """Progress of a run, from the ends of its tables."""
 
     step: int = 0
-    seconds: float = float("nan")
     mean_return: float = float("nan")
     best: float = float("nan")
     """Best mean return of an evaluation."""
@@ -247,15 +246,12 @@ class Work:
 
     def progress(self) -> JobProgress:
         """Returns how far its run is."""
-        metrics = read_table(self.path / METRICS, ("step", "time/time_elapsed", "rollout/ep_rew_mean"))
+        metrics = read_table(self.path / METRICS, ("step", "rollout/ep_rew_mean"))
         evaluations = read_table(self.path / EVALUATIONS, ("step", "mean_return"))
-        values = evaluations.column("mean_return")
         steps = [column[-1] for column in (metrics.column("step"), evaluations.column("step")) if len(column)]
-        steps = [one for one in steps if np.isfinite(one)]
-
-        def last(name: str) -> float:
-            column = metrics.column(name)
-            return float(column[-1]) if len(column) else float("nan")
-
-        best = float(np.nanmax(values)) if np.isfinite(values).any() else float("nan")
-        return JobProgress(int(max(steps, default=0)), last("time/time_elapsed"), last("rollout/ep_rew_mean"), best)
+        returns, values = metrics.column("rollout/ep_rew_mean"), evaluations.column("mean_return")
+        return JobProgress(
+            int(max((one for one in steps if np.isfinite(one)), default=0)),
+            float(returns[-1]) if len(returns) else float("nan"),
+            float(np.nanmax(values)) if np.isfinite(values).any() else float("nan"),
+        )
