@@ -11,9 +11,9 @@ import pytest
 
 import rejeu
 from rejeu.callbacks import Checkpoint
-from rejeu.envs import envpool
+from rejeu.envs import action_log
+from rejeu.envs.action_log import ActionLog
 from rejeu.envs.base import DivergedError
-from rejeu.envs.envpool import ActionLog
 from rejeu.envs.make import make_vector
 from tests.tiers import only
 
@@ -48,7 +48,7 @@ def fill(log, space, n_steps):
 
 @pytest.mark.parametrize("name", SPACES)
 def test_a_log_yields_the_operations_that_were_recorded(name, monkeypatch):
-    monkeypatch.setattr(envpool, "BLOCK", 100)  # so that there are several
+    monkeypatch.setattr(action_log, "BLOCK", 100)  # so that there are several
     space = SPACES[name]
     log = ActionLog(3, space)
     done = fill(log, space, 40)
@@ -70,8 +70,8 @@ def blocks(data):
     [
         blocks(b"no zlib"),
         blocks(zlib.compress(bytes([9]))),
-        blocks(zlib.compress(bytes([envpool.STEP, 0]))),
-        blocks(zlib.compress(bytes([envpool.STEP]) + np.int64(7).tobytes())),
+        blocks(zlib.compress(bytes([action_log.STEP, 0]))),
+        blocks(zlib.compress(bytes([action_log.STEP]) + np.int64(7).tobytes())),
         blocks(zlib.compress(bytes(2**24))),
         blocks(zlib.compress(bytes(100))[:-3]),
         {"n_operations": 1, "blocks": [3]},
@@ -166,7 +166,7 @@ def test_a_pool_that_does_not_repeat_its_episodes_begins_new_ones(tmp_path):
 def test_a_record_with_more_operations_than_it_says_is_refused_at_the_first_too_many():
     with closing(make_vector("CartPole-v1", 2, "envpool", seed=1)) as env:
         obs = env.reset().copy()
-        many = np.frombuffer(zlib.compress(bytes([envpool.RESET]) * envpool.BLOCK), np.uint8)
+        many = np.frombuffer(zlib.compress(bytes([action_log.RESET]) * action_log.BLOCK), np.uint8)
         saved = {**env.snapshot(), "blocks": [many]}
         with pytest.raises(ValueError, match="does not hold the 1 operations"):
             env.restore(saved, obs)

@@ -74,7 +74,7 @@ class Exponential:
 class TableSchedule:
     """Values at equal steps of the progress from 0 to 1, joined by straight lines: any function, as data.
 
-    >>> Table((1.0, 0.5, 0.0))(0.25)
+    >>> TableSchedule((1.0, 0.5, 0.0))(0.25)
     0.75
     """
 

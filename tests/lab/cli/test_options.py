@@ -20,7 +20,7 @@ from rejeu.agents.together import sibling
 from rejeu.checkpoints.run_folder import RunFolder
 from rejeu.core.interrupt import Interrupt
 from rejeu.lab import hub
-from rejeu.lab.cli import clone, courses, main, models, resume, runs, sweep, train, tune
+from rejeu.lab.cli import clone, compare, courses, main, models, resume, sweep, train, tune
 from rejeu.lab.cli.commands import Train
 from rejeu.lab.cli.environment import Environment
 from rejeu.lab.cli.session import Session, TrainingLimits
@@ -198,7 +198,7 @@ def test_sweep_and_its_resume(spy):
 
 
 def test_compare(spy, monkeypatch):
-    compared, opened = spy(runs, "compare", result := mock.Mock(**{"to_dict.return_value": {}})), []
+    compared, opened = spy(compare, "compare", result := mock.Mock(**{"to_dict.return_value": {}})), []
     monkeypatch.setattr("webbrowser.open", opened.append)
     result.save.return_value = [Path("page.html")]
     argv = ["compare", "a", "b", "--by", "env", "--x", "time", "--score", "evaluation", "--statistic", "median"]

@@ -9,7 +9,7 @@ import pytest
 
 from rejeu.lab.reporting import run_list
 from rejeu.lab.reporting.comparison import compare
-from rejeu.lab.reporting.run_list import read_monitor
+from rejeu.lab.reporting.other_programs import read_monitor
 
 RECORDED = Path(__file__).parents[2] / "golden" / "sb3_monitor"
 ZOO = RECORDED / "ppo" / "CartPole-v1_1"

@@ -515,7 +515,6 @@ COMMANDS = {kind.__name__.lower(): kind for kinds in TASKS.values() for kind in 
 """The arguments of each command, by its name."""
 MODULES = {
     "class": "courses",
-    "compare": "runs",
     "course": "courses",
     "evaluate": "models",
     "export": "models",
@@ -524,7 +523,6 @@ MODULES = {
     "pull": "models",
     "push": "models",
     "record": "models",
-    "report": "runs",
     "status": "runs",
     "watch": "models",
 }

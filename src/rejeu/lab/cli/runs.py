@@ -1,26 +1,16 @@
-"""``rejeu runs``, ``status``, ``compare`` and ``report``: lists of runs, how far one is, groups side by side, and pages."""
+"""``rejeu runs`` and ``status``: lists of runs, and how far one is."""
 
 from __future__ import annotations
 
 import math
-import time
-import webbrowser
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import closing
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from rejeu.checkpoints.run_folder import RunFolder, find_model
-from rejeu.core import atomic
-from rejeu.core.interrupt import leaving
 from rejeu.core.records import shown
-from rejeu.core.validation import whole
-from rejeu.lab.cli.commands import Compare, Report, Runs, Status
+from rejeu.lab.cli.commands import Runs, Status
 from rejeu.lab.reporting import run_list
-from rejeu.lab.reporting.comparison import Comparison, compare
-from rejeu.lab.reporting.report import make_server, write_report
 from rejeu.lab.reporting.runs import RunSummary, best_row
 from rejeu.logs import formatting
 from rejeu.logs.formatting import counted
@@ -161,65 +151,6 @@ def lines(facts: dict[str, Any]) -> list[str]:
     return [*found, *(f"note          {one}" for one in facts["notes"])]
 
 
-def run_compare(arguments: Compare) -> tuple[int, dict[str, Any]]:
-    """Compares runs, prints a table, and writes what was asked for."""
-    comparison = compare(
-        arguments.runs,
-        arguments.by,
-        x=arguments.x,
-        score=arguments.score,
-        statistic=arguments.statistic,
-        normalize=references(arguments.reference) or arguments.normalize,
-        threshold=arguments.threshold,
-    )
-    out = arguments.out or (Path("compare.html") if arguments.open else None)
-    written = [] if out is None else comparison.save(out)
-    if not arguments.json:
-        show_comparison(comparison)
-        for path in written:
-            print(path)
-    pages = [path for path in written if path.suffix == ".html"]
-    if arguments.open and pages:
-        webbrowser.open(pages[0].absolute().as_uri())
-    return 0, comparison.to_dict()
-
-
-def references(words: Iterable[str]) -> dict[str, tuple[float, float]]:
-    """Returns the reference returns of environments.
-
-    Raises:
-        ValueError: for a word that is not ENV=LOW,HIGH.
-
-    >>> references(["CartPole-v1=22,500"])
-    {'CartPole-v1': (22.0, 500.0)}
-    """
-    found = {}
-    for word in words:
-        env, _, values = word.rpartition("=")
-        try:
-            low, high = map(float, values.split(","))
-        except ValueError:
-            raise ValueError(f"--reference {word!r} must be ENV=LOW,HIGH, such as CartPole-v1=22,500") from None
-        found[env] = low, high
-    return found
-
-
-def show_comparison(comparison: Comparison) -> None:
-    """Prints the tables and the notes."""
-    from rich.console import Console
-    from rich.markup import escape
-
-    head, *rows = comparison.text_table()
-    show_table(head, rows, 2)
-    console = Console(highlight=False)
-    console.print(comparison.definition, soft_wrap=True)
-    for one in comparison.improvements:
-        better, other, env, text = map(escape, one.cells)
-        console.print(f"{better} scores higher than {other} on {env} with probability {text}", soft_wrap=True)
-    for note in comparison.notes:
-        console.print(f"note: {escape(note)}", soft_wrap=True)
-
-
 def show_table(head: Sequence[str], rows: Iterable[Sequence[str]], n_text: int) -> None:
     """Prints a table. A narrow terminal folds the first ``n_text`` columns, which are text; numbers are never folded."""
     from rich import box
@@ -236,68 +167,3 @@ def show_table(head: Sequence[str], rows: Iterable[Sequence[str]], n_text: int) 
     if not console.is_terminal:
         console = formatting.console(highlight=False, width=WIDE)
     console.print(table)
-
-
-SUFFIXES = (".html", ".htm")
-
-
-def run_report(arguments: Report) -> tuple[int, None]:
-    """Writes the page, or serves it until Ctrl-C.
-
-    Raises:
-        ValueError: for ``--out`` or ``--replay`` with ``--live``, or for a file that is no page.
-    """
-    if arguments.live:
-        if arguments.out is not None:
-            raise ValueError("--live serves the page and writes no file; leave out --out, or --live")
-        if arguments.replay is not None:
-            raise ValueError("--replay plays the trained agent; leave out --replay, or --live")
-        follow(arguments)
-        return 0, None
-    if arguments.out is not None and arguments.out.suffix.lower() not in SUFFIXES:
-        raise ValueError(f"--out {arguments.out} must end in {' or '.join(SUFFIXES)}")
-    for path in arguments.runs if arguments.replay is not None else ():
-        replay(path, arguments)
-    path = write_report(arguments.runs, arguments.out)
-    print(path, flush=True)
-    if arguments.open:
-        webbrowser.open(path.absolute().as_uri())
-    return 0, None
-
-
-def replay(path: Path, arguments: Report) -> None:
-    """Lets the best model of a run play episodes from the seeds 0, 1, 2 ..., and writes them to its folder.
-
-    Each is what ``rejeu watch`` and ``rejeu record`` show with ``--seed`` and ``--episodes 1``.
-
-    Raises:
-        FileNotFoundError: if the folder holds no model.
-        ValueError: if the environment cannot be made.
-    """
-    from rejeu.agents import load  # JAX takes longer than all that rejeu status needs
-    from rejeu.lab.cli.environment import environment_of
-
-    assert arguments.replay is not None
-    model = find_model(path)
-    agent = load(model)
-    rows = ["seed,return,length,success"]
-    with closing(environment_of(model, arguments).make()) as env:
-        for seed in range(whole("--replay", arguments.replay, least=1)):
-            played = agent.evaluate(1, env=env, seed=seed)
-            rows.append(f"{seed},{played.mean_return},{played.mean_length:.0f},{played.success_rate}")
-    atomic.write(RunFolder(path).replays, "\n".join(rows) + "\n")
-
-
-def follow(arguments: Report) -> None:
-    """Serves the page until Ctrl-C or SIGTERM ends the process; waits for the folders of runs that are about to begin."""
-    awaited = [path for path in arguments.runs if not path.exists()]
-    for path in awaited:
-        print(f"there is no run folder {path} yet; waiting for it (Ctrl-C ends it)", flush=True)
-    while not all(RunFolder(path).config.is_file() for path in awaited):
-        time.sleep(0.5)
-    server, address = make_server(arguments.runs)
-    print(f"{address} (Ctrl-C ends it)", flush=True)
-    if arguments.open:
-        webbrowser.open(address)
-    with server, leaving("the page is no longer served"):
-        server.serve_forever()

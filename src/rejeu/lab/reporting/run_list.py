@@ -1,37 +1,18 @@
-"""Finding and reading runs: of rejeu, Stable-Baselines3's ``monitor.csv``, TensorBoard files and folders of RL Zoo.
-
-YAML files of RL Zoo (``config.yml``, ``args.yml``) are not read, because they may name code; algorithm and environment are
-taken from the names of the folders, as RL Zoo gives them: ``ALGORITHM/ENV_NUMBER``.
-"""
+"""Finding and reading runs, of rejeu and of :mod:`other programs <rejeu.lab.reporting.other_programs>`."""
 
 from __future__ import annotations
 
-import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from rejeu.algorithms.catalog import CATALOG
 from rejeu.core.errors import MissingExtra
-from rejeu.core.records import Malformed, parse_json, shown
-from rejeu.lab.reporting.runs import (
-    CONFIG,
-    EPISODES,
-    MAX_NAME,
-    MAX_STEP,
-    METRICS,
-    RunSummary,
-    is_file,
-    ordered,
-    read_run,
-)
-from rejeu.logs.formatting import counted
-from rejeu.logs.tables import EMPTY, MAX_COLUMNS, Episodes, Table, read_bytes, read_table
+from rejeu.core.records import shown
+from rejeu.lab.reporting.other_programs import EVENTS, FILES, MONITOR, files, read_monitor, read_tensorboard
+from rejeu.lab.reporting.runs import CONFIG, EPISODES, MAX_NAME, METRICS, RunSummary, is_file, read_run
 
 MAX_DEPTH = 4
 """Levels of folders that are searched for runs."""
@@ -154,185 +135,3 @@ def is_run(folder: Path) -> bool:
         return is_ours(folder) or any(files(folder, kind) for kind in FILES)
     except OSError:
         return False
-
-
-MONITOR = re.compile(r"(.*\.)?monitor\.csv")
-EVENTS = re.compile(r"events\.out\.tfevents\..+")
-FILES = (MONITOR, EVENTS)
-ZOO_NAME = re.compile(r"(.+-v\d+)_(\d+)")
-ALGORITHMS = {key: one.name for one in CATALOG.values() for key in (one.name.lower(), one.zoo) if key} | {"her": "HER"}
-"""Algorithms by the names of RL Zoo's folders."""
-MAX_FILES = 4096
-"""Upper limit on the files of one run."""
-MAX_EVENT_BYTES = 2**28
-RECORD_FRAME = 16
-"""Bytes of a record's length and checksums."""
-MAX_EVENTS = 10_000
-"""Points that are kept of each curve in TensorBoard files, up to twice as many; of longer ones every second is dropped."""
-
-
-def files(folder: Path, pattern: re.Pattern[str]) -> list[Path]:
-    """Returns the files in a folder whose names match ``MONITOR``, one for each environment, or ``EVENTS``."""
-    return sorted(path for path in folder.iterdir() if pattern.fullmatch(path.name) and is_file(path))[:MAX_FILES]
-
-
-def read_monitor(path: Path) -> RunSummary:
-    """Returns the run of a ``monitor.csv``, or of all such files in a folder as the environments of one run.
-
-    Raises:
-        ValueError: if no file holds the columns r, l and t.
-    """
-    notes: list[str] = []
-    parts, starts, env_id = [], [], ""
-    for file in files(path, MONITOR) if path.is_dir() else [path]:
-        start, said_env = monitor_header(file)
-        table = read_table(file, only=("r", "l", "t", "is_success"), skip_lines=1)
-        notes += table.notes
-        if {"r", "l", "t"} <= table.columns.keys():
-            parts.append(table)
-            starts.append(start)
-            env_id = env_id or said_env
-    if not parts:
-        raise ValueError(f"{shown(path, 300)} is no monitor.csv of Stable-Baselines3: expected the columns r, l and t")
-    env = np.repeat(np.arange(float(len(parts))), [len(one) for one in parts])
-    began = np.repeat(np.array(starts) - min(starts), [len(one) for one in parts])
-    names = ("r", "l", "is_success", "t")
-    returns, length, success, time = (np.concatenate([one.column(name) for one in parts]) for name in names)
-    seconds = time + began
-    valid = (length >= 0) & (length <= MAX_STEP)
-    if not valid.all():
-        n_bad = int(np.sum(~valid))
-        notes.append(
-            f"{counted(n_bad, 'damaged row')} without a valid length {'was' if n_bad == 1 else 'were'} left out"
-        )
-    order = np.argsort(seconds, kind="stable")
-    order = order[valid[order]]
-    steps = np.cumsum(length[order])
-    columns = {"env": env, "return": returns, "length": length, "success": success, "seconds": seconds}
-    table = ordered(Table({"step": steps, **{name: one[order] for name, one in columns.items()}}, tuple(notes)))
-    episodes = Episodes.of(table)
-    folder = path if path.is_dir() else path.parent
-    said = named(folder)
-    return RunSummary(
-        path=path.resolve(),
-        name=shown(folder.name, MAX_NAME),
-        format="monitor",
-        algorithm=said[0],
-        env_id=env_id or said[1],
-        seed=said[2],
-        n_envs=len(parts),
-        steps=int(steps[-1]) if len(steps) else 0,
-        seconds=float(episodes.seconds[-1]) if len(episodes) else float("nan"),
-        episodes=episodes,
-        notes=table.notes,
-    )
-
-
-def monitor_header(path: Path) -> tuple[float, str]:
-    """Returns start time and environment from the first line of a ``monitor.csv``: ``#{"t_start": ..., "env_id": ...}``."""
-    try:
-        line = read_bytes(path, 4096).split(b"\n")[0]
-        content = parse_json(line.removeprefix(b"#"))
-    except (OSError, Malformed):
-        return 0.0, ""
-    if not isinstance(content, Mapping):
-        return 0.0, ""
-    start, env = content.get("t_start"), content.get("env_id")
-    began = float(start) if isinstance(start, int | float) and abs(start) < 1e12 else 0.0
-    return began, shown(env, MAX_NAME) if isinstance(env, str) else ""
-
-
-def named(folder: Path) -> tuple[str, str, int | None]:
-    """Returns algorithm, environment and number of a run from the names of RL Zoo's folders; empty where they do not say.
-
-    >>> named(Path("logs/ppo/CartPole-v1_2"))
-    ('PPO', 'CartPole-v1', 2)
-    """
-    algorithm = ALGORITHMS.get(folder.parent.name.lower(), "")
-    found = ZOO_NAME.fullmatch(folder.name)
-    if found is None:  # as Stable-Baselines3 names its TensorBoard folders
-        kind = re.fullmatch(r"([A-Za-z0-9]+)_(\d{1,9})", folder.name)
-        if kind is not None and kind[1].lower() in ALGORITHMS:
-            return ALGORITHMS[kind[1].lower()], "", int(kind[2])
-        return algorithm, "", None
-    return algorithm, shown(found[1], MAX_NAME), int(found[2][:9])
-
-
-def read_tensorboard(folder: Path) -> RunSummary:
-    """Returns the run of a folder with TensorBoard files: its scalars are the metrics.
-
-    Raises:
-        MissingExtra: if tensorboard is not installed.
-    """
-    try:
-        import tensorboard.backend.event_processing.event_file_loader  # noqa: F401 - where it is used it may not fail
-    except ImportError:
-        raise MissingExtra("reading TensorBoard files", "tensorboard", "tensorboard") from None
-    notes = []
-    values: dict[str, dict[int, tuple[float, float]]] = {}
-    for file in files(folder, EVENTS):
-        if file.stat().st_size > MAX_EVENT_BYTES:
-            notes.append(f"{file.name} has more than {MAX_EVENT_BYTES >> 20} MiB and was left out")
-            continue
-        try:
-            read = sum(RECORD_FRAME + len(record) for record in take_scalars(file, values))
-        except Exception as error:  # of protobuf or of TensorBoard, for damaged records
-            notes.append(f"{file.name} is damaged: {shown(error)}")
-        else:
-            if read < file.stat().st_size:  # the reader ends at a damaged record without an error
-                notes.append(f"{file.name} is damaged or incomplete after {read:,} bytes, and was read up to there")
-    metrics = ordered(table_of(values)) if values else EMPTY
-    algorithm, env_id, number = named(folder)
-    seconds = metrics.column("time/time_elapsed")
-    return RunSummary(
-        path=folder.resolve(),
-        name=shown(folder.name, MAX_NAME),
-        format="tensorboard",
-        algorithm=algorithm,
-        env_id=env_id,
-        seed=number,
-        steps=int(metrics.columns["step"][-1]) if len(metrics) else 0,
-        seconds=float(seconds[-1]) if len(seconds) else float("nan"),
-        metrics=metrics,
-        notes=(*notes, *metrics.notes),
-    )
-
-
-def take_scalars(file: Path, values: dict[str, dict[int, tuple[float, float]]]) -> Iterator[bytes]:
-    """Yields the records of a TensorBoard file, and adds their scalars to the columns in ``values``."""
-    from tensorboard.backend.event_processing.event_file_loader import RawEventFileLoader
-    from tensorboard.compat.proto.event_pb2 import Event
-    from tensorboard.util.tensor_util import make_ndarray
-
-    for record in RawEventFileLoader(str(file)).Load():
-        yield record
-        event = Event.FromString(record)
-        for one in event.summary.value:
-            if one.HasField("simple_value"):
-                value = one.simple_value
-            elif one.metadata.plugin_data.plugin_name == "scalars" and not one.tensor.tensor_shape.dim:
-                value = float(make_ndarray(one.tensor).item())
-            else:
-                continue
-            name = shown(one.tag, MAX_NAME)
-            if name not in values and len(values) == MAX_COLUMNS:
-                continue
-            column = values.setdefault(name, {})
-            column[event.step] = value, event.wall_time
-            if len(column) > 2 * MAX_EVENTS:
-                values[name] = dict([*column.items()][::2])
-
-
-def table_of(values: Mapping[str, Mapping[int, tuple[float, float]]]) -> Table:
-    """Returns scalars as one table by step, with the wall time since the first of them."""
-    steps = sorted({step for column in values.values() for step in column})
-    row = {step: i for i, step in enumerate(steps)}
-    columns: dict[str, Any] = {"step": np.array(steps, np.float64)}
-    wall = np.full(len(steps), np.nan)
-    for name, column in values.items():
-        columns[name] = np.full(len(steps), np.nan)
-        for step, (value, time) in column.items():
-            columns[name][row[step]] = value
-            wall[row[step]] = time
-    columns.setdefault("time/time_elapsed", wall - np.nanmin(wall))
-    return Table(columns)

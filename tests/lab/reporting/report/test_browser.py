@@ -6,7 +6,8 @@ import time
 import pytest
 
 from rejeu.lab.reporting.comparison import compare
-from rejeu.lab.reporting.report import make_server, write_report
+from rejeu.lab.reporting.report import write_report
+from rejeu.lab.reporting.report.live import make_server
 from tests.lab.reporting.report.folders import write, write_hostile
 from tests.lab.reporting.test_comparison import write_run
 from tests.tiers import crossed, exhaustive

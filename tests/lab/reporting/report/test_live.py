@@ -9,9 +9,10 @@ import time
 
 import pytest
 
-from rejeu.lab.cli import runs
+from rejeu.lab.cli import report
 from rejeu.lab.cli.commands import Report
-from rejeu.lab.reporting.report import make_server, page
+from rejeu.lab.reporting.report import page
+from rejeu.lab.reporting.report.live import make_server
 from tests.lab.reporting.report.folders import write
 
 
@@ -90,14 +91,14 @@ def test_other_host_names_are_refused(server, host):
 
 
 def test_a_run_that_is_about_to_begin_is_waited_for(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(runs.time, "sleep", lambda seconds: write(tmp_path / "run"))
+    monkeypatch.setattr(report.time, "sleep", lambda seconds: write(tmp_path / "run"))
 
     def stop(self):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("socketserver.BaseServer.serve_forever", stop)
     with pytest.raises(KeyboardInterrupt):
-        runs.follow(Report(runs=(tmp_path / "run",), live=True))
+        report.follow(Report(runs=(tmp_path / "run",), live=True))
     waiting, address = capsys.readouterr().out.splitlines()
     assert "run yet; waiting for it" in waiting
     assert address.startswith("http://127.0.0.1")
