@@ -197,16 +197,14 @@ def read_run(env_id: str, kwargs: Kwargs, given: Kwargs) -> tuple[RunConfig, dic
     Raises:
         ValueError, TypeError: for an invalid value.
     """
-    values = {OF_RUNS.get(key, key): one for key, one in given.items()}
-    whole: Kwargs = {
-        key: int(one) if isinstance(one, float) and one.is_integer() else one for key, one in values.items()
+    values: Kwargs = {
+        OF_RUNS.get(key, key): int(one) if isinstance(one, float) and one.is_integer() else one
+        for key, one in given.items()
     }
-    if isinstance(whole.get("log"), str | tuple | list):
-        whole["log"] = check_logs("log", whole["log"])
-    files = convert({key: one for key, one in whole.items() if key in FILES}, dict[str, bool])
-    run = convert(
-        {"env": env_id, "env_kwargs": kwargs, **{key: whole[key] for key in whole.keys() - {*FILES}}}, RunConfig
-    )
+    if isinstance(values.get("log"), str | tuple | list):
+        values["log"] = check_logs("log", values["log"])
+    files = convert({key: values.pop(key) for key in FILES if key in values}, dict[str, bool])
+    run = convert({"env": env_id, "env_kwargs": kwargs, **values}, RunConfig)
     choice("backend", run.backend or "auto", BACKENDS)
     choice("device", run.device, devices.NAMES)
     if isinstance(run.preset, bool):
