@@ -41,21 +41,6 @@ PACKAGES = ("jax", "jaxlib", "optax")
 """Further packages whose versions results depend on."""
 
 
-class Marker(NamedTuple):
-    """A file by which a node sees whether it shares a folder."""
-
-    path: str
-    token: str
-    """Content of the file."""
-
-    def is_seen(self) -> bool:
-        """Returns whether this machine sees the file."""
-        try:
-            return Path(self.path).read_text(encoding="utf-8") == self.token
-        except (OSError, UnicodeDecodeError):
-            return False
-
-
 class Spec(NamedTuple):
     """A run as a node trains it. Paths are strings, which are the same on all machines."""
 
@@ -65,7 +50,8 @@ class Spec(NamedTuple):
     lock: str
     stop: str
     """File that asks the run to stop."""
-    marker: Marker
+    marker: str
+    """File that a node sees if it shares the folder of the sweep; no other file has its name."""
     folder: str
     """Current folder."""
     environ: dict[str, str]
@@ -74,9 +60,9 @@ class Spec(NamedTuple):
     """Versions that the node must have."""
 
 
-def look(marker: Marker) -> tuple[dict[str, str], bool]:
+def look(marker: str) -> tuple[dict[str, str], bool]:
     """Returns the versions of this node, and whether it sees the folder of the sweep."""
-    return cluster.versions(PACKAGES), marker.is_seen()
+    return cluster.versions(PACKAGES), Path(marker).is_file()
 
 
 def train(spec: Spec) -> int:
@@ -88,8 +74,7 @@ def train(spec: Spec) -> int:
         ClusterError: if this node has other versions, or does not see the folder of the sweep.
     """
     where = f"the node {platform.node()}"
-    cluster.check_versions(cluster.versions(PACKAGES), where, spec.versions)
-    check_shared(spec.marker.is_seen(), where, spec.marker)
+    check_node(*look(spec.marker), where, spec.versions, spec.marker)
     folder, stop = Path(spec.folder), Path(spec.stop)
     environ = {**os.environ, **spec.environ}
     process = Process(Path(spec.task), Path(spec.log), Path(spec.lock), environ, folder if folder.is_dir() else None)
@@ -107,11 +92,12 @@ def train(spec: Spec) -> int:
         process.stop()
 
 
-def check_shared(is_seen: bool, where: str, marker: Marker) -> None:
-    """Raises ``ClusterError`` if a machine, called ``where``, does not see the folder of the sweep."""
+def check_node(there: dict[str, str], is_seen: bool, where: str, versions: dict[str, str], marker: str) -> None:
+    """Raises ``ClusterError`` if a machine, called ``where``, has other versions or does not see the folder of the sweep."""
+    cluster.check_versions(there, where, versions)
     if not is_seen:
         raise ClusterError(
-            f"{where} does not see {Path(marker.path).parents[1]}, the folder of the sweep; name one with --out that all "
+            f"{where} does not see {Path(marker).parents[1]}, the folder of the sweep; name one with --out that all "
             "machines share under the same path"
         )
 
@@ -227,7 +213,7 @@ class RayLauncher:
             while any(one.poll() is None for one in self._handles) and time.monotonic() < until:
                 time.sleep(0.2)
         with suppress(OSError):
-            Path(self._marker.path).unlink()
+            Path(self._marker).unlink()
         self._connection.close()
 
     def _check_nodes(self) -> None:
@@ -264,16 +250,14 @@ class RayLauncher:
                 raise ClusterError(
                     f"{where} cannot run rejeu: {cluster.one_line(cause)}; install the same packages on all machines"
                 ) from None
-            cluster.check_versions(there, where, self._versions)
-            check_shared(is_seen, where, self._marker)
+            check_node(there, is_seen, where, self._versions, self._marker)
 
 
-def write_marker(folder: Path) -> Marker:
-    """Writes a marker to a folder."""
-    token = secrets.token_hex(16)
-    path = folder / f"marker-{token[:8]}"
-    path.write_text(token, encoding="utf-8")
-    return Marker(str(path), token)
+def write_marker(folder: Path) -> str:
+    """Writes an empty file with a name of its own to a folder, and returns its path."""
+    path = folder / f"marker-{secrets.token_hex(16)}"
+    path.touch()
+    return str(path)
 
 
 def requested(resources: Resources) -> dict[str, Any]:
