@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pkgutil
 import re
 import subprocess
 import sys
@@ -58,9 +59,21 @@ def test_the_first_page_names_five_pages_to_read_first():
     assert all((ROOT / "docs" / f"{name}.md").exists() for name in first)
 
 
-def test_the_reference_has_every_public_name():
+def documented_names():
+    """Returns the names in the API reference."""
     pages = [page.read_text(encoding="utf-8") for page in (ROOT / "docs" / "api").glob("*.rst")]
-    documented = set(re.findall(r"^\.\. auto\w+:: (rejeu\.[\w.]+)", "\n".join(pages), re.MULTILINE))
+    found = re.findall(r"^\.\. auto\w+:: (rejeu\.[\w.]+)(?:\n   :members: (.+))?", "\n".join(pages), re.MULTILINE)
+    members = {f"{name}.{member}" for name, listed in found if listed for member in listed.split(", ")}
+    return {name for name, _ in found} | members
+
+
+def test_the_reference_names_what_exists():
+    for name in documented_names():
+        pkgutil.resolve_name(name)
+
+
+def test_the_reference_has_every_public_name():
+    documented = documented_names()
     own = [f"sb3.{name}" for name in sb3.__all__ if name not in rejeu.__all__]
     names = {f"rejeu.{name}" for name in [*rejeu.__all__, *own]} - {"rejeu.AGENTS", "rejeu.plots"}
     assert names - documented == set()

@@ -148,7 +148,7 @@ def test_everything_of_a_rollout_buffer_works_on_agents(nested):
 
 def test_buffers_cannot_be_made_by_hand_or_set_to_something_else():
     space = gym.spaces.Box(-1, 1, (1,))
-    with pytest.raises(TypeError, match=r"rejeu.replay.ReplayMemory"):
+    with pytest.raises(TypeError, match=r"rejeu.replay.replay_memory.ReplayMemory"):
         buffers.ReplayBuffer(10, space, space)
     model = made(buffers.ReplayBuffer)
     with pytest.raises(TypeError, match="must be the replay buffer of an agent"):

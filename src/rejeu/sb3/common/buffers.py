@@ -1,7 +1,7 @@
 """Buffers with Stable-Baselines3's attributes and methods: what ``model.replay_buffer`` and ``model.rollout_buffer`` return.
 
 They show the buffers of :mod:`rejeu.replay` from which an agent learns, and only agents make them. Their arrays are copies
-that cannot be written to. To store and draw transitions yourself use :class:`rejeu.replay.ReplayMemory`.
+that cannot be written to. To store and draw transitions yourself use :class:`rejeu.replay.replay_memory.ReplayMemory`.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class BaseBuffer:
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         raise TypeError(
             f"{type(self).__name__} shows the buffer of an agent, as model.replay_buffer or model.rollout_buffer, and cannot "
-            "be made by hand; use rejeu.replay.ReplayMemory to store transitions yourself"
+            "be made by hand; use rejeu.replay.replay_memory.ReplayMemory to store transitions yourself"
         )
 
     @classmethod
