@@ -107,7 +107,7 @@ def facts(agent):
         **agent.get_parameters(),
         **{f"buffer.{key}": value for key, value in buffer.items()},
         "history": history,
-        "counters": np.array([agent.num_timesteps, agent.n_updates]),
+        "counters": np.array([agent.num_timesteps, agent.n_updates, agent.n_predictions]),
         "best": np.array([] if agent.best is None else [agent.best.step]),
         "window": np.array([e["r"] for e in agent.ep_info_buffer]),
     }
@@ -180,6 +180,7 @@ def test_hindsight_goes_on_exactly_where_the_environment_offers_its_state(tmp_pa
 
 def cut_run(folder, steps=60, cut=30, env=BALL, callbacks=(), **settings):
     agent = small_sac(env, **settings)
+    agent.predict(agent.observation_space.sample(), deterministic=False)  # the next one draws something else, then too
     return agent.learn(steps, [*callbacks, Checkpoint(folder, every=10), lambda agent, turn: turn.step < cut])
 
 

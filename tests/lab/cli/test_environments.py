@@ -320,6 +320,8 @@ def test_check_finds_all_errors_and_train_refuses_with_the_same_lines(arguments,
 
 
 def test_the_check_before_training_draws_no_random_numbers_of_others(here):
+    drawing = SOURCE.replace("self.x = 0.0", "self.x = 0.0 * np.random.random()")
+    (here / "drift_env.py").write_text(drawing, encoding="utf-8")
     made = environment.from_arguments("drift_env.py", Train(env="drift_env.py"))
     random.seed(1)
     np.random.seed(1)  # noqa: NPY002

@@ -39,6 +39,14 @@ def test_single_monitor_file():
     np.testing.assert_array_equal(run.episodes.seconds, [row["t"] for row in expected])
 
 
+def test_the_clocks_of_several_files_begin_with_the_first(tmp_path):
+    for i, (start, row) in enumerate([(100.0, "1,5,30"), (120.0, "2,5,15")]):
+        head = f'#{{"t_start": {start}, "env_id": "CartPole-v1"}}'
+        (tmp_path / f"{i}.monitor.csv").write_text(f"{head}\nr,l,t\n{row}\n", encoding="utf-8")
+    episodes = read_monitor(tmp_path).episodes
+    assert (episodes.seconds.tolist(), episodes.returns.tolist()) == ([30, 35], [1, 2])
+
+
 def test_hostile_monitor_file(tmp_path):
     path = tmp_path / "monitor.csv"
     path.write_bytes(b'#{"t_start": "now", "env_id": ["<b>"]}\nr,l,t\n1e999,5,1\nx,-3,nan\n2,1e300,3\n3,4,4\n5,')
