@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 from msgspec import Meta
 
 from rejeu.core.records import MAX_ENVS, Duration, Positive, Seed
-from rejeu.lab.runs.config import MAX_EPISODES, EnvironmentOptions, OptionGroup, RunConfig, Shown, Task
+from rejeu.lab.runs.config import MAX_EPISODES, EnvironmentOptions, RunConfig, Shown, Task, Topic
 
 WHICH = "Of a folder: the model that evaluated best in training, or the last."
 EPISODES = "Episodes of each evaluation; by default the preset's, else 20."
@@ -28,7 +28,7 @@ RunPath = Annotated[Path, Shown("RUN", is_positional=True, help="Its folder.")]
 Count = Annotated[Positive | None, Shown("N")]
 EnvCount = Annotated[Annotated[int, Meta(ge=1, le=MAX_ENVS)] | None, Shown("N")]
 EpisodeCount = Annotated[
-    Annotated[int, Meta(ge=1, le=MAX_EPISODES)] | None, Shown("N", help=EPISODES), OptionGroup.EVALUATION
+    Annotated[int, Meta(ge=1, le=MAX_EPISODES)] | None, Shown("N", help=EPISODES), Topic.EVALUATION
 ]
 Several = Annotated[Annotated[int, Meta(ge=1, le=1000)] | None, Shown("N")]
 SeedOrNone = Annotated[Seed | None, Shown("N")]
@@ -40,19 +40,19 @@ Return = Annotated[float | None, Shown("RETURN")]
 Folder = Annotated[Path | None, Shown("DIR")]
 Imports = Annotated[tuple[str, ...], Shown("MODULE", "import")]
 Assignments = tuple[str, ...]
-NoReport = Annotated[bool, Shown(help="Write no report.html and draw no curve.png at the end."), OptionGroup.OUTPUT]
-NoVideo = Annotated[bool, Shown(help="Record no video at the end."), OptionGroup.OUTPUT]
+NoReport = Annotated[bool, Shown(help="Write no report.html and draw no curve.png at the end."), Topic.OUTPUT]
+NoVideo = Annotated[bool, Shown(help="Record no video at the end."), Topic.OUTPUT]
 Json = Annotated[
-    bool, Shown(help="Print the result as one JSON document, and messages to standard error."), OptionGroup.OUTPUT
+    bool, Shown(help="Print the result as one JSON document, and messages to standard error."), Topic.OUTPUT
 ]
-PrintJson = Annotated[bool, Shown(help="Print the result as JSON."), OptionGroup.OUTPUT]
+PrintJson = Annotated[bool, Shown(help="Print the result as JSON."), Topic.OUTPUT]
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunOptions(EnvironmentOptions):
     """The same where a run names the environment. Abstract."""
 
-    env: Annotated[str | None, Shown("ENV"), OptionGroup.ENVIRONMENT] = None
+    env: Annotated[str | None, Shown("ENV"), Topic.ENVIRONMENT] = None
     """Environment, as for rejeu train; by default the run's. One that is imported must be named again."""
 
 
@@ -63,19 +63,19 @@ class Train(RunConfig):
     Ctrl-C stops cleanly; rejeu resume continues. Example: rejeu train Pendulum-v1 --steps 20000 --set learning_rate=1e-3
     """
 
-    assist: Annotated[bool, OptionGroup.TRAINING] = False
+    assist: Annotated[bool, Topic.TRAINING] = False
     """Open a window on the environment, in which you act in place of the agent while you hold a key. Your steps are also
     written to a Minari dataset, the folder assisted of the run."""
-    fps: Annotated[Rate, OptionGroup.TRAINING] = None
-    offline: Annotated[Path | None, Shown("DATASET"), OptionGroup.TRAINING] = None
+    fps: Annotated[Rate, Topic.TRAINING] = None
+    offline: Annotated[Path | None, Shown("DATASET"), Topic.TRAINING] = None
     """Learn from the Minari dataset in this folder, without stepping the environment, which only evaluates: each step is a
     gradient step. By default with IQL."""
-    pause: Annotated[Count, OptionGroup.TRAINING] = None
+    pause: Annotated[Count, Topic.TRAINING] = None
     """Pause after so many environment steps; rejeu resume continues to the goal."""
-    seeds: Annotated[Several, OptionGroup.TRAINING] = None
+    seeds: Annotated[Several, Topic.TRAINING] = None
     """Train this many seeds, from --seed or 0 on, each in a folder of its own, and compare them in the end. In JAX
     environments one program trains all of them; elsewhere, and with --jobs, each has a process of its own."""
-    jobs: Annotated[Several, OptionGroup.TRAINING] = None
+    jobs: Annotated[Several, Topic.TRAINING] = None
     """With --seeds: how many are trained at once; by default half as many as there are cores."""
     out: Folder = None
     """Run folder, new or empty; by default one under runs, named after the run and the time."""
@@ -94,7 +94,7 @@ class Clone(RunOptions):
 
     dataset: Annotated[Path, Shown("DATASET", is_positional=True)]
     """Folder of a Minari dataset, such as rejeu play --record writes."""
-    env: Annotated[str | None, Shown("ENV"), OptionGroup.ENVIRONMENT] = None
+    env: Annotated[str | None, Shown("ENV"), Topic.ENVIRONMENT] = None
     """Environment, as for rejeu train; by default the dataset's. One that is imported must be named."""
     algo: Algorithm = None
     hyperparameters: Annotated[dict[str, Any], Shown("NAME=VALUE ...", "set")] = field(default_factory=dict)
@@ -103,20 +103,20 @@ class Clone(RunOptions):
     """Gradient steps; with --expert, in each round."""
     learning_rate: Annotated[Annotated[float, Meta(gt=0)], Shown("RATE")] = 1e-3
     """Step size of these gradient steps."""
-    critic_updates: Annotated[int, Meta(ge=0), Shown("N"), OptionGroup.TRAINING] = 0
+    critic_updates: Annotated[int, Meta(ge=0), Shown("N"), Topic.TRAINING] = 0
     """Then gradient steps of the critics alone on the dataset: before rejeu resume trains SAC, TD3 or a relative of them."""
-    expert: Annotated[Path | None, Shown("RUN"), OptionGroup.TRAINING] = None
+    expert: Annotated[Path | None, Shown("RUN"), Topic.TRAINING] = None
     """Folder of a run, or a model file, of the agent that labels what the clone does."""
-    by_hand: Annotated[bool, OptionGroup.TRAINING] = False
+    by_hand: Annotated[bool, Topic.TRAINING] = False
     """Be the expert: open a window in which you take over from the clone while you hold a key."""
-    fps: Annotated[Rate, OptionGroup.TRAINING] = None
-    rounds: Annotated[Positive, Shown("N"), OptionGroup.TRAINING] = 5
+    fps: Annotated[Rate, Topic.TRAINING] = None
+    rounds: Annotated[Positive, Shown("N"), Topic.TRAINING] = 5
     """With an expert: how often the clone acts and is trained again."""
-    round_steps: Annotated[Positive, Shown("N"), OptionGroup.TRAINING] = 1000
+    round_steps: Annotated[Positive, Shown("N"), Topic.TRAINING] = 1000
     """With an expert: environment steps of each round; the last episode is completed."""
-    which: Annotated[Which, OptionGroup.TRAINING] = "best"
+    which: Annotated[Which, Topic.TRAINING] = "best"
     evaluate_episodes: EpisodeCount = None
-    device: Annotated[str, Shown("NAME"), OptionGroup.TRAINING] = "auto"
+    device: Annotated[str, Shown("NAME"), Topic.TRAINING] = "auto"
     """As for rejeu train."""
     seed: SeedOrNone = None
     """Seeds everything; by default a random one."""
@@ -159,7 +159,7 @@ class Resume(RunOptions):
     """Of a complete run whose process ended before all files were written: write them, rather than report an error."""
     workers: Several = None
     """Of a sweep or a study: runs at once; by default half as many as there are cores."""
-    ray: Annotated[str | None, Shown("ADDRESS"), OptionGroup.ENVIRONMENT] = None
+    ray: Annotated[str | None, Shown("ADDRESS"), Topic.ENVIRONMENT] = None
     """Of a sweep, or of a run with --backend ray: use this Ray cluster, auto or HOST:PORT."""
     steps: Count = None
     """Pause after so many environment steps; the goal stays. Of a complete run, or beyond the goal: train for so many more."""
@@ -167,11 +167,11 @@ class Resume(RunOptions):
     """Pause after so many minutes; the goal stays. Of a complete run: train for so many more."""
     hyperparameters: Annotated[dict[str, Any], Shown("NAME=VALUE ...", "set")] = field(default_factory=dict)
     """Hyperparameters to change from here on, as for rejeu train; those that change shapes cannot be changed."""
-    device: Annotated[str | None, Shown("NAME"), OptionGroup.TRAINING] = None
+    device: Annotated[str | None, Shown("NAME"), Topic.TRAINING] = None
     """As for rejeu train; by default cpu if the run was trained there on request, else auto."""
-    restart_workers: Annotated[int, Meta(ge=0), Shown("N"), OptionGroup.ENVIRONMENT] = 0
+    restart_workers: Annotated[int, Meta(ge=0), Shown("N"), Topic.ENVIRONMENT] = 0
     """As for rejeu train; for this part of the run."""
-    env_cpus: Annotated[Annotated[float, Meta(ge=0, le=10_000)] | None, Shown("N"), OptionGroup.ENVIRONMENT] = None
+    env_cpus: Annotated[Annotated[float, Meta(ge=0, le=10_000)] | None, Shown("N"), Topic.ENVIRONMENT] = None
     """With --backend ray: CPUs for each environment, a fraction if it mostly waits; by default 1, or 0 without --ray."""
     no_report: NoReport = False
     no_video: NoVideo = False
@@ -188,11 +188,11 @@ class Tune(EnvironmentOptions):
     env: EnvironmentId
     """Id of an environment, as for rejeu train."""
     algo: Algorithm = None
-    envs: Annotated[EnvCount, OptionGroup.ENVIRONMENT] = None
+    envs: Annotated[EnvCount, Topic.ENVIRONMENT] = None
     """Environments that each agent steps at once; by default the preset's, else 1."""
-    backend: Annotated[Name, OptionGroup.ENVIRONMENT] = None
+    backend: Annotated[Name, Topic.ENVIRONMENT] = None
     """auto, envpool, gymnasium, gymnasium-async or jax; by default the preset's, else auto."""
-    preset: Annotated[Path | None, Shown("FILE"), OptionGroup.TRAINING] = None
+    preset: Annotated[Path | None, Shown("FILE"), Topic.TRAINING] = None
     """Where the search starts, and the other hyperparameters; by default rejeu's preset, else the algorithm's defaults."""
     assignments: Annotated[Assignments, Shown("NAME=VALUE ...", "set")] = ()
     """Hyperparameters to set instead of searching them, as for rejeu train."""
@@ -200,28 +200,26 @@ class Tune(EnvironmentOptions):
     """Other ranges, or further hyperparameters: learning_rate=1e-4..1e-2 "batch_size=[64,128]" tau=log:0.001..0.1"""
     only: Annotated[Assignments, Shown("NAME ...")] = ()
     """Search these hyperparameters and no others."""
-    measure: Annotated[Literal["return", "success"], Shown("{return,success}"), OptionGroup.EVALUATION] = "return"
+    measure: Annotated[Literal["return", "success"], Shown("{return,success}"), Topic.EVALUATION] = "return"
     """Maximize the mean return of the last evaluation of a trial, or its success rate."""
     evaluate_episodes: EpisodeCount = None
-    checkpoint_minutes: Annotated[float, Meta(ge=0), Shown("M"), OptionGroup.OUTPUT] = 5.0
+    checkpoint_minutes: Annotated[float, Meta(ge=0), Shown("M"), Topic.OUTPUT] = 5.0
     """Minutes between two checkpoints of a training; 0 for none."""
     seed: Annotated[Seed, Shown("N")] = 0
     """Determines what is sampled and the seeds of all trainings."""
-    workers: Annotated[Several, OptionGroup.TRAINING] = None
+    workers: Annotated[Several, Topic.TRAINING] = None
     """Agents trained at once; by default half as many as there are cores."""
     trials: Annotated[int, Meta(ge=1, le=100_000), Shown("N")] = 30
     """How many trials; of a study that exists, how many in all."""
     steps: Count = None
     """Environment steps of a trial; by default the preset's, else 100000."""
-    evaluate_every: Annotated[Count, OptionGroup.EVALUATION] = None
+    evaluate_every: Annotated[Count, Topic.EVALUATION] = None
     """Environment steps between two evaluations; by default a tenth of --steps."""
-    trial_seeds: Annotated[int, Meta(ge=1, le=1000), Shown("K"), OptionGroup.TRAINING] = 1
+    trial_seeds: Annotated[int, Meta(ge=1, le=1000), Shown("K"), Topic.TRAINING] = 1
     """Seeds of each trial, trained at once, whose evaluations are averaged."""
-    final_seeds: Annotated[int, Meta(ge=0, le=1000), Shown("K"), OptionGroup.EVALUATION] = 5
+    final_seeds: Annotated[int, Meta(ge=0, le=1000), Shown("K"), Topic.EVALUATION] = 5
     """Fresh seeds on which the winner is compared with the default, at least 5; 0 for no comparison."""
-    pruner: Annotated[Literal["median", "halving", "none"], Shown("{median,halving,none}"), OptionGroup.TRAINING] = (
-        "median"
-    )
+    pruner: Annotated[Literal["median", "halving", "none"], Shown("{median,halving,none}"), Topic.TRAINING] = "median"
     """Stop trials that are below the median of the others, or by successive halving, or none."""
     out: Folder = None
     """Study folder; an existing one is continued or joined. By default a new one under runs."""

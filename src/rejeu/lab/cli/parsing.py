@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Literal, NoReturn, get_args, get_origin
 
 from rejeu.core.validation import field_docs, number, whole
-from rejeu.lab.runs.config import Option, OptionGroup, assigned, options
+from rejeu.lab.runs.config import Option, Topic, assigned, options
 
 ELSEWHERE = {
     "--env": "the environment is given without an option: rejeu {command} ENV",
@@ -128,9 +128,9 @@ def make_parser(command: str, kind: type, known: Iterable[Option], with_help: ob
         exit_on_error=False,
     )
     docs = field_docs(kind) if with_help else {}
-    lists: dict[OptionGroup, Any] = dict.fromkeys(OptionGroup, parser)
+    lists: dict[Topic, Any] = dict.fromkeys(Topic, parser)
     if len(known) > MOST_IN_ONE_LIST:
-        lists |= {one: parser.add_argument_group(one) for one in OptionGroup if one is not OptionGroup.FIRST}
+        lists |= {one: parser.add_argument_group(one) for one in Topic if one is not Topic.FIRST}
     for one in known:
         text = docs.get(one.field, one.shown.help).replace("%", "%%")
         if one.kind is bool:

@@ -116,7 +116,7 @@ WORDS_OF_THEIR_OWN = ("env", "env_kwargs", "wrappers", "imports", "hyperparamete
 """Fields that are not one option with its value."""
 
 
-class OptionGroup(StrEnum):
+class Topic(StrEnum):
     """The list of a help text that an option is in; the title of the list."""
 
     FIRST = "options"
@@ -149,7 +149,7 @@ class Option(NamedTuple):
     """The type of the value: ``bool``, ``int``, ``float``, ``str``, ``Path``, ``dict``, ``tuple`` or a ``Literal``."""
     item: Any
     """The type of one word: that of the value, or of an element of a tuple."""
-    group: OptionGroup
+    group: Topic
     limits: dict[str, float]
     """Of a number: ``ge``, ``gt`` and ``le``."""
     default: Any
@@ -171,13 +171,11 @@ Key = Annotated[str, Meta(pattern=r"^[A-Za-z_][\w.]{0,199}\Z")]
 class EnvironmentOptions:
     """How an environment is made. Abstract: options of the commands that use one."""
 
-    env_kwargs: Annotated[dict[Key, Any], Shown("NAME=VALUE ..."), OptionGroup.ENVIRONMENT] = field(
-        default_factory=dict
-    )
+    env_kwargs: Annotated[dict[Key, Any], Shown("NAME=VALUE ..."), Topic.ENVIRONMENT] = field(default_factory=dict)
     """Keyword arguments of the environment: sigma=2 map_name=8x8."""
-    wrappers: Annotated[tuple[str, ...], Shown("MODULE:CLASS", "wrapper"), OptionGroup.ENVIRONMENT] = ()
+    wrappers: Annotated[tuple[str, ...], Shown("MODULE:CLASS", "wrapper"), Topic.ENVIRONMENT] = ()
     """Wrap it in this gymnasium.Wrapper, such as gymnasium.wrappers:FlattenObservation; repeat for several, inner first."""
-    imports: Annotated[tuple[str, ...], Shown("MODULE", "import"), OptionGroup.ENVIRONMENT] = ()
+    imports: Annotated[tuple[str, ...], Shown("MODULE", "import"), Topic.ENVIRONMENT] = ()
     """Import this module or Python file first: one that registers algorithms or environments; repeat for several."""
 
 
@@ -189,7 +187,7 @@ class RunConfig(EnvironmentOptions):
     """Id of an environment, such as parking-v0; or my_env:MyEnv-v0 or my_env.py, which is imported."""
     algorithm: Annotated[str | None, Shown("NAME", "algo")] = None
     """Algorithm; by default the preset's, else the one that fits the environment's actions."""
-    preset: Annotated[str | bool | None, Shown("FILE"), OptionGroup.TRAINING] = None
+    preset: Annotated[str | bool | None, Shown("FILE"), Topic.TRAINING] = None
     """Use the preset in this file, such as the preset.json of rejeu tune, in the place of rejeu's own."""
     steps: Annotated[Positive | None, Shown("N")] = None
     """Environment steps to take, over all environments; by default the preset's, else 100000."""
@@ -197,35 +195,35 @@ class RunConfig(EnvironmentOptions):
     """Train for this long instead."""
     n_envs: Annotated[EnvCount | None, Shown("N", "envs")] = None
     """Environments stepped at once; by default the preset's, else 1."""
-    backend: Annotated[Name | None, Shown("NAME"), OptionGroup.ENVIRONMENT] = None
+    backend: Annotated[Name | None, Shown("NAME"), Topic.ENVIRONMENT] = None
     """auto, envpool, gymnasium, gymnasium-async, jax or ray; by default the preset's, else auto."""
-    restart_workers: Annotated[int, Meta(ge=0), Shown("N"), OptionGroup.ENVIRONMENT] = 0
+    restart_workers: Annotated[int, Meta(ge=0), Shown("N"), Topic.ENVIRONMENT] = 0
     """With --backend gymnasium-async or ray: how many workers that crashed, hung or were lost are restarted."""
-    wait_for: Annotated[Positive | None, Shown("K"), OptionGroup.ENVIRONMENT] = None
+    wait_for: Annotated[Positive | None, Shown("K"), Topic.ENVIRONMENT] = None
     """With these: take the first K results that arrive, and do not wait for the other environments."""
-    ray: Annotated[str | None, Shown("ADDRESS"), OptionGroup.ENVIRONMENT] = None
+    ray: Annotated[str | None, Shown("ADDRESS"), Topic.ENVIRONMENT] = None
     """With --backend ray: HOST:PORT of the cluster, or auto; by default RAY_ADDRESS, else Ray on this machine."""
-    env_cpus: Annotated[Annotated[float, Meta(ge=0, le=10_000)] | None, Shown("N"), OptionGroup.ENVIRONMENT] = None
+    env_cpus: Annotated[Annotated[float, Meta(ge=0, le=10_000)] | None, Shown("N"), Topic.ENVIRONMENT] = None
     """With --backend ray: CPUs for each environment, a fraction if it mostly waits; by default 1, or 0 without --ray."""
-    device: Annotated[str, Shown("NAME"), OptionGroup.TRAINING] = "auto"
+    device: Annotated[str, Shown("NAME"), Topic.TRAINING] = "auto"
     """auto, cpu or gpu; auto is the device that JAX chooses, a GPU if it has one."""
     seed: Annotated[Seed | None, Shown("N")] = None
     """Seeds everything; by default a random one."""
     hyperparameters: Annotated[dict[Key, Any], Shown("NAME=VALUE ...", "set")] = field(default_factory=dict)
     """Hyperparameters, dotted where nested: "policy_kwargs.net_arch=[64,64]" "train_freq=[1,'episode']"."""
-    success_threshold: Annotated[float | None, Shown("RETURN"), OptionGroup.EVALUATION] = None
+    success_threshold: Annotated[float | None, Shown("RETURN"), Topic.EVALUATION] = None
     """Return from which on an episode counts as a success; by default what the environment reports or declares."""
-    video_every: Annotated[Positive | None, Shown("N"), OptionGroup.OUTPUT] = None
+    video_every: Annotated[Positive | None, Shown("N"), Topic.OUTPUT] = None
     """Environment steps between two videos of the policy, in the folder videos; by default none are recorded."""
-    checkpoint_minutes: Annotated[Annotated[float, Meta(ge=0)] | None, Shown("M"), OptionGroup.OUTPUT] = 5.0
+    checkpoint_minutes: Annotated[Annotated[float, Meta(ge=0)] | None, Shown("M"), Topic.OUTPUT] = 5.0
     """Minutes between two checkpoints, from which rejeu resume continues; 0 for none."""
-    evaluate_every: Annotated[Positive | None, Shown("N"), OptionGroup.EVALUATION] = None
+    evaluate_every: Annotated[Positive | None, Shown("N"), Topic.EVALUATION] = None
     """Environment steps between two evaluations; by default the preset's, else 5000."""
-    evaluate_episodes: Annotated[
-        Annotated[int, Meta(ge=1, le=MAX_EPISODES)] | None, Shown("N"), OptionGroup.EVALUATION
-    ] = None
+    evaluate_episodes: Annotated[Annotated[int, Meta(ge=1, le=MAX_EPISODES)] | None, Shown("N"), Topic.EVALUATION] = (
+        None
+    )
     """Episodes of each evaluation; by default the preset's, else 20."""
-    log: Annotated[tuple[Name, ...], Shown("NAME ..."), OptionGroup.OUTPUT] = ()
+    log: Annotated[tuple[Name, ...], Shown("NAME ..."), Topic.OUTPUT] = ()
     """Log to these too: json, tensorboard, wandb, mlflow, trackio. metrics.csv is always written."""
 
     env_argument: str = ""
@@ -331,7 +329,7 @@ class Task:
 def options(kind: type) -> Iterator[Option]:
     """Yields the fields of a dataclass that the command line shows: flags, and those with a :class:`Shown`.
 
-    A :class:`OptionGroup` next to it is the list of the help that it is in.
+    A :class:`Topic` next to it is the list of the help that it is in.
     """
     hints = get_type_hints(kind, include_extras=True)
     for one in dataclasses.fields(kind):
@@ -351,7 +349,7 @@ def options(kind: type) -> Iterator[Option]:
             shown=shown_as,
             kind=kind_of,
             item=unmarked(get_args(hint)[0])[0] if kind_of is tuple else hint,
-            group=next((mark for mark in marks if isinstance(mark, OptionGroup)), OptionGroup.FIRST),
+            group=next((mark for mark in marks if isinstance(mark, Topic)), Topic.FIRST),
             limits={key: limit for key, limit in numbers if limit is not None},
             default=one.default if has_default else None,
             is_required=not has_default and one.default_factory is dataclasses.MISSING,
