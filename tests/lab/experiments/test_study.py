@@ -309,6 +309,7 @@ def test_more_trials_continue_a_study_and_another_plan_is_refused(journal, tmp_p
     result = run(tuning.open_study(make_plan(trials=5, final_seeds=0), tmp_path / "study"))
     assert time.monotonic() - began < 10
     assert len(result.trials) == 5
+    assert studies.open_study(StudyFolder(tmp_path / "study")).plan.trials == 5  # as rejeu resume opens it
     assert journal.read_bytes().startswith(before)
     with pytest.raises(ValueError, match=r"another study: steps is 40 there, not 80; .* --out"):
         tuning.open_study(make_plan(steps=80), tmp_path / "study")
