@@ -242,8 +242,8 @@ def import_envpool() -> Any:
 
 def _tables_of_envpool() -> dict[str, Path]:
     """Returns the files of the modules that EnvPool's entry imports, by name; none if it does more than to import such."""
-    found = importlib.util.find_spec("envpool")
-    entry = Path(found.origin).with_name("entry.py") if found is not None and found.origin else None
+    package = importlib.util.find_spec("envpool")
+    entry = Path(package.origin).with_name("entry.py") if package is not None and package.origin else None
     if entry is None or not entry.is_file():
         return {}
     statements = ast.parse(entry.read_text(encoding="utf-8")).body[1:]  # the first is the docstring

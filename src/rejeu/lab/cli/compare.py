@@ -44,15 +44,15 @@ def references(words: Iterable[str]) -> dict[str, tuple[float, float]]:
     >>> references(["CartPole-v1=22,500"])
     {'CartPole-v1': (22.0, 500.0)}
     """
-    found = {}
+    bounds = {}
     for word in words:
         env, _, values = word.rpartition("=")
         try:
             low, high = map(float, values.split(","))
         except ValueError:
             raise ValueError(f"--reference {word!r} must be ENV=LOW,HIGH, such as CartPole-v1=22,500") from None
-        found[env] = low, high
-    return found
+        bounds[env] = low, high
+    return bounds
 
 
 def show_comparison(comparison: Comparison) -> None:

@@ -86,7 +86,7 @@ def parse(
     known = {one.name: one for one in options(commands[command])}
     parser = make_parser(command, commands[command], known.values(), {"-h", "--help"} & {*words})
     try:
-        found, rest = parser.parse_known_intermixed_args([normalized(word) for word in words])
+        typed, rest = parser.parse_known_intermixed_args([normalized(word) for word in words])
     except argparse.ArgumentError as error:
         raise ValueError(problem(error, command, words)) from None
     if unknown := next((word for word in rest if word.startswith("-")), ""):
@@ -95,9 +95,9 @@ def parse(
         raise ValueError(f"rejeu {command} has no option {name}; {replacement(name, command, named)}")
     if rest:
         raise ValueError(f"rejeu {command} does not expect {rest[0]!r}; rejeu {command} --help shows what it takes")
-    values = {name: value for name, value in vars(found).items() if value is not None}
-    given = {one.field: collected(one, values[one.field]) for one in known.values() if one.field in values}
-    return command, commands[command](**given)
+    values = {name: value for name, value in vars(typed).items() if value is not None}
+    chosen = {one.field: collected(one, values[one.field]) for one in known.values() if one.field in values}
+    return command, commands[command](**chosen)
 
 
 def overview(tasks: Mapping[str, Iterable[Any]], about: str) -> argparse.ArgumentParser:
@@ -233,9 +233,9 @@ def read(option: Option, text: str) -> Any:
     return whole(option.name, int(value), int(option.limits.get("ge", 0)), int(option.limits.get("le", 2**63 - 1)))
 
 
-def collected(option: Option, found: Any) -> Any:
+def collected(option: Option, typed: Any) -> Any:
     """Returns the value of an option that was given: of one that may be repeated, that of all its words."""
-    return assigned(found, option.name) if option.kind is dict else tuple(found) if option.kind is tuple else found
+    return assigned(typed, option.name) if option.kind is dict else tuple(typed) if option.kind is tuple else typed
 
 
 def replacement(name: str, command: str, known: Mapping[str, Any]) -> str:

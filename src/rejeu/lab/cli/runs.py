@@ -66,11 +66,11 @@ def best_of(row: Mapping[str, Any]) -> str:
 
 def run_status(arguments: Status) -> tuple[int, dict[str, Any]]:
     """Prints the state of a run; the exit status is 3 if it was interrupted, 4 if it crashed."""
-    found = run_list.read(arguments.run)
-    facts = describe(found)
+    summary = run_list.read(arguments.run)
+    facts = describe(summary)
     if not arguments.json:
         print("\n".join(lines(facts)))
-    return EXIT[found.state], facts
+    return EXIT[summary.state], facts
 
 
 def describe(run: RunSummary) -> dict[str, Any]:
@@ -133,7 +133,7 @@ def steps_text(facts: dict[str, Any]) -> str:
 def lines(facts: dict[str, Any]) -> list[str]:
     """Returns the state of a run as lines of text."""
     seed = "" if facts["seed"] is None else f", seed {facts['seed']}"
-    found = [
+    texts = [
         f"run           {facts['name']}: {facts['env'] or 'unknown environment'}, {facts['algorithm'] or 'unknown'}{seed}",
         f"state         {facts['state']}",
         f"steps         {steps_text(facts)}",
@@ -141,14 +141,14 @@ def lines(facts: dict[str, Any]) -> list[str]:
     if math.isfinite(facts["seconds"]):
         left = facts["seconds_left"]
         rest = f", about {left:,.0f} s left" if left is not None and math.isfinite(left) else ""
-        found.append(f"time          {facts['seconds']:,.1f} s, {facts['steps_per_second']:,.0f} steps/s{rest}")
+        texts.append(f"time          {facts['seconds']:,.1f} s, {facts['steps_per_second']:,.0f} steps/s{rest}")
     if math.isfinite(facts["mean_return"]):
         n = min(facts["episodes"], WINDOW)
         latest = f"over the last {counted(n, 'episode')}" if n else "in the latest row of metrics.csv"
-        found.append(f"training      return {facts['mean_return']:,.2f} {latest}")
-    found.append(f"best          {best_text(facts['best'])}")
-    found += [f"warning       {one}" for one in facts["warnings"]]
-    return [*found, *(f"note          {one}" for one in facts["notes"])]
+        texts.append(f"training      return {facts['mean_return']:,.2f} {latest}")
+    texts.append(f"best          {best_text(facts['best'])}")
+    texts += [f"warning       {one}" for one in facts["warnings"]]
+    return [*texts, *(f"note          {one}" for one in facts["notes"])]
 
 
 def show_table(head: Sequence[str], rows: Iterable[Sequence[str]], n_text: int) -> None:

@@ -113,13 +113,13 @@ def named(folder: Path) -> tuple[str, str, int | None]:
     ('PPO', 'CartPole-v1', 2)
     """
     algorithm = ALGORITHMS.get(folder.parent.name.lower(), "")
-    found = ZOO_NAME.fullmatch(folder.name)
-    if found is None:  # as Stable-Baselines3 names its TensorBoard folders
+    numbered = ZOO_NAME.fullmatch(folder.name)
+    if numbered is None:  # as Stable-Baselines3 names its TensorBoard folders
         kind = re.fullmatch(r"([A-Za-z0-9]+)_(\d{1,9})", folder.name)
         if kind is not None and kind[1].lower() in ALGORITHMS:
             return ALGORITHMS[kind[1].lower()], "", int(kind[2])
         return algorithm, "", None
-    return algorithm, shown(found[1], MAX_NAME), int(found[2][:9])
+    return algorithm, shown(numbered[1], MAX_NAME), int(numbered[2][:9])
 
 
 def read_tensorboard(folder: Path) -> RunSummary:

@@ -51,10 +51,10 @@ def read_all(paths: str | Path | RunSummary | Iterable[str | Path | RunSummary])
     Raises:
         FileNotFoundError: if a path does not exist, or holds no run.
     """
-    found: dict[Any, Path | RunSummary] = {}
+    sources: dict[Any, Path | RunSummary] = {}
     for one in [paths] if isinstance(paths, str | Path | RunSummary) else paths:
         if isinstance(one, RunSummary):
-            found[one] = one
+            sources[one] = one
             continue
         inside = find(Path(one))
         if not inside:
@@ -62,9 +62,9 @@ def read_all(paths: str | Path | RunSummary | Iterable[str | Path | RunSummary])
                 f"{shown(one, 300)} holds no run; expected a run folder of rejeu train, a monitor.csv or TensorBoard files"
             )
         for path in inside:
-            found.setdefault(path.resolve(), path)
+            sources.setdefault(path.resolve(), path)
     with ThreadPoolExecutor(2) as pool:  # NumPy computes outside of Python's lock
-        read = [*pool.map(read_or_note, found.values())]
+        read = [*pool.map(read_or_note, sources.values())]
     notes = [one for one in read if isinstance(one, str)]
     runs = distinct([one for one in read if isinstance(one, RunSummary)])
     notes += [f"{run.name}: {note}" for run in runs for note in run.notes if "damaged" in note]
@@ -98,17 +98,17 @@ def find(path: Path) -> list[Path]:
         return [path]
     if not path.is_dir():
         raise FileNotFoundError(f"there is no run folder {shown(path, 300)}")
-    found: list[Path] = []
+    folders: list[Path] = []
     level = [path]
     for _ in range(MAX_DEPTH + 1):
         below: list[Path] = []
         for folder in level:
             if is_run(folder):
-                found.append(folder)
+                folders.append(folder)
             else:
                 below += subfolders(folder)
         level = below[: MAX_RUNS * 2]
-    return sorted(found)[:MAX_RUNS]
+    return sorted(folders)[:MAX_RUNS]
 
 
 def subfolders(folder: Path) -> list[Path]:

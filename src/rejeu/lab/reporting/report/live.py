@@ -70,10 +70,10 @@ class LivePage:
 def stamp(path: Path) -> tuple[int, int] | None:
     """Returns time and size of a file, None if it does not exist."""
     try:
-        found = path.lstat()
+        status = path.lstat()
     except OSError:
         return None
-    return found.st_mtime_ns, found.st_size
+    return status.st_mtime_ns, status.st_size
 
 
 def handler(live: LivePage, hosts: Callable[[], set[str]]) -> type[BaseHTTPRequestHandler]:

@@ -67,24 +67,24 @@ def build(runs: Sequence[RunSummary], folder: Path | None) -> Parts:
         charts |= own_charts
         own = {"episodes": histogram_of(run), "replays": replays_of(run)}
         histograms |= {f"run{i}-{name}": one for name, one in own.items() if one is not None}
-        found, notes, spent = collect(run, folder, budget)
+        clips, notes, spent = collect(run, folder, budget)
         budget -= spent
-        parts.append(describe(run, f"run{i}", groups, found, notes, {name for name, one in own.items() if one}))
+        parts.append(describe(run, f"run{i}", groups, clips, notes, {name for name, one in own.items() if one}))
     return Parts(parts, {"charts": charts, "histograms": histograms})
 
 
 def charts_of(run: RunSummary, prefix: str) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """Returns the charts of a run by id, and groups of their ids and titles for the template."""
-    found: list[tuple[str, str, str, Any]] = [
+    curves: list[tuple[str, str, str, Any]] = [
         (CURVES, column, title, chart_data.episode_chart(run.episodes, run.evaluations, column))
         for column, title in TITLES.items()
     ]
     for i, (name, chart) in enumerate(chart_data.metric_charts(run.metrics).items()):
-        found.append((chart_data.group_of(name), f"metric{i}", shown(name), chart))
-    found.append((TIME, "time", "Shares of the time", chart_data.time_chart(run.metrics)))
+        curves.append((chart_data.group_of(name), f"metric{i}", shown(name), chart))
+    curves.append((TIME, "time", "Shares of the time", chart_data.time_chart(run.metrics)))
     charts: dict[str, Any] = {}
     groups: dict[str, list[dict[str, str]]] = {heading: [] for heading in (CURVES, *chart_data.GROUPS, TIME)}
-    for heading, key, title, chart in found:
+    for heading, key, title, chart in curves:
         if chart is not None:
             charts[f"{prefix}-{key}"] = chart
             groups[heading].append({"id": f"{prefix}-{key}", "title": title, "note": chart["note"]})
@@ -184,18 +184,18 @@ def duration(seconds: float) -> str:
 
 def tiles(run: RunSummary) -> list[Tile]:
     """Returns the figures of the headline."""
-    mean, found = run.evaluations.column("mean_return"), []
+    mean, headline = run.evaluations.column("mean_return"), []
     best = best_row(run.evaluations)
     if best is not None:
-        found += evaluation_tiles(run, "Best evaluation", best)
+        headline += evaluation_tiles(run, "Best evaluation", best)
         newest = "Newest evaluation" if run.state == "running" else "Final evaluation"
-        found += evaluation_tiles(run, newest, int(np.flatnonzero(np.isfinite(mean))[-1]))
+        headline += evaluation_tiles(run, newest, int(np.flatnonzero(np.isfinite(mean))[-1]))
     else:
-        found += training_tiles(run)
+        headline += training_tiles(run)
     done = f"of {run.steps_asked:,}" if run.steps_asked else ""
     time = f"of {duration(60 * run.minutes_asked)}" if run.minutes_asked else ""
     return [
-        *found,
+        *headline,
         Tile("Environment steps", f"{run.steps:,}", done),
         Tile("Training time", duration(run.seconds), time),
     ]
@@ -230,12 +230,12 @@ def training_tiles(run: RunSummary) -> list[Tile]:
 def facts(run: RunSummary) -> list[str]:
     """Returns the line below the headline."""
     backend = None if run.config is None else run.config.backend
-    found = [counted(len(run.episodes), "episode")]
-    found += [f"seed {run.seed}"] if run.seed is not None else []
-    found += [f"{counted(run.n_envs, 'environment')} at once"] if run.n_envs else []
-    found += [f"{shown(backend)} backend"] if backend else []
-    found += [f"{run.steps / run.seconds:,.0f} steps/s"] if run.seconds > 0 else []
-    return found
+    texts = [counted(len(run.episodes), "episode")]
+    texts += [f"seed {run.seed}"] if run.seed is not None else []
+    texts += [f"{counted(run.n_envs, 'environment')} at once"] if run.n_envs else []
+    texts += [f"{shown(backend)} backend"] if backend else []
+    texts += [f"{run.steps / run.seconds:,.0f} steps/s"] if run.seconds > 0 else []
+    return texts
 
 
 def evaluation_rows(run: RunSummary) -> list[dict[str, Any]]:

@@ -41,7 +41,7 @@ def collect(run: RunSummary, folder: Path | None, budget: int) -> tuple[list[Vid
     during = [path for path in run.videos if path.name != BEST]
     chosen = {path: "Best model" for path in run.videos if path.name == BEST}  # first, as the budget may not be enough
     chosen |= dict.fromkeys(during[-1:], "Last") | dict.fromkeys(during[:-1][:1], "First")
-    found, notes, spent = [], [], 0
+    videos, notes, spent = [], [], 0
     for path, title in chosen.items():
         try:
             size = path.stat().st_size
@@ -58,8 +58,8 @@ def collect(run: RunSummary, folder: Path | None, budget: int) -> tuple[list[Vid
             spent += size
         step = re.fullmatch(r"step_(\d{1,15})\.mp4", path.name)
         label = f"{title} (step {int(step[1]):,})" if step else title
-        found.append(Video(label, shown(path.name), source, link_to(path, folder), size / 2**20))
-    return found[::-1], notes, spent
+        videos.append(Video(label, shown(path.name), source, link_to(path, folder), size / 2**20))
+    return videos[::-1], notes, spent
 
 
 def link_to(path: Path, folder: Path | None) -> str:
