@@ -36,6 +36,7 @@ from rejeu.algorithms.actor_critic import OnPolicyConfig  # noqa: E402
 from rejeu.algorithms.config import OffPolicyConfig  # noqa: E402
 from rejeu.algorithms.rollout_config import RolloutConfig  # noqa: E402
 from rejeu.algorithms.sac import continuous as sac  # noqa: E402
+from rejeu.algorithms.soft import EntropyConfig  # noqa: E402
 from rejeu.core import schedules, validation  # noqa: E402
 from rejeu.envs.masks import n_choices  # noqa: E402
 from scripts import sb3_parity  # noqa: E402
@@ -50,7 +51,7 @@ BLOCK = re.compile(r"(<!-- figures: (.+?) -->\n).*?(<!-- end of figures -->)", r
 SHARED = (
     (ppo.Config, "PPO", "ppo.md#hyperparameters"),
     (sac.Config, "SAC", "sac.md#hyperparameters"),
-    (sac.EntropyConfig, "SAC", "sac.md#hyperparameters"),
+    (EntropyConfig, "SAC", "sac.md#hyperparameters"),
     (dqn.QLearningConfig, "DQN", "dqn.md#hyperparameters"),
     (OffPolicyConfig, "all off-policy algorithms", "../hyperparameters.md#off-policy-algorithms"),
     (OnPolicyConfig, "all on-policy algorithms", "../hyperparameters.md#on-policy-algorithms"),

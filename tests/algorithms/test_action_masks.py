@@ -162,9 +162,9 @@ def test_the_equations_of_discrete_sac_with_masks():
     target = discrete.td_target(state.actor, state.target_critics, jnp.float32(alpha), batch)
     np.testing.assert_allclose(target, expected, rtol=1e-5, atol=1e-5)
     log_p = log_policy(np.asarray(state.actor(batch.obs.obs)), batch.obs.mask)
-    loss, entropy = discrete.actor_loss(state.actor, jnp.asarray(values), jnp.float32(alpha), batch.obs)
+    loss, log_prob = discrete.actor_loss(state.actor, jnp.asarray(values), jnp.float32(alpha), batch.obs)
     np.testing.assert_allclose(loss, expectation(log_p, alpha * log_p - values).mean(), rtol=1e-5)
-    np.testing.assert_allclose(entropy, -expectation(log_p, log_p), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(log_prob, expectation(log_p, log_p), rtol=1e-5, atol=1e-6)
 
 
 def test_forbidden_actions_have_no_gradient_in_discrete_sac():

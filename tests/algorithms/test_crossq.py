@@ -26,7 +26,8 @@ def make(**settings):
     return jax.jit(algorithm.update), jax.jit(algorithm.init)(jax.random.PRNGKey(1))
 
 
-actor_loss = jax.jit(crossq.actor_loss)
+clipped = functools.partial(crossq.squashed, log_std=crossq.clipped)
+actor_loss = jax.jit(functools.partial(crossq.actor_loss, policy=clipped))
 
 
 def random_batch(seed=0):
@@ -78,7 +79,8 @@ def test_the_critics_gradient_equals_finite_differences_with_the_target_held(whi
     _, state = make()
     batch, (next_action, cost) = random_batch(), given_next()
     differentiate = jax.jit(jax.grad(crossq.critics_loss, has_aux=True))
-    gradient, (_, target, _) = differentiate(state.critics, batch, next_action, cost)
+    gradient, ((values, error), _) = differentiate(state.critics, batch, next_action, cost)
+    target = (values - error)[0]
     critic = jax.tree.map(np.float64, one_of(state.critics, which))
     weight = critic.torso.layers[0].weight
 
@@ -106,7 +108,7 @@ def test_the_actor_goes_by_its_batch_and_the_critics_by_their_running_statistics
         with jax.numpy_dtype_promotion("standard"):
             state, _ = update(state, random_batch(seed), CLOCK)
     batch, key = random_batch(9), jax.random.PRNGKey(7)
-    loss, (log_prob, trained) = actor_loss(state.actor, state.critics, jnp.float32(0.3), batch.obs, key)
+    loss, (log_prob, trained) = actor_loss(state.actor, state.critics, jnp.float32(0.3), batch.obs, key, batch.obs)
     outputs, norms = numpy_output(state.actor, batch.obs, "train")
     action, expected = numpy_action(outputs, key)
     rows = np.hstack([batch.obs, action])

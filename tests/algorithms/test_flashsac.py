@@ -120,8 +120,7 @@ def test_the_target_has_no_gradient_and_the_critics_follow_theirs(name):
     batch, module = box_batch(1, BATCH), MODULES[name]
     next_action = np.tanh(np.random.default_rng(0).normal(size=(BATCH, 2))).astype(np.float32)
     target = softmax(np.random.default_rng(1).normal(size=(BATCH, N_BINS)))
-    obs, action = np.vstack([batch.obs, batch.next_obs]), np.vstack([batch.action, next_action])
-    gradient, _ = jax.grad(flashsac.critics_loss, has_aux=True)(state.critics, obs, action, jnp.float32(target), None)
+    gradient, _ = jax.grad(flashsac.critics_loss, has_aux=True)(state.critics, batch, next_action, jnp.float32(target))
     critic = jax.tree.map(np.float64, one_of(state.critics, 1))
     layer = (critic.torso.layers[1] if name == "XQC" else critic.torso.blocks[0].expand).weight
     slopes = gradient.torso.layers[1].weight if name == "XQC" else gradient.torso.blocks[0].expand.weight

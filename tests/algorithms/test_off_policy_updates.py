@@ -189,7 +189,7 @@ def test_the_target_is_the_reward_where_the_mdp_terminated_and_dtypes_are_not_mi
         "SAC, Discrete": lambda: sac_discrete.critics_loss(state.critics, batch, target),
         "TQC": lambda: (
             tqc.critics_loss(state.critics, batch, target),
-            tqc.actor_loss(state.actor, state.critics, alpha, batch.obs, key),
+            sac.continuous.actor_loss(state.actor, state.critics, alpha, batch.obs, key, tqc.judge),
         ),
     }
     assert {leaf.dtype.name for leaf in jax.tree.leaves(losses[name]())} == {"float32"}

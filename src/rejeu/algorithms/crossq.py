@@ -21,45 +21,26 @@ As in Stable-Baselines3 Contrib, the critics are 1024 wide by default, where the
 
 from __future__ import annotations
 
-import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from gymnasium import spaces
 from jax import Array
 
 from rejeu.algorithms import optimizers, search
-from rejeu.algorithms.sac.continuous import (
-    LOG_STD_RANGE,
-    EntropyConfig,
-    exploit,
-    explore,
-    initial_alpha,
-    metrics_of,
-    temperature_step,
-)
+from rejeu.algorithms.sac.continuous import LOG_STD_RANGE, squared_error
 from rejeu.algorithms.search import Integers, SearchSpace
-from rejeu.core.algorithm import (
-    Algorithm,
-    Clock,
-    Metrics,
-    Optimizer,
-    PyTree,
-    Transition,
-    ensemble,
-    minimize,
-    weighted_mean,
-)
+from rejeu.algorithms.soft import EntropyConfig, SoftCritic, soft_actor_critic
+from rejeu.core.algorithm import Algorithm, Optimizer, PyTree, Transition, ensemble, minimize
 from rejeu.core.distributions import TanhNormal
-from rejeu.core.prng import nth
-from rejeu.core.schedules import Schedule, at
-from rejeu.core.spaces import Leaf, action_dimension, check_box_action, leaves
+from rejeu.core.schedules import Schedule
+from rejeu.core.spaces import action_dimension, check_box_action, leaves
 from rejeu.core.validation import coerce, whole
 from rejeu.exploration.held_noise import held_explorer
-from rejeu.networks import PolicyConfig, Widths, action_values, values_by_critics
+from rejeu.networks import Linear, PolicyConfig, Widths, action_values
 from rejeu.networks.batch_renorm import RenormalizedMLP, RenormalizedNetwork, with_statistics
 
 ACTOR_LAYERS = (256, 256)
@@ -91,124 +72,112 @@ class Config(EntropyConfig):
     hidden_layers: ClassVar[Widths] = Widths(ACTOR_LAYERS, CRITIC_LAYERS)
     hidden_layers_on_images: ClassVar[Widths] = hidden_layers
 
+    entropy_per_action: ClassVar[float] = -1.0
+    """Share of a target entropy of ``"auto"`` that each action dimension has, in nats."""
+
     def __post_init__(self) -> None:
         EntropyConfig.__post_init__(self)
         coerce(self, "policy_delay", whole, least=1)
         coerce(self, "renorm_warmup_steps", whole, least=0)
         check_shape(self.policy_kwargs, self.name)
 
-
-class State(eqx.Module):
-    """Everything that CrossQ learns, every leaf an array; the networks hold their running statistics."""
-
-    actor: RenormalizedNetwork
-    critics: RenormalizedNetwork
-    """All critics, stacked along a leading axis."""
-    log_alpha: Array
-    actor_optimizer: PyTree
-    critics_optimizer: PyTree
-    alpha_optimizer: PyTree
-    actor_loss: Array
-    """Of the actor's last step, ``float32[]``: there is none in between."""
-    entropy: Array
-    """Of the policy at the actor's last step, in nats, ``float32[]``."""
-    key: Array
-    """Root of the randomness of the updates, ``uint32[2]``; never changes."""
-    n_updates: Array
-    """Gradient steps of the critics taken, ``int32[]``."""
+    def torso(self, key: Array, n_inputs: int, widths: tuple[int, ...]) -> Any:
+        """Returns hidden layers."""
+        return RenormalizedMLP(key, n_inputs, widths, self.policy_kwargs.activation_fn, self.renorm_warmup_steps)
 
 
 def make(config: Config, observation_space: spaces.Space, action_space: spaces.Space) -> Algorithm:
-    """Returns CrossQ for these spaces.
+    """Returns CrossQ for these spaces; its state is SAC's without target critics.
 
     Raises:
         ValueError: if the action space is not a finite Box.
         TypeError: if the observation space holds something that is not an array.
     """
-    action_dim = action_dimension(check_box_action(action_space, config.name))
-    obs_leaves, target_entropy = leaves(observation_space), config.entropy_target(-float(action_dim), action_dim)
+    equations = Equations(lambda critics, batch, action, cost: cost, critics_loss, action_values, has_targets=False)
     optimizer = optimizers.make(config.optimizer, config.max_grad_norm, b1=ADAM_B1)
-
-    def init(key: Array) -> State:
-        return initial_state(key, obs_leaves, action_dim, config, optimizer)
-
-    def update(state: State, batch: Transition, clock: Clock) -> tuple[State, Metrics]:
-        target_key, actor_key = jax.random.split(nth(state.key, state.n_updates))
-        rate, alpha = at(config.learning_rate, clock.progress), jnp.exp(state.log_alpha)
-        next_action, next_log_prob = distribution(state.actor(batch.next_obs)).sample_and_log_prob(target_key)
-        critics, critics_optimizer, critic_loss, (values, target, trained) = minimize(
-            critics_loss,
-            state.critics,
-            state.critics_optimizer,
-            optimizer,
-            rate,
-            batch,
-            next_action,
-            alpha * next_log_prob,
-        )
-        critics, n_updates = with_statistics(critics, trained), state.n_updates + 1
-
-        def delayed(state: State) -> State:
-            actor, actor_optimizer, policy_loss, (log_prob, trained) = minimize(
-                actor_loss, state.actor, state.actor_optimizer, optimizer, rate, critics, alpha, batch.obs, actor_key
-            )
-            log_alpha, alpha_optimizer = temperature_step(
-                state.log_alpha, state.alpha_optimizer, log_prob, target_entropy, config, rate
-            )
-            return dataclasses.replace(
-                state,
-                actor=with_statistics(actor, trained),
-                actor_optimizer=actor_optimizer,
-                log_alpha=log_alpha,
-                alpha_optimizer=alpha_optimizer,
-                actor_loss=policy_loss,
-                entropy=-jnp.mean(log_prob),
-            )
-
-        state = dataclasses.replace(state, critics=critics, critics_optimizer=critics_optimizer, n_updates=n_updates)
-        state = jax.lax.cond(n_updates % config.policy_delay == 0, delayed, lambda s: s, state)
-        return state, metrics_of(
-            critic_loss, state.actor_loss, alpha, state.entropy, values, target, target_entropy, config
-        )
-
-    policy = lambda actor, obs: distribution(actor(obs))  # noqa: E731
-    explorer = held_explorer(policy, action_dim, config.noise_repeat) if config.noise_repeat > 1 else None
-    return Algorithm(
-        init, lambda state: state.actor, explore, exploit, update, explorer, action_values=values_by_critics
-    )
+    return make_with(config, observation_space, action_space, equations, optimizer)
 
 
-def initial_state(
-    key: Array,
-    obs_leaves: tuple[Leaf, ...],
-    action_dim: int,
-    config: Config,
+def clipped(outputs: Array) -> Array:
+    """Returns the policy's log standard deviations within those of SAC, from outputs of the actor."""
+    return jnp.clip(outputs, *LOG_STD_RANGE)
+
+
+class Equations(NamedTuple):
+    """What CrossQ, FlashSAC and XQC do each in their own way."""
+
+    target: Callable[[Any, Transition, Array, Array], Array]
+    """``target(target_critics, batch, next_action, next_entropy_cost)``: what the critics learn."""
+    critics_loss: Callable[[Any, Transition, Array, Array], tuple[Array, Any]]
+    """``critics_loss(critics, batch, next_action, target)``, as :func:`critics_loss`."""
+    values: Callable[[Any, PyTree, Array], Array]
+    """``values(critics, obs, action)``: by the running statistics, ``(n_critics, batch)``."""
+    measure: Callable[[Any, Any], tuple[Array, Array]] = lambda errors, target: errors
+    """``measure(extra, (next_action, target))``, as of :class:`rejeu.algorithms.soft.SoftCritic`."""
+    n_outputs: int = 1
+    """Of each critic."""
+    head: Callable[[Array, int, int], Any] = Linear
+    """``head(key, n_inputs, n_outputs)``: the last layer of a network."""
+    log_std: Callable[[Array], Array] = clipped
+    """``log_std(outputs)``: the policy's log standard deviations from outputs of the actor."""
+    after_step: Callable[[Any], Any] = lambda network: network
+    """``after_step(network)``: a network after a step of the optimizer."""
+    seen: Callable[[Transition], PyTree] = lambda batch: batch.obs
+    """``seen(batch)``: by which observations the actor normalizes; those of the batch are the first."""
+    has_targets: bool = True
+    """Whether there are target critics."""
+
+
+def make_with(
+    config: Any,
+    observation_space: spaces.Space,
+    action_space: spaces.Space,
+    equations: Equations,
     optimizer: Optimizer,
-) -> State:
-    """Returns the state before the first update."""
-    actor_key, critics_key, update_key = jax.random.split(key, 3)
-    shape = config.policy_kwargs
+) -> Algorithm:
+    """Returns SAC with networks that are normalized by batches, and equations of its own."""
+    action_dim = action_dimension(check_box_action(action_space, config.name))
+    obs_leaves, shape = leaves(observation_space), config.policy_kwargs
+    target_entropy = config.entropy_target(config.entropy_per_action * action_dim, action_dim)
+    distribution = lambda outputs: squashed(outputs, equations.log_std)  # noqa: E731
+    policy = lambda actor, obs: distribution(actor(obs))  # noqa: E731
 
     def network(key: Array, n_actions: int | None, n_outputs: int, widths: tuple[int, ...]) -> RenormalizedNetwork:
-        settings = widths, shape.activation_fn, config.renorm_warmup_steps
-        torso = lambda key, n_inputs: RenormalizedMLP(key, n_inputs, *settings)  # noqa: E731
-        return RenormalizedNetwork(key, obs_leaves, n_actions, n_outputs, torso)
+        torso = lambda key, n_inputs: config.torso(key, n_inputs, widths)  # noqa: E731
+        return RenormalizedNetwork(key, obs_leaves, n_actions, n_outputs, torso, equations.head)
 
-    actor = network(actor_key, None, 2 * action_dim, shape.actor_widths(ACTOR_LAYERS))
-    widths = shape.critic_widths(CRITIC_LAYERS)
-    critics = ensemble(lambda k: network(k, action_dim, 1, widths), critics_key, config.n_critics)
-    log_alpha, alpha_optimizer = initial_alpha(config)
-    return State(
-        actor=actor,
+    def critics(key: Array) -> Any:
+        widths = shape.critic_widths(config.hidden_layers.critics)
+        return ensemble(lambda key: network(key, action_dim, equations.n_outputs, widths), key, config.n_critics)
+
+    def target(actor: Any, target_critics: Any, alpha: Array, batch: Transition, key: Array) -> tuple[Array, Array]:
+        next_action, next_log_prob = policy(actor, batch.next_obs).sample_and_log_prob(key)
+        return next_action, equations.target(target_critics, batch, next_action, alpha * next_log_prob)
+
+    def policy_loss(actor: Any, critics: Any, alpha: Array, batch: Transition, key: Array) -> tuple[Array, Any]:
+        seen = equations.seen(batch)
+        return actor_loss(actor, critics, alpha, batch.obs, key, seen, distribution, equations.values)
+
+    def step(*arguments: Any) -> tuple[Any, PyTree, Array, Any]:
+        network, optimizer_state, loss, (extra, trained) = minimize(*arguments)
+        return equations.after_step(with_statistics(network, trained)), optimizer_state, loss, extra
+
+    parts = SoftCritic(
+        actor=lambda key: network(key, None, 2 * action_dim, shape.actor_widths(config.hidden_layers.actor)),
         critics=critics,
-        log_alpha=log_alpha,
-        actor_optimizer=optimizer.init(actor),
-        critics_optimizer=optimizer.init(critics),
-        alpha_optimizer=alpha_optimizer,
-        actor_loss=jnp.float32(0.0),
-        entropy=jnp.float32(0.0),
-        key=update_key,
-        n_updates=jnp.int32(0),
+        target=target,
+        critics_loss=lambda critics, batch, target, key: equations.critics_loss(critics, batch, *target),
+        actor_loss=policy_loss,
+        target_entropy=lambda obs: target_entropy,
+        measure=equations.measure,
+        minimize=step,
+        has_targets=equations.has_targets,
+    )
+    explore = lambda actor, obs, key, clock: policy(actor, obs).sample(key)  # noqa: E731
+    exploit = lambda actor, obs: policy(actor, obs).mode()  # noqa: E731
+    return soft_actor_critic(parts, config, explore, exploit, optimizer)._replace(
+        explorer=held_explorer(policy, action_dim, config.noise_repeat) if config.noise_repeat > 1 else None,
+        action_values=lambda state, obs, action: equations.values(state.critics, obs, action),
     )
 
 
@@ -232,18 +201,20 @@ def check_shape(shape: PolicyConfig, name: str) -> None:
         )
 
 
-def joint_values(
-    critics: RenormalizedNetwork, batch: Transition, next_action: Array
-) -> tuple[Array, Array, RenormalizedNetwork]:
-    """Returns the values of ``(s, a)`` and of ``(s', a')``, ``(n_critics, batch)`` each, from one pass of both.
+def joint_outputs(critics: Any, batch: Transition, next_action: Array) -> tuple[Array, Array, Any]:
+    """Returns the outputs for ``(s, a)`` and for ``(s', a')``, ``(n_critics, batch, n_outputs)`` each, from one pass of both.
 
     The critics are in training; they are returned as they are after having seen the batch.
     """
-    obs = jax.tree.map(lambda now, then: jnp.concatenate([now, then], axis=0), batch.obs, batch.next_obs)
-    action = jnp.concatenate([batch.action, next_action], axis=0)
-    values, trained = jax.vmap(lambda critic: critic.train(obs, action))(critics)
-    now, then = jnp.split(values[..., 0], 2, axis=-1)
+    obs, action = joined(batch.obs, batch.next_obs), joined(batch.action, next_action)
+    outputs, trained = jax.vmap(lambda critic: critic.train(obs, action))(critics)
+    now, then = jnp.split(outputs, 2, axis=1)
     return now, then, trained
+
+
+def joined(now: PyTree, then: PyTree) -> PyTree:
+    """Returns two batches as one of twice the size."""
+    return jax.tree.map(lambda a, b: jnp.concatenate([a, b], axis=0), now, then)
 
 
 def td_target(next_values: Array, next_entropy_cost: Array, batch: Transition) -> Array:
@@ -259,32 +230,39 @@ def td_target(next_values: Array, next_entropy_cost: Array, batch: Transition) -
 
 def critics_loss(
     critics: RenormalizedNetwork, batch: Transition, next_action: Array, next_entropy_cost: Array
-) -> tuple[Array, tuple[Array, Array, RenormalizedNetwork]]:
+) -> tuple[Array, tuple[tuple[Array, Array], RenormalizedNetwork]]:
     """Returns half the squared TD error, averaged over the batch and summed over critics.
 
-    With it come the values ``(n_critics, batch)``, the target ``(batch,)`` and the critics that have seen the batch.
+    With it come the values and the TD errors, ``(n_critics, batch)`` each, and the critics that have seen the batch.
     ``next_entropy_cost`` is that of :func:`td_target`.
     """
-    values, next_values, trained = joint_values(critics, batch, next_action)
-    target = td_target(next_values, next_entropy_cost, batch)
-    loss = 0.5 * jnp.sum(weighted_mean(jnp.square(values - target[None]), batch.weight))
-    return loss, (values, target, trained)
+    values, next_values, trained = joint_outputs(critics, batch, next_action)
+    target = td_target(next_values[..., 0], next_entropy_cost, batch)
+    loss, errors = squared_error(values[..., 0], target, batch)
+    return loss, (errors, trained)
 
 
-def distribution(outputs: Array) -> TanhNormal:
+def squashed(outputs: Array, log_std: Callable[[Array], Array]) -> TanhNormal:
     """Returns the distribution of actions in [-1, 1] that the actor's outputs, ``(batch, 2 action_dim)``, mean."""
-    mean, log_std = jnp.split(outputs, 2, axis=-1)
-    return TanhNormal(mean, jnp.clip(log_std, *LOG_STD_RANGE))
+    mean, raw = jnp.split(outputs, 2, axis=-1)
+    return TanhNormal(mean, log_std(raw))
 
 
 def actor_loss(
-    actor: RenormalizedNetwork, critics: RenormalizedNetwork, alpha: Array, obs: PyTree, key: Array
+    actor: RenormalizedNetwork,
+    critics: Any,
+    alpha: Array,
+    obs: PyTree,
+    key: Array,
+    seen: PyTree,
+    policy: Callable[[Array], TanhNormal],
+    values: Callable[[Any, PyTree, Array], Array] = action_values,
 ) -> tuple[Array, tuple[Array, RenormalizedNetwork]]:
-    """Returns the soft policy loss, the critics judging by their running statistics.
+    """Returns the soft policy loss at ``obs``, the critics judging by their running statistics.
 
-    With it come the log-probabilities of the actions drawn, ``(batch,)``, and the actor that has seen the batch.
+    The actor normalizes by ``seen``, which begins with ``obs``. With the loss come the log-probabilities of the actions drawn,
+    ``(batch,)``, and the actor that has seen the batch.
     """
-    outputs, trained = actor.train(obs)
-    action, log_prob = distribution(outputs).sample_and_log_prob(key)
-    value = jnp.min(action_values(critics, obs, action), axis=0)
-    return jnp.mean(alpha * log_prob - value), (log_prob, trained)
+    outputs, trained = actor.train(seen)
+    action, log_prob = policy(outputs[: len(jax.tree.leaves(obs)[0])]).sample_and_log_prob(key)
+    return jnp.mean(alpha * log_prob - jnp.min(values(critics, obs, action), axis=0)), (log_prob, trained)

@@ -23,8 +23,8 @@ target entropy is that of a normal distribution with the standard deviation 0.15
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar
 
 import jax
@@ -34,39 +34,14 @@ from jax import Array
 
 from rejeu.algorithms import optimizers, search
 from rejeu.algorithms.categorical import cross_entropy, make_atoms, mean_of, project
-from rejeu.algorithms.crossq import check_shape
-from rejeu.algorithms.sac.continuous import (
-    EntropyConfig,
-    State,
-    after_actor,
-    after_critics,
-    every,
-    initial_alpha,
-    metrics_of,
-)
+from rejeu.algorithms.crossq import Equations, check_shape, joined, joint_outputs, make_with
 from rejeu.algorithms.search import Choice, Integers, SearchSpace
-from rejeu.core.algorithm import (
-    Algorithm,
-    Clock,
-    Metrics,
-    Optimizer,
-    PyTree,
-    Transition,
-    copy,
-    ensemble,
-    minimize,
-    weighted_mean,
-    without_gradient,
-)
-from rejeu.core.distributions import TanhNormal
+from rejeu.algorithms.soft import EntropyConfig
+from rejeu.core.algorithm import Algorithm, PyTree, Transition, weighted_mean
 from rejeu.core.normalization import NormalizationConfig
-from rejeu.core.prng import nth
-from rejeu.core.schedules import Linear, Schedule, at
-from rejeu.core.spaces import Leaf, action_dimension, check_box_action, leaves
+from rejeu.core.schedules import Linear, Schedule
 from rejeu.core.validation import LARGEST_VALUE, MOST_OUTPUTS, coerce, number, whole
-from rejeu.exploration.held_noise import held_explorer
-from rejeu.networks import PolicyConfig, Widths
-from rejeu.networks.batch_renorm import RenormalizedNetwork, with_statistics
+from rejeu.networks import Widths
 from rejeu.networks.projected import InvertedResidual, head, projected
 
 ACTOR_LAYERS = (128, 128)
@@ -145,155 +120,56 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         ValueError: if the action space is not a finite Box.
         TypeError: if the observation space holds something that is not an array.
     """
-    action_dim = action_dimension(check_box_action(action_space, config.name))
-    obs_leaves, values = leaves(observation_space), make_atoms(-config.value_limit, config.value_limit, config.n_bins)
-    target_entropy = config.entropy_target(config.entropy_per_action * action_dim, action_dim)
+    atoms = make_atoms(-config.value_limit, config.value_limit, config.n_bins)
+    equations = Equations(
+        target=partial(td_target, atoms=atoms),
+        critics_loss=critics_loss,
+        values=partial(action_values, atoms=atoms),
+        measure=partial(measure, atoms=atoms),
+        n_outputs=config.n_bins,
+        head=head,
+        log_std=config.log_std,
+        after_step=projected,
+        seen=lambda batch: joined(batch.obs, batch.next_obs) if config.reads_both else batch.obs,
+    )
     optimizer = optimizers.make(config.optimizer, config.max_grad_norm)
-
-    def policy(outputs: Array) -> TanhNormal:
-        mean, log_std = jnp.split(outputs, 2, axis=-1)
-        return TanhNormal(mean, config.log_std(log_std))
-
-    def init(key: Array) -> State:
-        return initial_state(key, obs_leaves, action_dim, config, optimizer)
-
-    def update(state: State, batch: Transition, clock: Clock) -> tuple[State, Metrics]:
-        target_key, actor_key = jax.random.split(nth(state.key, state.n_updates))
-        rate, alpha = at(config.learning_rate, clock.progress), jnp.exp(state.log_alpha)
-        next_action, next_log_prob = policy(state.actor(batch.next_obs)).sample_and_log_prob(target_key)
-        obs = joined(batch.obs, batch.next_obs)
-        pairs = obs, joined(batch.action, next_action)
-        target = without_gradient(td_target)(state.target_critics, *pairs, batch, alpha * next_log_prob, values)
-        critics, critics_optimizer, critic_loss, (logits, trained) = minimize(
-            critics_loss, state.critics, state.critics_optimizer, optimizer, rate, *pairs, target, batch.weight
-        )
-        critics = projected(with_statistics(critics, trained))
-        state = after_critics(state, critics, critics_optimizer, config)
-
-        def improve(state: State) -> tuple[State, Array, Array]:
-            seen = obs if config.reads_both else batch.obs
-            judged = critics, alpha, batch.obs, seen, actor_key, values, policy
-            actor, actor_optimizer, loss, (log_prob, trained) = minimize(
-                actor_loss, state.actor, state.actor_optimizer, optimizer, rate, *judged
-            )
-            actor = projected(with_statistics(actor, trained))
-            state = after_actor(state, actor, actor_optimizer, log_prob, target_entropy, config, rate)
-            return state, loss, -jnp.mean(log_prob)
-
-        state, policy_loss, entropy = every(config.policy_delay, state, improve)
-        predicted, wanted = mean_of(logits, values), target @ values
-        return state, metrics_of(critic_loss, policy_loss, alpha, entropy, predicted, wanted, target_entropy, config)
-
-    def explore(actor: RenormalizedNetwork, obs: PyTree, key: Array, clock: Clock) -> Array:
-        return policy(actor(obs)).sample(key)
-
-    explorer = None
-    if config.noise_repeat > 1:
-        explorer = held_explorer(lambda actor, obs: policy(actor(obs)), action_dim, config.noise_repeat)
-    return Algorithm(
-        init,
-        lambda state: state.actor,
-        explore,
-        lambda actor, obs: policy(actor(obs)).mode(),
-        update,
-        explorer,
-        action_values=lambda state, obs, action: action_values(state.critics, obs, action, values),
-    )
+    return make_with(config, observation_space, action_space, equations, optimizer)
 
 
-def initial_state(
-    key: Array, obs_leaves: tuple[Leaf, ...], action_dim: int, config: Config, optimizer: Optimizer
-) -> State:
-    """Returns the state before the first update."""
-    actor_key, critics_key, update_key = jax.random.split(key, 3)
-    shape: PolicyConfig = config.policy_kwargs
-
-    def network(key: Array, n_actions: int | None, n_outputs: int, widths: tuple[int, ...]) -> RenormalizedNetwork:
-        torso: Callable[[Array, int], Any] = lambda key, n_inputs: config.torso(key, n_inputs, widths)  # noqa: E731
-        return RenormalizedNetwork(key, obs_leaves, n_actions, n_outputs, torso, head)
-
-    widths = shape.critic_widths(config.hidden_layers.critics)
-    actor = network(actor_key, None, 2 * action_dim, shape.actor_widths(config.hidden_layers.actor))
-    critics = ensemble(lambda k: network(k, action_dim, config.n_bins, widths), critics_key, config.n_critics)
-    log_alpha, alpha_optimizer = initial_alpha(config)
-    return State(
-        actor=actor,
-        critics=critics,
-        target_critics=copy(critics),
-        log_alpha=log_alpha,
-        actor_optimizer=optimizer.init(actor),
-        critics_optimizer=optimizer.init(critics),
-        alpha_optimizer=alpha_optimizer,
-        key=update_key,
-        n_updates=jnp.int32(0),
-        actor_loss=None if config.policy_delay == 1 else jnp.float32(0.0),
-        entropy=None if config.policy_delay == 1 else jnp.float32(0.0),
-    )
-
-
-def joined(now: PyTree, then: PyTree) -> PyTree:
-    """Returns two batches as one of twice the size."""
-    return jax.tree.map(lambda a, b: jnp.concatenate([a, b], axis=0), now, then)
-
-
-def trained_logits(critics: Any, obs: PyTree, action: Array) -> tuple[Array, Any]:
-    """Returns the logits of each critic in training, ``(n_critics, batch, n_bins)``, and critics that have seen the batch."""
-    return jax.vmap(lambda critic: critic.train(obs, action))(critics)
-
-
-def action_values(critics: Any, obs: PyTree, action: Array, values: Array) -> Array:
+def action_values(critics: Any, obs: PyTree, action: Array, atoms: Array) -> Array:
     """Returns the mean of each critic's distribution by the running statistics, ``(n_critics, batch)``."""
-    return mean_of(jax.vmap(lambda critic: critic(obs, action))(critics), values)
+    return mean_of(jax.vmap(lambda critic: critic(obs, action))(critics), atoms)
 
 
 def td_target(
-    target_critics: Any, obs: PyTree, action: Array, batch: Transition, next_entropy_cost: Array, values: Array
+    target_critics: Any, batch: Transition, next_action: Array, next_entropy_cost: Array, atoms: Array
 ) -> Array:
     """Returns the distributions that the critics should predict, ``(batch, n_bins)``.
 
     Args:
         target_critics: stacked; of each pair the one with the least mean counts.
-        obs: those of the batch and, after them, the next ones.
-        action: likewise, with those that the policy takes next.
-        batch: gives rewards and discounts.
+        batch: of transitions.
+        next_action: that the policy takes at ``batch.next_obs``.
         next_entropy_cost: ``alpha log pi(a' | s')``, ``(batch,)``.
-        values: of the bins.
+        atoms: the values of the bins.
     """
-    logits = jnp.split(trained_logits(target_critics, obs, action)[0], 2, axis=1)[1]
-    least = jnp.argmin(mean_of(logits, values), axis=0)
+    _, logits, _ = joint_outputs(target_critics, batch, next_action)
+    least = jnp.argmin(mean_of(logits, atoms), axis=0)
     chosen = jnp.take_along_axis(logits, least[None, :, None], axis=0)[0]
-    atoms = batch.reward[:, None] + batch.discount[:, None] * (values[None] - next_entropy_cost[:, None])
-    return project(atoms, jax.nn.softmax(chosen), values)
+    following = batch.reward[:, None] + batch.discount[:, None] * (atoms[None] - next_entropy_cost[:, None])
+    return project(following, jax.nn.softmax(chosen), atoms)
 
 
-def critics_loss(
-    critics: Any, obs: PyTree, action: Array, target: Array, weight: Array | None
-) -> tuple[Array, tuple[Array, Any]]:
-    """Returns the cross-entropy of the first half, averaged over the batch and summed over critics.
+def critics_loss(critics: Any, batch: Transition, next_action: Array, target: Array) -> tuple[Array, tuple[Array, Any]]:
+    """Returns the cross-entropy of ``target`` and the predictions, averaged over the batch and summed over critics.
 
-    With it come the logits of the first half ``(n_critics, batch, n_bins)`` and the critics that have seen the batch.
+    With it come the predicted logits ``(n_critics, batch, n_bins)`` and the critics that have seen the batch.
     """
-    logits, trained = trained_logits(critics, obs, action)
-    logits = jnp.split(logits, 2, axis=1)[0]
-    return jnp.sum(weighted_mean(cross_entropy(logits, target), weight)), (logits, trained)
+    logits, _, trained = joint_outputs(critics, batch, next_action)
+    return jnp.sum(weighted_mean(cross_entropy(logits, target), batch.weight)), (logits, trained)
 
 
-def actor_loss(
-    actor: RenormalizedNetwork,
-    critics: Any,
-    alpha: Array,
-    obs: PyTree,
-    seen: PyTree,
-    key: Array,
-    values: Array,
-    policy: Callable[[Array], TanhNormal],
-) -> tuple[Array, tuple[Array, RenormalizedNetwork]]:
-    """Returns the soft policy loss at ``obs``, the critics judging by their running statistics.
-
-    The actor normalizes by ``seen``, which begins with ``obs``. With the loss come the log-probabilities of the actions drawn,
-    ``(batch,)``, and the actor that has seen the batch.
-    """
-    outputs, trained = actor.train(seen)
-    action, log_prob = policy(outputs[: len(jax.tree.leaves(obs)[0])]).sample_and_log_prob(key)
-    value = jnp.min(action_values(critics, obs, action, values), axis=0)
-    return jnp.mean(alpha * log_prob - value), (log_prob, trained)
+def measure(logits: Array, target: tuple[Array, Array], atoms: Array) -> tuple[Array, Array]:
+    """Returns the values that logits and the second part of ``target`` mean: the former and their errors."""
+    values = mean_of(logits, atoms)
+    return values, values - (target[1] @ atoms)[None]

@@ -17,48 +17,21 @@ Stable-Baselines3 Contrib takes their mean.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from functools import partial
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 from gymnasium import spaces
 from jax import Array
 
-from rejeu.algorithms import optimizers, search
-from rejeu.algorithms.memory import remembering
+from rejeu.algorithms import search
 from rejeu.algorithms.quantile_loss import quantile_huber_loss
-from rejeu.algorithms.sac.continuous import (
-    HIDDEN_LAYERS,
-    Config as SACConfig,
-    SdeActor,
-    State,
-    after_actor,
-    after_critics,
-    every,
-    exploit,
-    explore,
-    explorer_of,
-    initial_state,
-    metrics_of,
-    networks,
-    policy,
-)
+from rejeu.algorithms.sac.continuous import Config as SACConfig, SdeActor, make_with, policy
 from rejeu.algorithms.search import Integers, SearchSpace
-from rejeu.core.algorithm import (
-    Algorithm,
-    Clock,
-    Metrics,
-    PyTree,
-    Transition,
-    minimize,
-    weighted_mean,
-    without_gradient,
-)
-from rejeu.core.prng import nth
-from rejeu.core.schedules import at
-from rejeu.core.spaces import Leaf, action_dimension, check_box_action, leaves
+from rejeu.core.algorithm import Algorithm, PyTree, Transition, weighted_mean
 from rejeu.core.validation import MOST_OUTPUTS, coerce, whole
-from rejeu.networks import Network, QNetwork, each, with_dropout
+from rejeu.networks import Network, QNetwork, each
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,47 +64,11 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         ValueError: if the action space is not a finite Box.
         TypeError: if the observation space holds something that is not an array.
     """
-    action_dim = action_dimension(check_box_action(action_space, config.name))
-    obs_leaves, shape = leaves(observation_space), config.policy_kwargs
-    target_entropy = config.entropy_target(-float(action_dim), action_dim)
     n_pooled = config.target_subset or config.n_critics
     n_kept = n_pooled * (config.n_quantiles - config.top_quantiles_to_drop_per_net)
-    optimizer = optimizers.make(config.optimizer, config.max_grad_norm)
-
-    def critic(key: Array, leaves: tuple[Leaf, ...], shape: Any) -> QNetwork:
-        widths = shape.critic_widths(HIDDEN_LAYERS)
-        return QNetwork(key, leaves, action_dim, widths, shape, config.n_quantiles)
-
-    def init(key: Array) -> State:
-        return initial_state(key, obs_leaves, 2 * action_dim, critic, config, optimizer)
-
-    def update(state: State, batch: Transition, clock: Clock) -> tuple[State, Metrics]:
-        target_key, actor_key = jax.random.split(nth(state.key, state.n_updates))
-        rate, alpha = at(config.learning_rate, clock.progress), jnp.exp(state.log_alpha)
-        target_critics = config.for_target(state.target_critics, target_key)
-        target = without_gradient(td_target)(state.actor, target_critics, alpha, batch, target_key, n_kept)
-        drop, judge_drop = config.dropout_keys(actor_key)
-        critics, critics_optimizer, critic_loss, quantiles = minimize(
-            critics_loss, state.critics, state.critics_optimizer, optimizer, rate, batch, target, drop
-        )
-        state = after_critics(state, critics, critics_optimizer, config)
-
-        def improve(state: State) -> tuple[State, Array, Array]:
-            judges = with_dropout(critics, judge_drop), alpha, batch.obs, actor_key
-            actor, actor_optimizer, loss, log_prob = minimize(
-                actor_loss, state.actor, state.actor_optimizer, optimizer, rate, *judges
-            )
-            state = after_actor(state, actor, actor_optimizer, log_prob, target_entropy, config, rate)
-            return state, loss, -jnp.mean(log_prob)
-
-        state, policy_loss, entropy = every(config.policy_delay, state, improve)
-        values, expected = jnp.mean(quantiles, axis=-1), jnp.mean(target, axis=-1)
-        return state, metrics_of(critic_loss, policy_loss, alpha, entropy, values, expected, target_entropy, config)
-
-    values = lambda state, obs, action: jnp.mean(action_quantiles(state.critics, obs, action), axis=-1)  # noqa: E731
-    actor = lambda state: state.actor  # noqa: E731
-    algorithm = Algorithm(init, actor, explore, exploit, update, explorer_of(config, action_dim), action_values=values)
-    return remembering(algorithm, shape, networks)
+    target = partial(td_target, n_kept=n_kept)
+    settings = config, observation_space, action_space
+    return make_with(*settings, target, critics_loss, mean_values, judge, config.n_quantiles, measure)
 
 
 def action_quantiles(critics: QNetwork, obs: PyTree, action: Array) -> Array:
@@ -149,6 +86,11 @@ def truncate(quantiles: Array, n_kept: int) -> Array:
     return -jax.lax.top_k(-pooled, n_kept)[0]
 
 
+def mean_values(critics: QNetwork, obs: PyTree, action: Array) -> Array:
+    """Returns the mean of each critic's quantiles, ``(n_critics, batch)``."""
+    return jnp.mean(action_quantiles(critics, obs, action), axis=-1)
+
+
 def td_target(
     actor: Network | SdeActor, target_critics: QNetwork, alpha: Array, batch: Transition, key: Array, n_kept: int
 ) -> Array:
@@ -158,22 +100,18 @@ def td_target(
     return batch.reward[:, None] + batch.discount[:, None] * (kept - (alpha * next_log_prob)[:, None])
 
 
-def critics_loss(critics: QNetwork, batch: Transition, target: Array, drop: Array | None = None) -> tuple[Array, Array]:
-    """Returns the quantile Huber loss, averaged over the batch and summed over critics, and the critics' quantiles.
-
-    ``drop`` is the key of the critics' dropout, None for none.
-    """
-    quantiles = action_quantiles(with_dropout(critics, drop), batch.obs, batch.action)
+def critics_loss(critics: QNetwork, batch: Transition, target: Array) -> tuple[Array, Array]:
+    """Returns the quantile Huber loss, averaged over the batch and summed over critics, and the critics' quantiles."""
+    quantiles = action_quantiles(critics, batch.obs, batch.action)
     return jnp.sum(weighted_mean(quantile_huber_loss(quantiles, target), batch.weight)), quantiles
 
 
-def actor_loss(
-    actor: Network | SdeActor, critics: QNetwork, alpha: Array, obs: PyTree, key: Array
-) -> tuple[Array, Array]:
-    """Returns the soft policy loss and the log-probabilities of the actions drawn, ``(batch,)``.
+def measure(quantiles: Array, target: Array) -> tuple[Array, Array]:
+    """Returns the means of the critics' quantiles, and how far they are from those of the targets, ``(n_critics, batch)``."""
+    values = jnp.mean(quantiles, axis=-1)
+    return values, values - jnp.mean(target, axis=-1)[None]
 
-    The value of an action is the mean of all quantiles, none left out.
-    """
-    action, log_prob = policy(actor, obs).sample_and_log_prob(key)
-    value = jnp.mean(action_quantiles(critics, obs, action), axis=(0, 2))
-    return jnp.mean(alpha * log_prob - value), log_prob
+
+def judge(critics: QNetwork, obs: PyTree, action: Array) -> Array:
+    """Returns the value of an action that the actor climbs, ``(batch,)``: the mean of all quantiles, none left out."""
+    return jnp.mean(action_quantiles(critics, obs, action), axis=(0, 2))

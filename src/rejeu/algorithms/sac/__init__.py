@@ -3,7 +3,8 @@
 from gymnasium import spaces
 
 from rejeu.algorithms.sac import continuous, discrete, mixed
-from rejeu.algorithms.sac.continuous import Config, State
+from rejeu.algorithms.sac.continuous import Config
+from rejeu.algorithms.soft import State
 from rejeu.core.algorithm import Algorithm
 
 __all__ = ["Config", "State", "make"]

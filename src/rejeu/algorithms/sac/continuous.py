@@ -10,11 +10,8 @@ critics ``Q'_i``, temperature ``alpha`` and discount ``d`` (0 where the MDP term
     J_alpha     = -mean log_alpha (log pi(a | s) + target_entropy)      unless the temperature is fixed
     Q'_i       <- Q'_i + tau (Q_i - Q'_i)
 
-One update takes these steps in this order: critics, actor (against the new critics), temperature, targets. The actor and
-the temperature share one sample of actions, and the losses use the temperature from before the update, as in
-Stable-Baselines3. The critics' losses are summed over the critics, which gives each the gradient of its own ``J_Q``. As in
-Stable-Baselines3, the temperature's loss is written in ``log alpha`` rather than ``alpha``. TQC and CrossQ share the
-temperature.
+The order of the steps, temperature and targets are those of :mod:`rejeu.algorithms.soft`, as in Stable-Baselines3. The
+critics' losses are summed over the critics, which gives each the gradient of its own ``J_Q``.
 
 With ``target_subset`` M, ``min`` in ``y`` is over M critics that are drawn anew for each update, and ``J_pi`` has the mean
 of all critics in place of ``min``: REDQ (Chen et al. 2021, arXiv 2101.05982, algorithm 1), which has 10 critics, M = 2, and
@@ -24,11 +21,11 @@ DroQ (Hiraoka et al. 2022, arXiv 2110.02034, algorithm 2).
 
 from __future__ import annotations
 
-import dataclasses
-import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, TypeVar
+from functools import partial
+from types import MappingProxyType
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -38,30 +35,10 @@ from jax import Array
 
 from rejeu.algorithms import optimizers
 from rejeu.algorithms.actor_critic.network import sde_explorer, sde_log_std
-from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.algorithms.memory import remembering
-from rejeu.core.algorithm import (
-    AVERAGED,
-    TD_ERROR,
-    Algorithm,
-    Clock,
-    Explorer,
-    Metrics,
-    Optimizer,
-    PyTree,
-    Transition,
-    copy,
-    descend,
-    ensemble,
-    minimize,
-    polyak,
-    tau_at,
-    weighted_mean,
-    without_gradient,
-)
+from rejeu.algorithms.soft import EntropyConfig, SoftCritic, soft_actor_critic
+from rejeu.core.algorithm import Algorithm, Clock, Explorer, PyTree, Transition, ensemble, weighted_mean
 from rejeu.core.distributions import TanhNormal
-from rejeu.core.prng import nth
-from rejeu.core.schedules import at
 from rejeu.core.spaces import Leaf, action_dimension, check_box_action, leaves
 from rejeu.core.validation import coerce, flag, number, whole
 from rejeu.exploration.held_noise import held_explorer
@@ -73,66 +50,16 @@ from rejeu.networks import (
     make_head,
     make_torso,
     some,
-    values_by_critics,
     with_dropout,
     with_memory,
 )
 
-S = TypeVar("S", bound=Any)
-"""The state of an algorithm with an entropy bonus."""
 LOG_STD_RANGE = (-20.0, 2.0)
 """Bounds of the policy's log standard deviation, in nats, as in the authors' code."""
-
-
 SDE_MEAN = 2.0
 """Largest mean of a policy with gSDE before squashing."""
 HIDDEN_LAYERS = (256, 256)
 """Default widths of actor and critics."""
-ALPHA_OPTIMIZER = optimizers.make("adam")
-"""Of the temperature, whatever the optimizer of the networks is."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class EntropyConfig(OffPolicyConfig):
-    """The hyperparameters of algorithms with an entropy bonus and several critics. Abstract."""
-
-    ent_coef: float | str = "auto"
-    """Temperature of the entropy bonus: ``"auto"`` learns it from 1, ``"auto_0.1"`` from 0.1, a number fixes it. A larger
-    value explores more."""
-    target_entropy: float | str = "auto"
-    """Target entropy in nats for learning the temperature. ``"auto"`` is minus the number of action dimensions; for n
-    Discrete actions 0.3 log n (the paper's 0.98 log n keeps the policy nearly uniform). ``"std_0.15"`` is that of normal
-    distributions with this standard deviation, the range of an action being [-1, 1]."""
-    n_critics: int = 2
-    """Number of critics."""
-    noise_repeat: int = 1
-    """Most steps for which the noise of an action stays the same; most spells are short (FlashSAC). A larger number explores
-    further from where the policy is. Box actions only, without ``action_noise``. 1: fresh noise in every step."""
-
-    def __post_init__(self) -> None:
-        OffPolicyConfig.__post_init__(self)
-        initial_temperature(self.ent_coef)
-        coerce(self, "target_entropy", entropy_target)
-        coerce(self, "noise_repeat", whole, least=1)
-        for key, given in (("action_noise", self.action_noise is not None), ("lstm_hidden_size", self.has_memory)):
-            if self.noise_repeat > 1 and given:
-                raise ValueError(f"noise_repeat={self.noise_repeat} is not available with {key}; leave one of them out")
-        coerce(self, "n_critics", whole, least=1)
-
-    def entropy_target(self, automatic: float, action_dim: int = 0) -> float:
-        """Returns the target entropy in nats, ``automatic`` for ``"auto"``.
-
-        That of a standard deviation ``std`` is ``n log(2 pi e std^2) / 2`` for ``n`` components of a Box.
-        """
-        if isinstance(self.target_entropy, str) and self.target_entropy != "auto":
-            std = float(self.target_entropy.removeprefix("std_"))
-            return 0.5 * action_dim * math.log(2 * math.pi * math.e * std**2)
-        return automatic if self.target_entropy == "auto" else float(self.target_entropy)
-
-    @property
-    def learns_temperature(self) -> bool:
-        """Whether the temperature is learned."""
-        return isinstance(self.ent_coef, str)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -224,72 +151,101 @@ class SdeActor(eqx.Module):
         return TanhNormal(mean, sde_log_std(self.log_std, hidden, self.use_expln))
 
 
-class State(eqx.Module):
-    """Everything that SAC learns; every leaf is an array."""
-
-    actor: Any
-    """A :class:`Network`, with gSDE an :class:`SdeActor`."""
-    critics: Any
-    """All critics, stacked along a leading axis."""
-    target_critics: Any = eqx.field(metadata=AVERAGED)
-    log_alpha: Array
-    actor_optimizer: PyTree
-    critics_optimizer: PyTree
-    alpha_optimizer: PyTree
-    key: Array
-    """Root of the random numbers of the updates, ``uint32[2]``; never changes."""
-    n_updates: Array
-    """Gradient steps taken, ``int32[]``."""
-    actor_loss: Array | None = None
-    """Of the actor's last step, ``float32[]``, with ``policy_delay``."""
-    entropy: Array | None = None
-    """Of the policy at that step, in nats, ``float32[]``, likewise."""
-
-
 def make(config: Config, observation_space: spaces.Space, action_space: spaces.Space) -> Algorithm:
     """Returns SAC for Box actions."""
+    judge = partial(value, judged_by=config.judged_by)
+    return make_with(config, observation_space, action_space, td_target, critics_loss, action_values, judge)
+
+
+def make_with(
+    config: Config,
+    observation_space: spaces.Space,
+    action_space: spaces.Space,
+    td_target: Callable[[Any, Any, Array, Transition, Array], Array],
+    critics_loss: Callable[[Any, Transition, Array], tuple[Array, Any]],
+    values: Callable[[Any, PyTree, Array], Array],
+    judge: Callable[[Any, PyTree, Array], Array],
+    n_outputs: int = 1,
+    measure: Callable[[Any, Any], tuple[Array, Array]] = lambda errors, target: errors,
+) -> Algorithm:
+    """Returns SAC for Box actions with critics of ``n_outputs`` and functions of its own, as those of this module.
+
+    ``values`` is as :func:`rejeu.networks.action_values`, ``judge`` as :func:`value`, ``measure`` as of :class:`SoftCritic`.
+    """
     action_dim = action_dimension(check_box_action(action_space, config.name))
-    obs_leaves, shape = leaves(observation_space), config.policy_kwargs
     target_entropy = config.entropy_target(-float(action_dim), action_dim)
-    optimizer = optimizers.make(config.optimizer, config.max_grad_norm)
 
     def critic(key: Array, leaves: tuple[Leaf, ...], shape: Any) -> QNetwork:
-        return QNetwork(key, leaves, action_dim, shape.critic_widths(HIDDEN_LAYERS), shape)
+        return QNetwork(key, leaves, action_dim, shape.critic_widths(HIDDEN_LAYERS), shape, n_outputs)
 
-    def init(key: Array) -> State:
-        return initial_state(key, obs_leaves, 2 * action_dim, critic, config, optimizer)
-
-    def update(state: State, batch: Transition, clock: Clock) -> tuple[State, Metrics]:
-        target_key, actor_key = jax.random.split(nth(state.key, state.n_updates))
-        rate, alpha = at(config.learning_rate, clock.progress), jnp.exp(state.log_alpha)
-        target_critics = config.for_target(state.target_critics, target_key)
-        target = without_gradient(td_target)(state.actor, target_critics, alpha, batch, target_key)
-        drop, judge_drop = config.dropout_keys(actor_key)
-        critics, critics_optimizer, critic_loss, values = minimize(
-            critics_loss, state.critics, state.critics_optimizer, optimizer, rate, batch, target, drop
-        )
-        state = after_critics(state, critics, critics_optimizer, config)
-
-        def improve(state: State) -> tuple[State, Array, Array]:
-            judges = with_dropout(critics, judge_drop), alpha, batch.obs, actor_key, config.judged_by
-            actor, actor_optimizer, loss, log_prob = minimize(
-                actor_loss, state.actor, state.actor_optimizer, optimizer, rate, *judges
-            )
-            state = after_actor(state, actor, actor_optimizer, log_prob, target_entropy, config, rate)
-            return state, loss, -jnp.mean(log_prob)
-
-        state, policy_loss, entropy = every(config.policy_delay, state, improve)
-        return state, metrics_of(critic_loss, policy_loss, alpha, entropy, values, target, target_entropy, config)
-
-    actor = lambda state: state.actor  # noqa: E731
-    explorer = explorer_of(config, action_dim)
-    algorithm = Algorithm(init, actor, explore, exploit, update, explorer, action_values=values_by_critics)
-    return remembering(algorithm, shape, networks)
+    parts = SoftCritic(
+        *networks(config, leaves(observation_space), 2 * action_dim, critic),
+        target=td_target,
+        critics_loss=lambda critics, batch, target, key: critics_loss(critics, batch, target),
+        actor_loss=lambda actor, critics, alpha, batch, key: actor_loss(actor, critics, alpha, batch.obs, key, judge),
+        target_entropy=lambda obs: target_entropy,
+        measure=measure,
+    )
+    queries = {"action_values": lambda state, obs, action: values(state.critics, obs, action)}
+    return algorithm_of(parts, config, explore, exploit, {**queries, "explorer": explorer_of(config, action_dim)})
 
 
-def networks(state: State) -> tuple[Any, ...]:
-    """Returns the networks that may have a memory."""
-    return state.actor, state.critics
+def algorithm_of(
+    parts: SoftCritic,
+    config: Config,
+    explore: Callable[..., Array],
+    exploit: Callable[..., Array],
+    others: Mapping[str, Any] = MappingProxyType({}),
+) -> Algorithm:
+    """Returns the algorithm of these parts and ``others`` of :class:`Algorithm`, with what its settings add.
+
+    That is a target of a subset of the critics, dropout in them, and memory.
+    """
+    parts = parts if config.target_subset is None and not config.policy_kwargs.dropout else drawn(parts, config)
+    optimizer = optimizers.make(config.optimizer, config.max_grad_norm)
+    algorithm = soft_actor_critic(parts, config, explore, exploit, optimizer)._replace(**others)
+    return remembering(algorithm, config.policy_kwargs, lambda state: (state.actor, state.critics))
+
+
+def drawn(parts: SoftCritic, config: Config) -> SoftCritic:
+    """Returns the same with ``target_subset`` (REDQ) and with dropout in the critics in every pass (DroQ)."""
+
+    def target(actor: Any, target_critics: Any, alpha: Array, batch: Transition, key: Array) -> Any:
+        return parts.target(actor, config.for_target(target_critics, key), alpha, batch, key)
+
+    def critics_loss(critics: Any, batch: Transition, target: Any, key: Array) -> tuple[Array, Any]:
+        return parts.critics_loss(with_dropout(critics, config.dropout_keys(key)[0]), batch, target, key)
+
+    def actor_loss(actor: Any, critics: Any, alpha: Array, batch: Transition, key: Array) -> tuple[Array, Any]:
+        return parts.actor_loss(actor, with_dropout(critics, config.dropout_keys(key)[1]), alpha, batch, key)
+
+    return parts._replace(target=target, critics_loss=critics_loss, actor_loss=actor_loss)
+
+
+def networks(
+    config: Config,
+    obs_leaves: tuple[Leaf, ...],
+    n_outputs: int,
+    critic: Callable[[Array, tuple[Leaf, ...], Any], Any],
+) -> tuple[Callable[[Array], Any], Callable[[Array], Any]]:
+    """Returns functions of a key that build an actor of ``n_outputs``, and ``config.n_critics`` critics.
+
+    ``critic(key, leaves, shape)`` returns one critic of such observations. With gSDE the actor has half as many outputs, the
+    means.
+    """
+    shape = config.policy_kwargs
+
+    def actor(key: Array) -> Any:
+        if config.use_sde:
+            return SdeActor(key, obs_leaves, n_outputs // 2, config)
+        build = lambda leaves, shape: Network(key, leaves, n_outputs, shape.actor_widths(HIDDEN_LAYERS), shape)  # noqa: E731
+        return with_memory(key, obs_leaves, shape, build)
+
+    def critics(key: Array) -> Any:
+        build = lambda leaves, shape: ensemble(lambda key: critic(key, leaves, shape), key, config.n_critics)  # noqa: E731
+        return with_memory(key, obs_leaves, shape, build, slot=1)
+
+    return actor, critics
 
 
 def explorer_of(config: Config, action_dim: int) -> Explorer | None:
@@ -308,95 +264,6 @@ def check_discrete(config: Config) -> None:
     }
     if wrong := [setting for setting, is_given in given.items() if is_given]:
         raise ValueError(f"{wrong[0]} needs Box actions: noise cannot be added to discrete actions; leave it out")
-
-
-def initial_state(
-    key: Array,
-    obs_leaves: tuple[Leaf, ...],
-    n_outputs: int,
-    make_critic: Callable[[Array, tuple[Leaf, ...], Any], Any],
-    config: Config,
-    optimizer: Optimizer,
-) -> State:
-    """Returns the state before the first update: an actor of ``n_outputs``, and ``config.n_critics`` critics.
-
-    ``make_critic(key, leaves, shape)`` returns one critic of such observations. With gSDE the actor has half as many
-    outputs, the means.
-    """
-    actor_key, critics_key, update_key = jax.random.split(key, 3)
-    shape = config.policy_kwargs
-    actor: Network | SdeActor
-    if config.use_sde:
-        actor = SdeActor(actor_key, obs_leaves, n_outputs // 2, config)
-    else:
-        actor = with_memory(
-            actor_key,
-            obs_leaves,
-            shape,
-            lambda leaves, shape: Network(actor_key, leaves, n_outputs, shape.actor_widths(HIDDEN_LAYERS), shape),
-        )
-    critics = with_memory(
-        critics_key,
-        obs_leaves,
-        shape,
-        lambda leaves, shape: ensemble(lambda key: make_critic(key, leaves, shape), critics_key, config.n_critics),
-        slot=1,
-    )
-    log_alpha, alpha_optimizer = initial_alpha(config)
-    return State(
-        actor=actor,
-        critics=critics,
-        target_critics=copy(critics),
-        log_alpha=log_alpha,
-        actor_optimizer=optimizer.init(actor),
-        critics_optimizer=optimizer.init(critics),
-        alpha_optimizer=alpha_optimizer,
-        key=update_key,
-        n_updates=jnp.int32(0),
-        actor_loss=None if config.policy_delay == 1 else jnp.float32(0.0),
-        entropy=None if config.policy_delay == 1 else jnp.float32(0.0),
-    )
-
-
-def after_critics(state: State, critics: Any, optimizer_state: PyTree, config: Any) -> State:
-    """Returns the state with new critics, their optimizer's state, and the targets moved by ``config.tau`` if they are due."""
-    n_updates = state.n_updates + 1
-    tau = tau_at(n_updates, config.tau, config.target_update_interval)
-    targets = polyak(state.target_critics, critics, tau)
-    return dataclasses.replace(
-        state, critics=critics, critics_optimizer=optimizer_state, target_critics=targets, n_updates=n_updates
-    )
-
-
-def after_actor(
-    state: S, actor: Any, optimizer_state: PyTree, log_prob: Array, target_entropy: Any, config: Any, rate: Any
-) -> S:
-    """Returns the state with a new actor and its optimizer's state, after a step of the temperature.
-
-    ``log_prob`` is that of the actions that the actor sampled, ``(batch,)``; ``target_entropy`` is in nats.
-    """
-    log_alpha, alpha_optimizer = temperature_step(
-        state.log_alpha, state.alpha_optimizer, log_prob, target_entropy, config, rate
-    )
-    return dataclasses.replace(
-        state, actor=actor, actor_optimizer=optimizer_state, log_alpha=log_alpha, alpha_optimizer=alpha_optimizer
-    )
-
-
-def every(policy_delay: int, state: S, improve: Callable[[S], tuple[S, Array, Array]]) -> tuple[S, Array, Array]:
-    """Returns ``improve(state)`` at every ``policy_delay``-th update of the critics, which ``state.n_updates`` counts.
-
-    That is the state after a step of the actor, its loss and the entropy; at other updates those of its latest step.
-    """
-    if policy_delay == 1:
-        return improve(state)
-
-    def step(state: S) -> S:
-        state, loss, entropy = improve(state)
-        return dataclasses.replace(state, actor_loss=loss, entropy=entropy)
-
-    state = jax.lax.cond(state.n_updates % policy_delay == 0, step, lambda s: s, state)
-    return state, state.actor_loss, state.entropy
 
 
 def explore(actor: Network | SdeActor, obs: PyTree, key: Array, clock: Clock) -> Array:
@@ -426,105 +293,34 @@ def td_target(
     return batch.reward + batch.discount * (next_value - alpha * next_log_prob)
 
 
-def critics_loss(critics: QNetwork, batch: Transition, target: Array, drop: Array | None = None) -> tuple[Array, Array]:
-    """Returns half the squared TD error, averaged over the batch and summed over critics, and the values.
+def critics_loss(critics: QNetwork, batch: Transition, target: Array) -> tuple[Array, tuple[Array, Array]]:
+    """Returns half the squared TD error, averaged over the batch and summed over critics; the values and the TD errors."""
+    values = action_values(critics, batch.obs, batch.action)
+    return squared_error(values, target, batch)
 
-    ``drop`` is the key of the critics' dropout, None for none.
-    """
-    values = action_values(with_dropout(critics, drop), batch.obs, batch.action)
-    return 0.5 * jnp.sum(weighted_mean(jnp.square(values - target[None]), batch.weight)), values
+
+def squared_error(values: Array, target: Array, batch: Transition) -> tuple[Array, tuple[Array, Array]]:
+    """Returns the same of values ``(n_critics, batch)``, which come with it."""
+    error = values - target[None]
+    return 0.5 * jnp.sum(weighted_mean(jnp.square(error), batch.weight)), (values, error)
+
+
+def value(critics: QNetwork, obs: PyTree, action: Array, judged_by: Callable[..., Array] = jnp.min) -> Array:
+    """Returns the values of actions by all critics, ``(batch,)``, combined by ``jnp.min`` or ``jnp.mean``."""
+    return judged_by(action_values(critics, obs, action), axis=0)
 
 
 def actor_loss(
     actor: Network | SdeActor,
-    critics: QNetwork,
+    critics: Any,
     alpha: Array,
     obs: PyTree,
     key: Array,
-    judged_by: Callable[..., Array] = jnp.min,
+    judge: Callable[[Any, PyTree, Array], Array] = value,
 ) -> tuple[Array, Array]:
     """Returns the soft policy loss and the log-probabilities of the actions drawn, ``(batch,)`` (equation 7).
 
-    The critics are combined by ``judged_by``, ``jnp.min`` or ``jnp.mean``.
+    ``judge(critics, obs, action)`` returns the values of actions, ``(batch,)``.
     """
     action, log_prob = policy(actor, obs).sample_and_log_prob(key)
-    value = judged_by(action_values(critics, obs, action), axis=0)
-    return jnp.mean(alpha * log_prob - value), log_prob
-
-
-def entropy_target(key: str, value: Any) -> float | str:
-    """Returns a target entropy: ``"auto"``, ``"std_"`` and a positive number, or a number."""
-    if isinstance(value, str) and value != "auto":
-        try:
-            good = value.startswith("std_") and 0 < float(value.removeprefix("std_")) < math.inf
-        except ValueError:
-            good = False
-        if not good:
-            raise ValueError(f"{key}={value!r} must be 'auto', 'std_0.15' or a number")
-    return value if isinstance(value, str) else number(key, value)
-
-
-def initial_temperature(ent_coef: float | str) -> float:
-    """Returns the initial temperature: 1 for ``"auto"``, x for ``"auto_x"`` and for x.
-
-    Raises:
-        ValueError: for anything else.
-    """
-    if isinstance(ent_coef, str):
-        rest = ent_coef.removeprefix("auto").removeprefix("_")
-        try:
-            value = float(rest) if rest else 1.0
-        except ValueError:
-            value = -1.0
-        if ent_coef.startswith("auto") and 0 < value < math.inf:
-            return value
-    elif not isinstance(ent_coef, bool) and isinstance(ent_coef, int | float) and 0 < ent_coef < math.inf:
-        return float(ent_coef)
-    raise ValueError(f"ent_coef={ent_coef!r} must be 'auto', 'auto_0.1' or a positive number")
-
-
-def initial_alpha(config: EntropyConfig) -> tuple[Array, PyTree]:
-    """Returns the initial logarithm of the temperature, and the state of its optimizer."""
-    log_alpha = jnp.log(jnp.float32(initial_temperature(config.ent_coef)))
-    return log_alpha, ALPHA_OPTIMIZER.init(log_alpha)
-
-
-def temperature_loss(log_alpha: Array, log_prob: Array, target_entropy: Any) -> Array:
-    """Returns the loss that raises the temperature while the policy's entropy is below its target.
-
-    Of several temperatures ``(n,)``, with ``log_prob (batch, n)`` and targets ``(1, n)``, it is the sum.
-    """
-    weight = jnp.broadcast_to(log_alpha, log_prob.shape)
-    return -jnp.sum(jnp.mean(weight * (jax.lax.stop_gradient(log_prob) + target_entropy), axis=0))
-
-
-def temperature_step(
-    log_alpha: Array, optimizer_state: PyTree, log_prob: Array, target_entropy: Any, config: EntropyConfig, rate: Any
-) -> tuple[Array, PyTree]:
-    """Returns the temperature's logarithm and optimizer state after one step, unchanged if the temperature is fixed."""
-    if not config.learns_temperature:
-        return log_alpha, optimizer_state
-    gradient = jax.grad(temperature_loss)(log_alpha, log_prob, target_entropy)
-    return descend(log_alpha, gradient, optimizer_state, ALPHA_OPTIMIZER, rate)
-
-
-def metrics_of(
-    critic_loss: Array,
-    actor_loss: Array,
-    alpha: Array,
-    entropy: Array,
-    values: Array,
-    target: Array,
-    target_entropy: float,
-    config: EntropyConfig,
-) -> Metrics:
-    """Returns the metrics of an update, from the values ``(n_critics, batch)`` and their targets ``(batch,)``."""
-    loss = {"ent_coef_loss": jnp.log(alpha) * (entropy - target_entropy)} if config.learns_temperature else {}
-    return loss | {
-        "critic_loss": critic_loss,
-        "actor_loss": actor_loss,
-        "ent_coef": alpha,
-        "entropy": entropy,
-        "q_value": jnp.mean(values),
-        TD_ERROR: jnp.mean(jnp.abs(values - target[None]), axis=0),
-    }
+    return jnp.mean(alpha * log_prob - judge(critics, obs, action)), log_prob

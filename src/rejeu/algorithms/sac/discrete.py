@@ -23,37 +23,19 @@ import jax.numpy as jnp
 from gymnasium import spaces
 from jax import Array
 
-from rejeu.algorithms import optimizers
-from rejeu.algorithms.memory import remembering
 from rejeu.algorithms.sac.continuous import (
     HIDDEN_LAYERS,
     Config,
-    State,
-    after_actor,
-    after_critics,
+    algorithm_of,
     check_discrete,
-    every,
-    initial_state,
-    metrics_of,
     networks,
+    squared_error,
 )
-from rejeu.core.algorithm import (
-    Algorithm,
-    Clock,
-    Metrics,
-    PyTree,
-    Transition,
-    minimize,
-    some_allowed,
-    unmasked,
-    weighted_mean,
-    without_gradient,
-)
+from rejeu.algorithms.soft import SoftCritic
+from rejeu.core.algorithm import Algorithm, Clock, PyTree, Transition, some_allowed, unmasked
 from rejeu.core.distributions import Categorical, forbid
-from rejeu.core.prng import nth
-from rejeu.core.schedules import at
 from rejeu.core.spaces import Leaf, leaves
-from rejeu.networks import Network, each, with_dropout
+from rejeu.networks import Network, each
 
 TARGET_ENTROPY_SHARE = 0.3
 """Automatic target entropy as a share of the uniform policy's."""
@@ -66,42 +48,25 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.D
         ValueError: with gSDE.
     """
     check_discrete(config)
-    obs_leaves, n_actions, shape = leaves(observation_space), int(action_space.n), config.policy_kwargs
-    optimizer = optimizers.make(config.optimizer, config.max_grad_norm)
+    n_actions = int(action_space.n)
 
     def critic(key: Array, leaves: tuple[Leaf, ...], shape: Any) -> Network:
         return Network(key, leaves, n_actions, shape.critic_widths(HIDDEN_LAYERS), shape)
 
-    def init(key: Array) -> State:
-        return initial_state(key, obs_leaves, n_actions, critic, config, optimizer)
+    def policy_loss(actor: Any, critics: Any, alpha: Array, batch: Transition, key: Array) -> tuple[Array, Array]:
+        judged = config.judged_by(all_values(critics, batch.obs), axis=0)
+        return actor_loss(actor, judged, alpha, batch.obs)
 
-    def update(state: State, batch: Transition, clock: Clock) -> tuple[State, Metrics]:
-        rate, alpha = at(config.learning_rate, clock.progress), jnp.exp(state.log_alpha)
-        target_entropy: Any = config.entropy_target(TARGET_ENTROPY_SHARE * mean_log_count(batch.obs, n_actions))
-        key = nth(state.key, state.n_updates)
-        target = without_gradient(td_target)(state.actor, config.for_target(state.target_critics, key), alpha, batch)
-        drop, judge_drop = config.dropout_keys(jax.random.fold_in(key, 3))
-        critics, critics_optimizer, critic_loss, values = minimize(
-            critics_loss, state.critics, state.critics_optimizer, optimizer, rate, batch, target, drop
-        )
-        state = after_critics(state, critics, critics_optimizer, config)
-
-        def improve(state: State) -> tuple[State, Array, Array]:
-            judged = config.judged_by(all_values(with_dropout(critics, judge_drop), batch.obs), axis=0)
-            actor, actor_optimizer, loss, entropy = minimize(
-                actor_loss, state.actor, state.actor_optimizer, optimizer, rate, judged, alpha, batch.obs
-            )
-            state = after_actor(state, actor, actor_optimizer, -entropy, target_entropy, config, rate)
-            return state, loss, jnp.mean(entropy)
-
-        state, policy_loss, entropy = every(config.policy_delay, state, improve)
-        return state, metrics_of(critic_loss, policy_loss, alpha, entropy, values, target, target_entropy, config)
-
-    values = lambda state, obs, action: all_values(state.critics, obs)  # noqa: E731
-    algorithm = Algorithm(
-        init, lambda state: state.actor, explore, exploit, update, action_values=values, imitation=imitation
+    parts = SoftCritic(
+        *networks(config, leaves(observation_space), n_actions, critic),
+        target=lambda actor, target_critics, alpha, batch, key: td_target(actor, target_critics, alpha, batch),
+        critics_loss=lambda critics, batch, target, key: critics_loss(critics, batch, target),
+        actor_loss=policy_loss,
+        target_entropy=lambda obs: config.entropy_target(TARGET_ENTROPY_SHARE * mean_log_count(obs, n_actions)),
+        keys=lambda key: (key, jax.random.fold_in(key, 3)),
     )
-    return remembering(algorithm, shape, networks)
+    values = lambda state, obs, action: all_values(state.critics, obs)  # noqa: E731
+    return algorithm_of(parts, config, explore, exploit, {"action_values": values, "imitation": imitation})
 
 
 def explore(actor: Network, obs: PyTree, key: Array, clock: Clock) -> Array:
@@ -142,17 +107,23 @@ def td_target(actor: Network, target_critics: PyTree, alpha: Array, batch: Trans
     return batch.reward + batch.discount * jnp.sum(jnp.exp(log_probabilities) * soft_values, axis=-1)
 
 
-def critics_loss(critics: PyTree, batch: Transition, target: Array, drop: Array | None = None) -> tuple[Array, Array]:
-    """Returns half the squared TD error summed over critics, and the values of the actions, ``(n_critics, batch)``."""
-    values = all_values(with_dropout(critics, drop), batch.obs)
-    index = jnp.broadcast_to(batch.action[None, :, None], (*values.shape[:-1], 1))
-    values = jnp.take_along_axis(values, index, axis=-1)[..., 0]
-    return 0.5 * jnp.sum(weighted_mean(jnp.square(values - target[None]), batch.weight)), values
+def critics_loss(critics: PyTree, batch: Transition, target: Array) -> tuple[Array, tuple[Array, Array]]:
+    """Returns half the squared TD error summed over critics; the values of the actions and the TD errors."""
+    return squared_error(taken(all_values(critics, batch.obs), batch.action), target, batch)
+
+
+def taken(values: Array, action: Array) -> Array:
+    """Returns the values of actions ``(batch,)`` among those of all, ``(n_critics, batch)``."""
+    index = jnp.broadcast_to(action[None, :, None], (*values.shape[:-1], 1))
+    return jnp.take_along_axis(values, index, axis=-1)[..., 0]
 
 
 def actor_loss(actor: Network, values: Array, alpha: Array, obs: PyTree) -> tuple[Array, Array]:
-    """Returns the soft policy loss and the entropies in nats, ``(batch,)``; ``values`` is ``(batch, n_actions)``."""
+    """Returns the soft policy loss, and the mean log-probabilities, which are minus the entropies in nats, ``(batch,)``.
+
+    ``values`` is ``(batch, n_actions)``.
+    """
     log_probabilities = jax.nn.log_softmax(logits(actor, obs))
     probabilities = jnp.exp(log_probabilities)
     loss = jnp.mean(jnp.sum(probabilities * (alpha * log_probabilities - values), axis=-1))
-    return loss, -jnp.sum(probabilities * log_probabilities, axis=-1)
+    return loss, jnp.sum(probabilities * log_probabilities, axis=-1)

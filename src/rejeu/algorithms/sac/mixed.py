@@ -16,7 +16,6 @@ components; a number given as ``target_entropy`` is that of the Box components.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable
 from typing import Any
@@ -27,36 +26,21 @@ import numpy as np
 from gymnasium import spaces
 from jax import Array
 
-from rejeu.algorithms import optimizers
 from rejeu.algorithms.sac.continuous import (
-    ALPHA_OPTIMIZER,
     HIDDEN_LAYERS,
     LOG_STD_RANGE,
     Config,
-    State,
-    after_actor,
-    after_critics,
+    algorithm_of,
     check_discrete,
-    every,
-    initial_state,
+    networks,
+    squared_error,
 )
-from rejeu.algorithms.sac.discrete import TARGET_ENTROPY_SHARE
-from rejeu.core.algorithm import (
-    TD_ERROR,
-    Algorithm,
-    Clock,
-    Metrics,
-    PyTree,
-    Transition,
-    minimize,
-    weighted_mean,
-    without_gradient,
-)
+from rejeu.algorithms.sac.discrete import TARGET_ENTROPY_SHARE, taken
+from rejeu.algorithms.soft import SoftCritic
+from rejeu.core.algorithm import Algorithm, Clock, Metrics, PyTree, Transition
 from rejeu.core.distributions import Categorical, TanhNormal
-from rejeu.core.prng import nth
-from rejeu.core.schedules import at
 from rejeu.core.spaces import Leaf, action_width, check_action, check_box_action, leaves, members
-from rejeu.networks import Network, QNetwork, with_dropout
+from rejeu.networks import Network, QNetwork
 
 MOST_COMBINATIONS = 1024
 """Upper limit on the combinations of choices, each of which is an output of every critic."""
@@ -79,9 +63,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     if n > MOST_COMBINATIONS:
         raise ValueError(f"SAC takes at most {MOST_COMBINATIONS:,} combinations of choices, got {n:,}; use PPO")
     order = np.argsort(np.argsort([size > 0 for size in sizes], kind="stable"))
-    obs_leaves = leaves(observation_space)
-    targets = jnp.array([[TARGET_ENTROPY_SHARE * math.log(n), config.entropy_target(-float(n_box))]])
-    optimizer = optimizers.make(config.optimizer, config.max_grad_norm)
+    target_entropy = jnp.array([[TARGET_ENTROPY_SHARE * math.log(n), config.entropy_target(-float(n_box))]])
 
     def joined(choice: Array, box: Array) -> Array:
         """Returns combinations ``(batch,)`` and Box components as actions ``(batch, action_width)``."""
@@ -98,14 +80,6 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     def critic(key: Array, leaves: tuple[Leaf, ...], shape: Any) -> QNetwork:
         return QNetwork(key, leaves, n_box, shape.critic_widths(HIDDEN_LAYERS), shape, n)
 
-    def init(key: Array) -> State:
-        state = initial_state(key, obs_leaves, n + 2 * n_box, critic, config, optimizer)
-        log_alpha = jnp.full((2,), state.log_alpha)
-        entropy = None if state.entropy is None else jnp.zeros((2,), jnp.float32)
-        return dataclasses.replace(
-            state, log_alpha=log_alpha, alpha_optimizer=ALPHA_OPTIMIZER.init(log_alpha), entropy=entropy
-        )
-
     def explore(actor: Network, obs: PyTree, key: Array, clock: Clock) -> Array:
         choice_key, box_key = jax.random.split(key)
         choice, box = policy(actor, obs, n)
@@ -115,39 +89,27 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         choice, box = policy(actor, obs, n)
         return joined(choice.mode(), box.mode())
 
-    def update(state: State, batch: Transition, clock: Clock) -> tuple[State, Metrics]:
-        target_key, actor_key = jax.random.split(nth(state.key, state.n_updates))
-        rate, alpha = at(config.learning_rate, clock.progress), jnp.exp(state.log_alpha)
-        target_critics = config.for_target(state.target_critics, target_key)
-        target = without_gradient(td_target)(state.actor, target_critics, alpha, batch, target_key, n)
-        choice, box = parted(batch.action)
-        drop, judge_drop = config.dropout_keys(actor_key)
-        critics, critics_optimizer, critic_loss, values = minimize(
-            critics_loss, state.critics, state.critics_optimizer, optimizer, rate, batch, choice, box, target, drop
-        )
-        state = after_critics(state, critics, critics_optimizer, config)
+    def policy_loss(actor: Any, critics: Any, alpha: Array, batch: Transition, key: Array) -> tuple[Array, Array]:
+        return actor_loss(actor, critics, alpha, batch.obs, key, n, config.judged_by)
 
-        def improve(state: State) -> tuple[State, Array, Array]:
-            judges = with_dropout(critics, judge_drop), alpha, batch.obs, actor_key, n, config.judged_by
-            actor, actor_optimizer, loss, log_prob = minimize(
-                actor_loss, state.actor, state.actor_optimizer, optimizer, rate, *judges
-            )
-            state = after_actor(state, actor, actor_optimizer, log_prob, targets, config, rate)
-            return state, loss, -jnp.mean(log_prob, axis=0)
+    parts = SoftCritic(
+        *networks(config, leaves(observation_space), n + 2 * n_box, critic),
+        target=lambda actor, critics, alpha, batch, key: td_target(actor, critics, alpha, batch, key, n),
+        critics_loss=lambda critics, batch, target, key: critics_loss(critics, batch, *parted(batch.action), target),
+        actor_loss=policy_loss,
+        target_entropy=lambda obs: target_entropy,
+        temperatures=(2,),
+    )
+    algorithm = algorithm_of(parts, config, explore, exploit)
 
-        state, policy_loss, entropies = every(config.policy_delay, state, improve)
-        return state, {
-            "critic_loss": critic_loss,
-            "actor_loss": policy_loss,
-            "ent_coef": alpha[0],
-            "ent_coef_box": alpha[1],
-            "entropy": entropies[0],
-            "entropy_box": entropies[1],
-            "q_value": jnp.mean(values),
-            TD_ERROR: jnp.mean(jnp.abs(values - target[None]), axis=0),
-        }
+    def update(state: Any, batch: Transition, clock: Clock) -> tuple[Any, Metrics]:
+        """Returns the state after an update and the metrics, those of the two temperatures by names of their own."""
+        state, metrics = algorithm.update(state, batch, clock)
+        for name in ("ent_coef", "entropy"):
+            metrics[name], metrics[f"{name}_box"] = metrics[name]
+        return state, metrics
 
-    return Algorithm(init, lambda state: state.actor, explore, exploit, update)
+    return algorithm._replace(update=update)
 
 
 def column_sizes(space: spaces.Space) -> list[int]:
@@ -199,13 +161,10 @@ def td_target(actor: Network, target_critics: PyTree, alpha: Array, batch: Trans
 
 
 def critics_loss(
-    critics: PyTree, batch: Transition, choice: Array, box: Array, target: Array, drop: Array | None = None
-) -> tuple[Array, Array]:
-    """Returns half the squared TD error summed over critics, and the values of the actions, ``(n_critics, batch)``."""
-    values = all_values(with_dropout(critics, drop), batch.obs, box)
-    index = jnp.broadcast_to(choice[None, :, None], (*values.shape[:2], 1))
-    taken = jnp.take_along_axis(values, index, axis=-1)[..., 0]
-    return 0.5 * jnp.sum(weighted_mean(jnp.square(taken - target[None]), batch.weight)), taken
+    critics: PyTree, batch: Transition, choice: Array, box: Array, target: Array
+) -> tuple[Array, tuple[Array, Array]]:
+    """Returns half the squared TD error summed over critics; the values of the actions and the TD errors."""
+    return squared_error(taken(all_values(critics, batch.obs, box), choice), target, batch)
 
 
 def actor_loss(
