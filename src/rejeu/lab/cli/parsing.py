@@ -121,7 +121,7 @@ def make_parser(command: str, kind: type, known: Iterable[Option], with_help: ob
     parser = Parser(
         f"rejeu {command}",
         f"rejeu {command}{positional} [options]",
-        description=filled(inspect.cleandoc(kind.__doc__ or "")),
+        description=filled(inspect.cleandoc(kind.__doc__ or "")) if with_help else None,
         formatter_class=argparse.RawDescriptionHelpFormatter,
         argument_default=argparse.SUPPRESS,
         allow_abbrev=False,

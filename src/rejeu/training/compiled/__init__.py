@@ -21,7 +21,7 @@ from rejeu.core.xla import clock
 from rejeu.training.checks import check_state
 from rejeu.training.compiled.off_policy import OffPolicyProgram
 from rejeu.training.compiled.on_policy import OnPolicyProgram
-from rejeu.training.compiled.program import MAX_TURNS, NO_LIMIT, ChunkLimits, Remake
+from rejeu.training.compiled.program import MAX_TURNS, NO_LIMIT, Limits, Remake
 from rejeu.training.compiled.trainer import DeviceTrainer, group_size
 from rejeu.training.finite import NonFiniteUpdate
 from rejeu.training.learner import Learner
@@ -141,7 +141,7 @@ def take_chunks(
         n_turns = min(pace.turns, turns_left(step, n_envs, last, stops))
         if step <= leader.learn_from:  # the turns that follow take longer
             n_turns = min(n_turns, max(-(-(leader.learn_from - step) // n_envs), 1))
-        limits = ChunkLimits(
+        limits = Limits(
             np.int32(n_turns),
             np.uint32(NO_LIMIT if last is None else last),
             schedule(progress, step - first, n_turns, n_envs, capacity, last, first),
@@ -167,7 +167,7 @@ def take_chunks(
         yield turns
 
 
-def raise_fault(trainer: DeviceTrainer, which: int, limits: ChunkLimits) -> None:
+def raise_fault(trainer: DeviceTrainer, which: int, limits: Limits) -> None:
     """Raises the error of a run in a chunk; an error of an update says which run it is."""
     try:
         trainer.raise_fault(which, limits)

@@ -27,16 +27,7 @@ from rejeu.replay.device import DeviceReplay, DeviceRing, DeviceRows, download, 
 from rejeu.replay.device_priorities import Pending, noted
 from rejeu.replay.hindsight import HerReplayBuffer
 from rejeu.replay.prioritized import Draw
-from rejeu.training.compiled.program import (
-    Carry,
-    ChunkLimits,
-    Learned,
-    Loop,
-    Program,
-    capacity_of,
-    random_action,
-    step_envs,
-)
+from rejeu.training.compiled.program import Carry, Learned, Limits, Loop, Program, capacity_of, random_action, step_envs
 from rejeu.training.off_policy import begin_episodes
 from rejeu.training.run import Run
 
@@ -74,9 +65,7 @@ class OffPolicyProgram(Program):
         key = jax.random.fold_in(draws(carry.key, clock.step), number + 1)
         return self.draw(env, experience, key, clock.progress)[0]
 
-    def turns(
-        self, env: FunctionalEnv, loop: Loop, limits: ChunkLimits, may_go_on: Callable[[Array, Loop], Array]
-    ) -> Loop:
+    def turns(self, env: FunctionalEnv, loop: Loop, limits: Limits, may_go_on: Callable[[Array, Loop], Array]) -> Loop:
         one = lambda loop: (loop[0] + 1, take_turn(self, env, loop[1], limits, loop[0]))  # noqa: E731
         return jax.lax.while_loop(lambda loop: may_go_on(*loop), one, (jnp.int32(0), loop))[1]
 
@@ -165,7 +154,7 @@ class OffPolicyProgram(Program):
         run.owed, run.steps_since_update = int(carry.counts.owed), int(carry.counts.since_update)
 
 
-def take_turn(program: OffPolicyProgram, env: FunctionalEnv, loop: Loop, limits: ChunkLimits, i: Array) -> Loop:
+def take_turn(program: OffPolicyProgram, env: FunctionalEnv, loop: Loop, limits: Limits, i: Array) -> Loop:
     """Returns what the ``i``-th turn of a chunk passes on."""
     config, algorithm, replay, before = program.config, program.algorithm, program.replay, loop.carry
     assert before.action is not None

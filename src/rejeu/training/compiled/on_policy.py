@@ -18,7 +18,7 @@ from rejeu.algorithms.rollout_config import RolloutConfig
 from rejeu.core.algorithm import Clock, Rollout
 from rejeu.core.prng import nth
 from rejeu.envs.functional.protocol import FunctionalEnv
-from rejeu.training.compiled.program import Carry, ChunkLimits, Loop, Program, capacity_of, step_envs
+from rejeu.training.compiled.program import Carry, Limits, Loop, Program, capacity_of, step_envs
 from rejeu.training.on_policy import begin_episodes
 from rejeu.training.run import Run
 
@@ -44,9 +44,7 @@ class OnPolicyProgram(Program):
     def batch(self, env: FunctionalEnv, carry: Carry, experience: Rollout, clock: Clock, number: Any) -> Rollout:
         return rollout_of(experience, carry.counts.length)
 
-    def turns(
-        self, env: FunctionalEnv, loop: Loop, limits: ChunkLimits, may_go_on: Callable[[Array, Loop], Array]
-    ) -> Loop:
+    def turns(self, env: FunctionalEnv, loop: Loop, limits: Limits, may_go_on: Callable[[Array, Loop], Array]) -> Loop:
         n_steps = self.config.n_steps
 
         def fills(inner: tuple[Array, Loop]) -> Array:
@@ -113,7 +111,7 @@ class OnPolicyProgram(Program):
         """Does nothing: the length of the rollout is copied with it."""
 
 
-def take_turn(program: OnPolicyProgram, env: FunctionalEnv, loop: Loop, limits: ChunkLimits, i: Array) -> Loop:
+def take_turn(program: OnPolicyProgram, env: FunctionalEnv, loop: Loop, limits: Limits, i: Array) -> Loop:
     """Returns what the ``i``-th turn of a chunk passes on, apart from the update."""
     config, carry, steps = program.config, loop.carry, loop.experience
     counts, before, t = carry.counts, carry.episodes, carry.counts.length

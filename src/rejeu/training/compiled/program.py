@@ -50,7 +50,7 @@ Remake = Callable[[Any], tuple[Algorithm, Explorer]]
 """Makes the algorithm of a configuration, and its exploration."""
 
 
-class ChunkLimits(NamedTuple):
+class Limits(NamedTuple):
     """The limits of a chunk."""
 
     n_turns: Any
@@ -198,9 +198,7 @@ class Program(ABC):
         """Returns the batch of the ``number``-th gradient step of a turn that ends at ``clock``."""
 
     @abstractmethod
-    def turns(
-        self, env: FunctionalEnv, loop: Loop, limits: ChunkLimits, may_go_on: Callable[[Array, Loop], Array]
-    ) -> Loop:
+    def turns(self, env: FunctionalEnv, loop: Loop, limits: Limits, may_go_on: Callable[[Array, Loop], Array]) -> Loop:
         """Returns what turns pass on, which are taken while ``may_go_on(number of turns, loop)``."""
 
     @abstractmethod
@@ -236,7 +234,7 @@ class Program(ABC):
         """Copies what only this kind of learning counts into a run."""
 
     def chunk(
-        self, env: FunctionalEnv, carry: Carry, experience: Any, limits: ChunkLimits
+        self, env: FunctionalEnv, carry: Carry, experience: Any, limits: Limits
     ) -> tuple[Carry, Any, ChunkReport]:
         """Returns carry, experience and report after a number of turns."""
         program = self.with_hyperparameters(carry.hyper)
@@ -346,9 +344,7 @@ def plain(space: gym.Space, obs: PyTree) -> PyTree:
     return jax.tree.unflatten(spaces.structure(space), parts)
 
 
-def step_envs(
-    program: Program, env: FunctionalEnv, loop: Loop, action: Array, limits: ChunkLimits, turn: Array
-) -> Loop:
+def step_envs(program: Program, env: FunctionalEnv, loop: Loop, action: Array, limits: Limits, turn: Array) -> Loop:
     """Takes one step of all environments, and starts new episodes where some ended.
 
     Args:

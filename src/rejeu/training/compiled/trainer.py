@@ -23,7 +23,7 @@ from rejeu.envs.functional.protocol import FunctionalEnv
 from rejeu.envs.functional.vector import JaxVector, joined, split
 from rejeu.envs.masks import functional_vector
 from rejeu.training.checks import check_bounds, check_finite, check_obs
-from rejeu.training.compiled.program import Carry, ChunkLimits, ChunkReport, EpisodeLog, EpisodeState, Program
+from rejeu.training.compiled.program import Carry, ChunkReport, EpisodeLog, EpisodeState, Limits, Program
 from rejeu.training.finite import MAX_SKIPPED, NonFiniteUpdate
 from rejeu.training.learner import Learner, Readings
 from rejeu.training.run import Episode, Progress, Run
@@ -127,7 +127,7 @@ class DeviceTrainer:
             self.learner.programs[key] = jax.jit(partial(with_env, function, self.program, self.env_static), **options)
         return partial(self.learner.programs[key], self.env_arrays)
 
-    def take(self, limits: ChunkLimits, active: Iterable[int]) -> None:
+    def take(self, limits: Limits, active: Iterable[int]) -> None:
         """Takes a chunk of turns in the groups of the runs ``active``; while one is copied to the host, the next computes."""
         busy = sorted({i // self.size for i in active})
         try:
@@ -139,7 +139,7 @@ class DeviceTrainer:
             self.undo()
             raise
 
-    def start(self, group: RunGroup, limits: ChunkLimits) -> None:
+    def start(self, group: RunGroup, limits: Limits) -> None:
         """Starts a chunk of turns, and does not wait for it."""
         before, n_rows, options = group.experience, self.program.rows_changed(int(limits.n_turns)), {}
         back: Callable[[Any], Any] = lambda experience: before  # noqa: E731
@@ -205,7 +205,7 @@ class DeviceTrainer:
         experience = group.experience if self.size == 1 else of_run(group.experience, which % self.size)
         self.program.download(self.runs[which], experience, copies(group.carry.counts))
 
-    def raise_fault(self, which: int, limits: ChunkLimits) -> NoReturn:
+    def raise_fault(self, which: int, limits: Limits) -> NoReturn:
         """Raises the error of a chunk of which nothing was pulled; the run is put before the fault.
 
         Raises:
@@ -231,7 +231,7 @@ class DeviceTrainer:
             run.copy_replay()
         raise AssertionError("the chunk was not finite, and its turns are")
 
-    def _repeat(self, limits: ChunkLimits, in_a_row: int) -> None:
+    def _repeat(self, limits: Limits, in_a_row: int) -> None:
         """Takes a chunk from the state of the only run, after so many bad updates in a row."""
         self.push(float(limits.progress[0]), self.runs[0])
         self.groups[0].carry = self.groups[0].carry._replace(in_a_row=jnp.int32(in_a_row))
@@ -246,7 +246,7 @@ class DeviceTrainer:
         check_obs(run, carry.episodes.obs, int(carry.counts.step), "reset returned")
         raise AssertionError("the environment was not finite, and what it returned is")
 
-    def _raise_bad_update(self, run: Run, limits: ChunkLimits, in_a_row: int) -> NoReturn:
+    def _raise_bad_update(self, run: Run, limits: Limits, in_a_row: int) -> NoReturn:
         """Raises the error of the first bad update of the next turn, with the state before it and its batch."""
         number = 0
         while True:
@@ -269,7 +269,7 @@ def with_env(function: Callable[..., Any], program: Any, static: Any, arrays: An
 
 
 def take_chunk(
-    mesh: Mesh | None, n: int, program: Program, env: FunctionalEnv, carry: Any, limits: ChunkLimits, experience: Any
+    mesh: Mesh | None, n: int, program: Program, env: FunctionalEnv, carry: Any, limits: Limits, experience: Any
 ) -> tuple[Any, Any, ChunkReport]:
     """Returns carry, experience and report of ``n`` runs, which the devices of a mesh share, after a chunk."""
     one = lambda carry, limits, experience: program.chunk(env, carry, experience, limits)  # noqa: E731
