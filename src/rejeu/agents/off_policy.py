@@ -24,8 +24,9 @@ from rejeu.replay.hindsight import HerReplayBuffer, counters
 from rejeu.replay.prioritized import Priorities, PriorityConfig
 from rejeu.replay.ring import Ring
 from rejeu.replay.uniform import ReplayBuffer
+from rejeu.training.checks import checked_restart
 from rejeu.training.compiled import train_one
-from rejeu.training.off_policy import begin_episodes, off_policy, offline
+from rejeu.training.off_policy import off_policy, offline
 from rejeu.training.run import Progress
 
 if TYPE_CHECKING:
@@ -126,7 +127,7 @@ class OffPolicyAgent(Agent):
         return off_policy(self.run, self.learner, self.config, n_steps, progress)
 
     def start_episodes(self) -> None:
-        begin_episodes(self.run)
+        self.run.replay.begin(checked_restart(self.run))
 
     def make_buffer(self, env: VectorEnv) -> Any:
         config = self.config

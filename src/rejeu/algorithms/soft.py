@@ -149,17 +149,8 @@ class SoftCritic(NamedTuple):
     """``()`` for one temperature, ``(n,)`` for n."""
 
 
-def soft_actor_critic(
-    parts: SoftCritic,
-    config: Any,
-    explore: Callable[[PyTree, PyTree, Array, Clock], Array],
-    exploit: Callable[[PyTree, PyTree], Array],
-    optimizer: Optimizer,
-) -> Algorithm:
-    """Returns the algorithm with these networks and equations, which acts by ``explore`` and ``exploit``.
-
-    ``config`` is an :class:`EntropyConfig` with ``policy_delay``, and with targets ``target_update_interval``.
-    """
+def soft_actor_critic(parts: SoftCritic, config: Any, explore: Any, exploit: Any, optimizer: Optimizer) -> Algorithm:
+    """Returns the algorithm with these networks and equations, which acts by ``explore`` and ``exploit`` of an algorithm."""
     settings = {"parts": parts, "config": config, "optimizer": optimizer}
     init, learn = partial(initial_state, **settings), partial(update, **settings)
     return Algorithm(init, lambda state: state.actor, explore, exploit, learn)

@@ -14,7 +14,7 @@ from rejeu.core.spaces import leaves
 from rejeu.envs import validation
 from rejeu.envs.base import Step
 from rejeu.training.learner import Learner
-from rejeu.training.run import Run, timed
+from rejeu.training.run import Run, restart, timed
 
 VDOT_SIZE = 2**13
 """Number of elements up to which an array is checked by its square; beyond it BLAS would use its threads."""
@@ -60,6 +60,12 @@ def check_finite(run: Run, step: Step, taken: int) -> None:
     if not is_finite(step.reward):
         raise _reward_error(run, step.reward, taken)
     check_obs(run, step.obs, taken, "returned")
+
+
+def checked_restart(run: Run) -> PyTree:
+    """Starts an episode in every environment, which ends the running ones, and returns the observations, checked."""
+    check_obs(run, restart(run), run.step, "reset returned")
+    return run.obs
 
 
 @timed("env")

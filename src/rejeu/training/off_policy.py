@@ -32,10 +32,10 @@ from rejeu.core.algorithm import Clock, PyTree, unmasked
 from rejeu.core.spaces import action_scaler, random_action
 from rejeu.envs.base import Step
 from rejeu.exploration.explorer import memory_in
-from rejeu.training.checks import check_obs, check_state, checked_reset, checked_step
+from rejeu.training.checks import check_state, checked_reset, checked_restart, checked_step
 from rejeu.training.finite import gradient_steps
 from rejeu.training.learner import Learner
-from rejeu.training.run import Episode, Progress, Run, clock_of, record_step, restart, start_clock, timed
+from rejeu.training.run import Episode, Progress, Run, clock_of, record_step, start_clock, timed
 
 STEPS_OFFLINE = 100
 """Gradient steps in one call, where no environment is stepped."""
@@ -66,7 +66,7 @@ def off_policy(
     start_clock(run)
     while last is None or run.step < last:
         if run.obs is None or env.must_reset:
-            begin_episodes(run)
+            run.replay.begin(checked_restart(run))
         if run.action is None:
             run.action = np.array(choose(run, learner, config, clock_of(run, progress(run.step - first)), None)[0])
         action = scale(run.action)
@@ -122,12 +122,6 @@ def learn_from(
     clock = Clock(steps.astype(np.uint32), np.full(n, run.episode, np.uint32), np.asarray(progress, np.float32))
     update(run, learner, [(batch, drawn)], clock)
     run.td_errors = []
-
-
-def begin_episodes(run: Run) -> None:
-    """Starts an episode in every environment, which ends the running ones."""
-    check_obs(run, restart(run), run.step, "reset returned")
-    run.replay.begin(run.obs)
 
 
 @timed("replay")

@@ -24,7 +24,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from types import MappingProxyType
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -174,12 +173,8 @@ def make_with(
     """
     action_dim = action_dimension(check_box_action(action_space, config.name))
     target_entropy = config.entropy_target(-float(action_dim), action_dim)
-
-    def critic(key: Array, leaves: tuple[Leaf, ...], shape: Any) -> QNetwork:
-        return QNetwork(key, leaves, action_dim, shape.critic_widths(HIDDEN_LAYERS), shape, n_outputs)
-
     parts = SoftCritic(
-        *networks(config, leaves(observation_space), 2 * action_dim, critic),
+        *networks(config, observation_space, 2 * action_dim, QNetwork, action_dim, n_outputs),
         target=td_target,
         critics_loss=lambda critics, batch, target, key: critics_loss(critics, batch, target),
         actor_loss=lambda actor, critics, alpha, batch, key: actor_loss(actor, critics, alpha, batch.obs, key, judge),
@@ -190,17 +185,8 @@ def make_with(
     return algorithm_of(parts, config, explore, exploit, {**queries, "explorer": explorer_of(config, action_dim)})
 
 
-def algorithm_of(
-    parts: SoftCritic,
-    config: Config,
-    explore: Callable[..., Array],
-    exploit: Callable[..., Array],
-    others: Mapping[str, Any] = MappingProxyType({}),
-) -> Algorithm:
-    """Returns the algorithm of these parts and ``others`` of :class:`Algorithm`, with what its settings add.
-
-    That is a target of a subset of the critics, dropout in them, and memory.
-    """
+def algorithm_of(parts: SoftCritic, config: Config, explore: Any, exploit: Any, others: Mapping[str, Any]) -> Algorithm:
+    """Returns the algorithm of these parts and parts of :class:`Algorithm`, with REDQ, dropout and memory if they are set."""
     parts = parts if config.target_subset is None and not config.policy_kwargs.dropout else drawn(parts, config)
     optimizer = optimizers.make(config.optimizer, config.max_grad_norm)
     algorithm = soft_actor_critic(parts, config, explore, exploit, optimizer)._replace(**others)
@@ -223,17 +209,14 @@ def drawn(parts: SoftCritic, config: Config) -> SoftCritic:
 
 
 def networks(
-    config: Config,
-    obs_leaves: tuple[Leaf, ...],
-    n_outputs: int,
-    critic: Callable[[Array, tuple[Leaf, ...], Any], Any],
+    config: Config, observation_space: spaces.Space, n_outputs: int, kind: Any, *sizes: int
 ) -> tuple[Callable[[Array], Any], Callable[[Array], Any]]:
     """Returns functions of a key that build an actor of ``n_outputs``, and ``config.n_critics`` critics.
 
-    ``critic(key, leaves, shape)`` returns one critic of such observations. With gSDE the actor has half as many outputs, the
-    means.
+    A critic is of the class ``kind``, with ``sizes`` where it takes numbers of actions and outputs. With gSDE the actor has
+    half as many outputs, the means.
     """
-    shape = config.policy_kwargs
+    obs_leaves, shape = leaves(observation_space), config.policy_kwargs
 
     def actor(key: Array) -> Any:
         if config.use_sde:
@@ -242,7 +225,9 @@ def networks(
         return with_memory(key, obs_leaves, shape, build)
 
     def critics(key: Array) -> Any:
-        build = lambda leaves, shape: ensemble(lambda key: critic(key, leaves, shape), key, config.n_critics)  # noqa: E731
+        widths, (size, *more) = shape.critic_widths(HIDDEN_LAYERS), sizes
+        critic = lambda leaves, shape: lambda key: kind(key, leaves, size, widths, shape, *more)  # noqa: E731
+        build = lambda leaves, shape: ensemble(critic(leaves, shape), key, config.n_critics)  # noqa: E731
         return with_memory(key, obs_leaves, shape, build, slot=1)
 
     return actor, critics

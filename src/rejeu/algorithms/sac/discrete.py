@@ -24,7 +24,6 @@ from gymnasium import spaces
 from jax import Array
 
 from rejeu.algorithms.sac.continuous import (
-    HIDDEN_LAYERS,
     Config,
     algorithm_of,
     check_discrete,
@@ -34,7 +33,6 @@ from rejeu.algorithms.sac.continuous import (
 from rejeu.algorithms.soft import SoftCritic
 from rejeu.core.algorithm import Algorithm, Clock, PyTree, Transition, some_allowed, unmasked
 from rejeu.core.distributions import Categorical, forbid
-from rejeu.core.spaces import Leaf, leaves
 from rejeu.networks import Network, each
 
 TARGET_ENTROPY_SHARE = 0.3
@@ -50,15 +48,12 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.D
     check_discrete(config)
     n_actions = int(action_space.n)
 
-    def critic(key: Array, leaves: tuple[Leaf, ...], shape: Any) -> Network:
-        return Network(key, leaves, n_actions, shape.critic_widths(HIDDEN_LAYERS), shape)
-
     def policy_loss(actor: Any, critics: Any, alpha: Array, batch: Transition, key: Array) -> tuple[Array, Array]:
         judged = config.judged_by(all_values(critics, batch.obs), axis=0)
         return actor_loss(actor, judged, alpha, batch.obs)
 
     parts = SoftCritic(
-        *networks(config, leaves(observation_space), n_actions, critic),
+        *networks(config, observation_space, n_actions, Network, n_actions),
         target=lambda actor, target_critics, alpha, batch, key: td_target(actor, target_critics, alpha, batch),
         critics_loss=lambda critics, batch, target, key: critics_loss(critics, batch, target),
         actor_loss=policy_loss,

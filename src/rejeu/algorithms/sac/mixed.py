@@ -27,7 +27,6 @@ from gymnasium import spaces
 from jax import Array
 
 from rejeu.algorithms.sac.continuous import (
-    HIDDEN_LAYERS,
     LOG_STD_RANGE,
     Config,
     algorithm_of,
@@ -39,7 +38,7 @@ from rejeu.algorithms.sac.discrete import TARGET_ENTROPY_SHARE, taken
 from rejeu.algorithms.soft import SoftCritic
 from rejeu.core.algorithm import Algorithm, Clock, Metrics, PyTree, Transition
 from rejeu.core.distributions import Categorical, TanhNormal
-from rejeu.core.spaces import Leaf, action_width, check_action, check_box_action, leaves, members
+from rejeu.core.spaces import action_width, check_action, check_box_action, members
 from rejeu.networks import Network, QNetwork
 
 MOST_COMBINATIONS = 1024
@@ -77,9 +76,6 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         chosen = action[:, is_choice].astype(jnp.int32) * strides[None]
         return jnp.sum(chosen, axis=-1, dtype=jnp.int32), action[:, ~is_choice]
 
-    def critic(key: Array, leaves: tuple[Leaf, ...], shape: Any) -> QNetwork:
-        return QNetwork(key, leaves, n_box, shape.critic_widths(HIDDEN_LAYERS), shape, n)
-
     def explore(actor: Network, obs: PyTree, key: Array, clock: Clock) -> Array:
         choice_key, box_key = jax.random.split(key)
         choice, box = policy(actor, obs, n)
@@ -93,14 +89,14 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         return actor_loss(actor, critics, alpha, batch.obs, key, n, config.judged_by)
 
     parts = SoftCritic(
-        *networks(config, leaves(observation_space), n + 2 * n_box, critic),
+        *networks(config, observation_space, n + 2 * n_box, QNetwork, n_box, n),
         target=lambda actor, critics, alpha, batch, key: td_target(actor, critics, alpha, batch, key, n),
         critics_loss=lambda critics, batch, target, key: critics_loss(critics, batch, *parted(batch.action), target),
         actor_loss=policy_loss,
         target_entropy=lambda obs: target_entropy,
         temperatures=(2,),
     )
-    algorithm = algorithm_of(parts, config, explore, exploit)
+    algorithm = algorithm_of(parts, config, explore, exploit, {})
 
     def update(state: Any, batch: Transition, clock: Clock) -> tuple[Any, Metrics]:
         """Returns the state after an update and the metrics, those of the two temperatures by names of their own."""

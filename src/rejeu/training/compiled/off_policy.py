@@ -27,8 +27,8 @@ from rejeu.replay.device import DeviceReplay, DeviceRing, DeviceRows, download, 
 from rejeu.replay.device_priorities import Pending, noted
 from rejeu.replay.hindsight import HerReplayBuffer
 from rejeu.replay.prioritized import Draw
+from rejeu.training.checks import checked_restart
 from rejeu.training.compiled.program import Carry, Learned, Limits, Loop, Program, capacity_of, random_action, step_envs
-from rejeu.training.off_policy import begin_episodes
 from rejeu.training.run import Run
 
 DRAWS = 2**32 - 1
@@ -102,7 +102,7 @@ class OffPolicyProgram(Program):
         return self.replay.draw(ring, key, progress, env.compute_reward, terminated)
 
     def begin_episodes(self, run: Run) -> None:
-        begin_episodes(run)
+        run.replay.begin(checked_restart(run))
 
     def uses_part(self, run: Run, n_turns: int, last: int | None) -> bool:
         return False
