@@ -230,7 +230,8 @@ class OffPolicyConfig(AlgorithmConfig):
             )
         if self.offline and self.demonstrations is None:
             raise ValueError("offline=True learns from demonstrations alone; give demonstrations=FOLDER too")
-        assign(self, action_noise=action_noises.parse(self.action_noise))
+        if self.action_noise is not None:
+            assign(self, action_noise=action_noises.parse(self.action_noise))
         coerce(self, "replay_buffer_class", buffer_name)
         coerce(self, "replay_buffer_kwargs", buffer_settings, buffer=self.replay_buffer_class)
         if self.has_memory:

@@ -144,14 +144,18 @@ def parse(name: str, value: Any, least: float = -math.inf) -> float | Schedule:
 
 
 def _parse(name: str, value: Any) -> float | Schedule:
-    if isinstance(value, Linear | Exponential | TableSchedule):
-        return value
     if isinstance(value, bool):
         raise TypeError(f"{name}={value!r} must be a number or a schedule")
-    if isinstance(value, int | float):
-        if not is_finite(value):
-            raise ValueError(f"{name}={value} must be finite")
-        return float(value)
+    if not isinstance(value, int | float):
+        return _schedule_of(name, value)
+    if not is_finite(value):
+        raise ValueError(f"{name}={value} must be finite")
+    return float(value)
+
+
+def _schedule_of(name: str, value: Any) -> Schedule:
+    if isinstance(value, Linear | Exponential | TableSchedule):
+        return value
     try:
         if isinstance(value, str) and value.startswith("lin_"):
             return Linear(float(value.removeprefix("lin_")))
