@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +12,8 @@ import pytest
 
 from rejeu.algorithms import crossq
 from rejeu.core.algorithm import TD_ERROR
+from rejeu.demonstrations import with_targets
+from rejeu.sb3.policy import BasePolicy
 from tests.algorithms.batches import ACTION_DIM, BOX as ACTION_SPACE, CLOCK, OBS_SPACE, box_batch, noise_of
 from tests.networks.test_batch_renorm import NumpyRenorm, numpy_torso
 from tests.numpy_networks import squashed_sample
@@ -191,3 +194,14 @@ def test_a_policy_acts_on_each_observation_by_itself():
     np.testing.assert_allclose(
         algorithm.exploit(state.actor, obs)[:1], algorithm.exploit(state.actor, obs[:1]), atol=1e-6
     )
+
+
+def test_a_state_without_target_critics_stays_without():
+    _, state = make()
+    assert state.target_critics is None
+    assert jax.tree.structure(with_targets(state)) == jax.tree.structure(state)
+    learner, spaces = SimpleNamespace(shapes=state), {"observation_space": OBS_SPACE, "action_space": ACTION_SPACE}
+    policy = BasePolicy.of(SimpleNamespace(learner=learner, **spaces))
+    assert policy.critic is not None
+    with pytest.raises(AttributeError, match="critic_target"):
+        _ = policy.critic_target

@@ -172,7 +172,8 @@ class Case(NamedTuple):
         """Returns a state whose targets are drawn apart from its networks, and whose policy depends on what is seen."""
         state, other = (made.init(jax.random.PRNGKey(seed)) for seed in (1, 2))
         for name in [name for name in vars(state) if name.startswith("target_")]:
-            drawn = getattr(other, name)
+            if (drawn := getattr(other, name)) is None:
+                continue
             state = eqx.tree_at(lambda s, name=name: getattr(s, name), state, drawn)
         if self.kind == "MaskablePPO":  # PPO's policies begin almost uniform
             weight = state.network.head.weight

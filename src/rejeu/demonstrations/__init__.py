@@ -520,7 +520,7 @@ def with_targets(state: PyTree) -> PyTree:
     def copied(node: Any) -> Any:
         if not is_state(node):
             return node
-        fields = averaged_fields(type(node))
+        fields = {name for name in averaged_fields(type(node)) if getattr(node, name) is not None}
         return dataclasses.replace(node, **{name: getattr(node, name.removeprefix("target_")) for name in fields})
 
     return jax.tree.map(copied, state, is_leaf=is_state)

@@ -279,7 +279,7 @@ class BasePolicy(BaseModel):
     def __getattr__(self, name: str) -> Any:
         """Returns one of its networks: ``actor``, ``critic``, ``q_net`` and so on."""
         if name in NETWORKS and self.model is not None:
-            has = {field for field in NETWORKS[name] if hasattr(self.model.learner.shapes, field)}
+            has = {field for field in NETWORKS[name] if getattr(self.model.learner.shapes, field, None) is not None}
             if has:
                 kind = Actor if "actor" in name else ContinuousCritic if "critic" in name else QNetwork
                 return kind.of(self.model, frozenset(has))
