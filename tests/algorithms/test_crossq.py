@@ -76,7 +76,7 @@ def given_next(seed=5):
     return np.tanh(rng.normal(size=(BATCH, ACTION_DIM))).astype(np.float32), rng.normal(size=BATCH).astype(np.float32)
 
 
-@pytest.mark.parametrize("which", only([0], range(N_CRITICS)))
+@pytest.mark.parametrize("which", only([1], range(N_CRITICS)))
 def test_the_critics_gradient_equals_finite_differences_with_the_target_held(which):
     """Through the batch statistics of both halves, but not through the target, in the weights that reach them all."""
     _, state = make()

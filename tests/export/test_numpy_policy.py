@@ -38,6 +38,13 @@ def test_batches_and_masks(tmp_path):
         load_policy(tmp_path / "missing")
 
 
+def test_observations_are_clipped_as_in_training(tmp_path):
+    agent = agent_of("SAC", "Box", normalize={"norm_obs": True, "norm_reward": False, "clip_obs": 0.5})
+    policy = load_policy(agent.save(tmp_path / "model"))
+    for obs in (np.full(4, 50, np.float32), np.full(4, -50, np.float32)):
+        np.testing.assert_allclose(policy.predict(obs)[0], agent.predict(obs, deterministic=True)[0], atol=1e-5)
+
+
 def test_no_jax_is_imported(tmp_path):
     path = agent_of("SAC", "Box").save(tmp_path / "model")
     code = (
