@@ -49,6 +49,7 @@ python_use_unqualified_type_names = True
 python_maximum_signature_line_length = 80
 napoleon_numpy_docstring = False
 toc_object_entries_show_parents = "hide"
+suppress_warnings = ["ref.python"]  # two classes are called Episode: of training, and of demonstrations
 nitpick_ignore_regex = [("py:.*", r"(?!rejeu\b).*"), ("py:class", r".*\.[A-Z]")]  # other libraries, type variables
 
 html_theme = "furo"
