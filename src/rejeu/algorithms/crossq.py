@@ -172,6 +172,7 @@ def make_with(
         measure=equations.measure,
         minimize=step,
         has_targets=equations.has_targets,
+        keeps_losses=True,
     )
     explore = lambda actor, obs, key, clock: policy(actor, obs).sample(key)  # noqa: E731
     exploit = lambda actor, obs: policy(actor, obs).mode()  # noqa: E731

@@ -143,6 +143,8 @@ class SoftCritic(NamedTuple):
     """How a network takes a step on its loss, as :func:`rejeu.core.algorithm.minimize`."""
     has_targets: bool = True
     """Whether there are target critics."""
+    keeps_losses: bool = False
+    """Whether the state has ``actor_loss`` and ``entropy`` for any ``policy_delay``; a resumed run may then have another."""
     keys: Callable[[Array], Any] = jax.random.split
     """``keys(key)``: the keys of the target and of the actor in an update."""
     temperatures: tuple[int, ...] = ()
@@ -161,6 +163,7 @@ def initial_state(key: Array, parts: SoftCritic, config: Any, optimizer: Optimiz
     actor_key, critics_key, update_key = jax.random.split(key, 3)
     actor, critics = parts.actor(actor_key), parts.critics(critics_key)
     log_alpha = jnp.full(parts.temperatures, jnp.log(jnp.float32(initial_temperature(config.ent_coef))))
+    keeps_losses = parts.keeps_losses or config.policy_delay > 1
     return State(
         actor=actor,
         critics=critics,
@@ -171,8 +174,8 @@ def initial_state(key: Array, parts: SoftCritic, config: Any, optimizer: Optimiz
         alpha_optimizer=ALPHA_OPTIMIZER.init(log_alpha),
         key=update_key,
         n_updates=jnp.int32(0),
-        actor_loss=None if config.policy_delay == 1 else jnp.float32(0.0),
-        entropy=None if config.policy_delay == 1 else jnp.zeros(parts.temperatures, jnp.float32),
+        actor_loss=jnp.float32(0.0) if keeps_losses else None,
+        entropy=jnp.zeros(parts.temperatures, jnp.float32) if keeps_losses else None,
     )
 
 
