@@ -454,13 +454,13 @@ def test_a_run_that_was_killed_goes_on_to_the_same_end(tmp_path, capsys, monkeyp
             shutil.copytree(tmp_path / "whole", tmp_path / "cut")
 
     monkeypatch.setattr(Evaluate, "__call__", call)
-    argv += ["--backend", "gymnasium", "--evaluate-episodes", "2", "--checkpoint-minutes", "0.001"]
+    argv += ["--backend", "gymnasium", "--evaluate-episodes", "2", "--checkpoint-minutes", "1e-6"]
     argv += ["--out", str(tmp_path / "whole")]
     assert main([*argv, "--set", *TINY]) == 0
     monkeypatch.undo()
     assert not (tmp_path / "cut" / "agent.safetensors").exists()
     assert main(["resume", str(tmp_path / "cut"), *FEWER_FILES]) == 0
-    assert re.search(r"resumed at step [23]\d\d, exactly as it was saved", capsys.readouterr().out)
+    assert re.search(r"resumed at step \d+, exactly as it was saved", capsys.readouterr().out)
     for name in ("episodes.csv", "evaluations.csv", "metrics.csv"):
         assert table(tmp_path / "cut" / name) == table(tmp_path / "whole" / name), name
     assert_same_parameters(*(rejeu.load(tmp_path / run / "agent.safetensors") for run in ("whole", "cut")))
