@@ -12,9 +12,9 @@ import pytest
 
 from rejeu.callbacks.evaluate import Evaluated
 from rejeu.core import xla
-from rejeu.lab.cli import output, runs, session
+from rejeu.lab.cli import output, session
 from rejeu.lab.cli.session import TrainingLimits
-from rejeu.lab.reporting import run_list
+from rejeu.lab.reporting import rows, run_list
 from rejeu.logs.evaluation import Evaluation
 from rejeu.logs.logging import CsvFile
 from tests.lab.reporting.test_comparison import write_run
@@ -65,14 +65,19 @@ def test_status_is_the_mean_of_the_last_hundred_episodes_and_the_time_that_is_le
     (run / "agent.safetensors").unlink()
     config = json.loads((run / "config.json").read_text())
     seconds = run_list.read(run).seconds
-    assert runs.describe(found)["mean_return"] == pytest.approx(returns[-100:].mean())
+    assert rows.describe(found)["mean_return"] == pytest.approx(returns[-100:].mean())
     for asked, left in (({"steps": 40 * n}, 3 * (seconds - 2)), ({"steps": None, "minutes": 2}, 120 - seconds + 2)):
         (run / "config.json").write_text(json.dumps({**config, **asked}))
         (run / "checkpoints").mkdir(exist_ok=True)
-        facts = runs.describe(SimpleNamespace(**{**vars(run_list.read(run)), "state": "running"}))
+        facts = rows.describe(SimpleNamespace(**{**vars(run_list.read(run)), "state": "running"}))
         assert facts["steps_per_second"] == pytest.approx(10 * n / (seconds - 2))
         assert facts["seconds_left"] == pytest.approx(left)
-        assert f"about {left:,.0f} s left" in "\n".join(runs.lines(facts))
-    facts = runs.describe(SimpleNamespace(**{**vars(run_list.read(run)), "state": "interrupted"}))
+        assert rows.rate_text(facts) == f"{10 * n / (seconds - 2):,.0f}/s, {left:,.0f} s left"
+    facts = rows.describe(SimpleNamespace(**{**vars(run_list.read(run)), "state": "interrupted"}))
     assert (facts["episodes"], facts["seconds_left"], facts["seconds"]) == (n, None, seconds)
-    assert facts["best"] == {"step": 10 * n, "mean_return": 101.0, "success_rate": pytest.approx(math.nan, nan_ok=True)}
+    best = facts["best"]
+    assert (best["step"], best["mean_return"], best["success_rate"]) == (
+        10 * n,
+        101.0,
+        pytest.approx(math.nan, nan_ok=True),
+    )

@@ -385,6 +385,21 @@ class Report(RunOptions):
 
 
 @dataclass(frozen=True)
+class Studio:
+    """Serves a page to this computer on which runs are started, watched, played against and compared in the web browser.
+
+    Runs that it starts go on when it ends. Example: rejeu studio runs
+    """
+
+    folder: Annotated[Path, Shown("FOLDER", is_positional=True)] = Path("runs")
+    """Folder below which all runs are shown, and new ones begin."""
+    port: Annotated[Annotated[int, Meta(ge=0, le=65535)], Shown("N")] = 8080
+    """Port of this computer; if it is taken, the next free one. 0 for any."""
+    no_browser: bool = False
+    """Print the address, and do not open it in the web browser."""
+
+
+@dataclass(frozen=True)
 class Class(EnvironmentOptions):
     """Evaluates the models in a folder, such as those of a class, and writes a leaderboard with confidence intervals.
 
@@ -446,6 +461,8 @@ class Runs:
 
     folder: Annotated[Path, Shown("FOLDER", is_positional=True)] = Path("runs")
     """Folder that is searched."""
+    follow: bool = False
+    """Show the table until Ctrl-C, and changes once a second."""
     json: PrintJson = False
 
 
@@ -504,7 +521,7 @@ class Pull:
 
 TASKS: dict[str, tuple[Callable[..., Any], ...]] = {
     "train": (List, Check, Train, Resume, Clone, Tune, Sweep),
-    "look": (Evaluate, Watch, Record, Report, Runs, Status, Compare),
+    "look": (Studio, Evaluate, Watch, Record, Report, Runs, Status, Compare),
     "share": (Export, Import, Push, Pull),
     "teach": (Play, Course, Class),
 }

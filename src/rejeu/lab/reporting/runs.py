@@ -239,14 +239,20 @@ def ordered(table: Table) -> Table:
 def state_of(run: RunSummary) -> State:
     """Returns the state of a run, from its lock and from what was written; no file is believed to say it."""
     has_model = "agent.safetensors" in run.models
-    locks = [is_locked(path) for path in (run.path / "lock", run.path / "checkpoints" / "lock") if is_file(path)]
-    if any(locks) or (not locks and not has_model and is_recent(run.path)):
+    process = has_process(run.path)
+    if process or (process is None and not has_model and is_recent(run.path)):
         return "running"
     reached_steps = run.steps_asked is not None and run.steps >= run.steps_asked
     reached_minutes = run.minutes_asked is not None and run.seconds >= 0.98 * 60 * run.minutes_asked
     if has_model and run.steps in run.evaluations.column("step") and (reached_steps or reached_minutes):
         return "finished"
     return "interrupted" if has_model else "crashed"
+
+
+def has_process(folder: Path) -> bool | None:
+    """Returns whether a process holds a lock of a run; None if there is no lock."""
+    locks = [is_locked(path) for path in (folder / "lock", folder / "checkpoints" / "lock") if is_file(path)]
+    return any(locks) if locks else None
 
 
 def is_locked(path: Path) -> bool:

@@ -1,0 +1,228 @@
+"""Rows of a table of runs, the same in a terminal, as JSON and in the studio. A run is read again if a file has changed."""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rejeu.core.records import shown
+from rejeu.lab.reporting import run_list
+from rejeu.lab.reporting.runs import (
+    CONFIG,
+    EPISODES,
+    EVALUATIONS,
+    METRICS,
+    WARNINGS,
+    RunSummary,
+    best_row,
+    has_process,
+    is_recent,
+)
+from rejeu.logs import charts
+from rejeu.logs.tables import EMPTY, NO_EPISODES
+
+WINDOW = 100
+"""Training episodes in the mean that is shown."""
+POINTS = 40
+"""Points of the small curve."""
+COLUMNS = ("run", "environment", "algorithm", "state", "steps", "best", "rate", "curve")
+"""Titles of a table, in the order of :func:`cells`."""
+BARS = "▁▂▃▄▅▆▇█"
+FILES = (CONFIG, EPISODES, METRICS, EVALUATIONS, WARNINGS, "agent.safetensors", "checkpoints", "replays.csv")
+SHARE = 20.0
+"""A run whose reading takes a second is read at most once in so many seconds."""
+SLICE = 64
+"""Most files of another program's run whose times are looked at."""
+
+Row = dict[str, Any]
+
+
+@dataclass
+class Known:
+    """A run as it was read last. Mutable."""
+
+    stamp: Any
+    row: Row
+    run: RunSummary | None
+    """Without its tables; None if it could not be read."""
+    due: float
+    """When it may be read again, by :func:`time.monotonic`."""
+
+
+class Rows:
+    """The rows of all runs below a folder. Mutable; for one thread."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._known: dict[Path, Known] = {}
+
+    def read(self, seconds: float = math.inf) -> list[Row]:
+        """Returns one row a run, in the order of their paths; also of those that are damaged, or have disappeared since.
+
+        Args:
+            seconds: time after which further runs are left to the next call; their state is then "unread" or as it was.
+        """
+        until = time.monotonic() + seconds
+        paths = run_list.find(self.folder) if self.folder.is_dir() else []
+        for path in self._known.keys() - {*paths}:
+            row = {**self._known[path].row, "state": "gone", "notes": ("its folder is no longer there",)}
+            self._known[path] = Known(None, row, None, 0.0)
+        for path in paths:
+            if time.monotonic() < until:
+                self._update(path)
+            elif path not in self._known:
+                self._known[path] = Known(None, nothing(path, "unread"), None, 0.0)
+        return [{**self._known[path].row, "run": self.name_of(path)} for path in sorted(self._known)]
+
+    def name_of(self, path: Path) -> str:
+        """Returns the path of a run below the folder, which names it."""
+        return path.relative_to(self.folder).as_posix() if path != self.folder else path.name
+
+    def summaries(self) -> Mapping[str, RunSummary]:
+        """Returns the runs that could be read, without their tables, by the names of their rows."""
+        return {self.name_of(path): one.run for path, one in self._known.items() if one.run is not None}
+
+    def _update(self, path: Path) -> None:
+        known, began = self._known.get(path), time.monotonic()
+        found = stamp(path)
+        if known is not None and (known.stamp == found or began < known.due):
+            return
+        run: RunSummary | None = None
+        try:
+            run = run_list.read(path, table_only=True)
+            row = describe(run)
+            run = replace(run, episodes=NO_EPISODES, evaluations=EMPTY, metrics=EMPTY, replays=EMPTY)
+        except (OSError, ValueError, ImportError) as error:
+            row = {**nothing(path, "damaged"), "notes": (shown(error, 300),)}
+        now = time.monotonic()
+        self._known[path] = Known(found, row, run, now + SHARE * (now - began))
+
+
+def stamp(path: Path) -> Any:
+    """Returns what changes when a run does: times and sizes of its files, and whether a process trains it."""
+    process = has_process(path)
+    files = [path / name for name in FILES] if run_list.is_ours(path) else [*others(path)]
+    return process, is_recent(path) if process is None else None, *map(time_of, files)
+
+
+def others(path: Path) -> Iterator[Path]:
+    """Yields a file, or the first files of a folder, of another program's run."""
+    if path.is_dir():
+        with os.scandir(path) as inside:
+            yield from (Path(one.path) for one, _ in zip(inside, range(SLICE), strict=False))
+    yield path
+
+
+def time_of(path: Path) -> tuple[int, int] | None:
+    """Returns time and size of a file, None if it does not exist."""
+    try:
+        status = path.lstat()
+    except OSError:
+        return None
+    return status.st_mtime_ns, status.st_size
+
+
+def nothing(path: Path, state: str) -> Row:
+    """Returns the row of a run of which nothing is known but its state."""
+    return {**describe(RunSummary(path=path, name=shown(path.name, 200))), "state": state}
+
+
+def describe(run: RunSummary) -> Row:
+    """Returns what is worth knowing of a run, as plain values."""
+    compiling = run.metrics.column("time/compile_seconds")
+    seconds = run.seconds - (float(compiling[-1]) if len(compiling) and np.isfinite(compiling[-1]) else 0.0)
+    rate = run.steps / seconds if seconds > 0 else math.nan
+    left = max(run.steps_asked - run.steps, 0) / rate if run.steps_asked and rate else math.nan
+    if run.minutes_asked is not None:
+        left = max(60 * run.minutes_asked - seconds, 0.0)
+    returns = run.episodes.returns[-WINDOW:]
+    means = run.metrics.column("rollout/ep_rew_mean")
+    known = returns if len(returns) else means[np.isfinite(means)][-1:]
+    return {
+        "path": run.path,
+        "name": run.name,
+        "format": run.format,
+        "env": run.env_id,
+        "algorithm": run.algorithm,
+        "seed": run.seed,
+        "state": run.state,
+        "steps": run.steps,
+        "steps_asked": run.steps_asked,
+        "seconds": run.seconds,
+        "steps_per_second": rate,
+        "seconds_left": left if run.state == "running" else None,
+        "episodes": len(run.episodes),
+        "mean_return": float(np.mean(known[np.isfinite(known)])) if np.isfinite(known).any() else math.nan,
+        "best": best_evaluation(run),
+        "evaluations": len(run.evaluations),
+        "curve": curve(run),
+        "warnings": run.warnings,
+        "notes": run.notes,
+    }
+
+
+def best_evaluation(run: RunSummary) -> dict[str, float] | None:
+    """Returns the best evaluation, with the 95 % interval of its mean return; None if there is none."""
+    row = best_row(run.evaluations)
+    if row is None:
+        return None
+    step, value, success = (run.evaluations.column(name)[row] for name in ("step", "mean_return", "success_rate"))
+    low, high = (float(end[row]) for end in charts.interval(run.evaluations, "return"))
+    return {"step": int(step), "mean_return": float(value), "low": low, "high": high, "success_rate": float(success)}
+
+
+def curve(run: RunSummary) -> list[float]:
+    """Returns the mean returns of up to :data:`POINTS` parts of the training; of a run without episodes, its evaluations."""
+    values = run.episodes.returns if len(run.episodes) else run.evaluations.column("mean_return")
+    known = values[charts.usable(values)]
+    return (
+        [float(f"{part.mean():.4g}") for part in np.array_split(known, min(POINTS, len(known)))] if len(known) else []
+    )
+
+
+def cells(row: Row) -> dict[str, str]:
+    """Returns a row as texts, by the titles of :data:`COLUMNS`."""
+    texts = (row["run"], row["env"], row["algorithm"], row["state"])
+    own = (steps_text(row), best_text(row), rate_text(row), bars(row["curve"]))
+    return dict(zip(COLUMNS, (shown(text, 300) for text in (*texts, *own)), strict=True))
+
+
+def steps_text(row: Row) -> str:
+    """Returns the steps done, with those asked for unless all are done."""
+    done, asked = row["steps"], row["steps_asked"]
+    return f"{done:,} of {asked:,} ({done / asked:.0%})" if asked and done < asked else f"{done:,}"
+
+
+def best_text(row: Row) -> str:
+    """Returns the best evaluation with its interval; of a run without one the mean return of the last training episodes."""
+    best = row["best"]
+    if best is None:
+        return f"{row['mean_return']:,.2f} in training" if math.isfinite(row["mean_return"]) else "-"
+    interval = f" ({best['low']:,.2f} to {best['high']:,.2f})" if math.isfinite(best["low"]) else ""
+    success = f", {best['success_rate']:.0%} success" if math.isfinite(best["success_rate"]) else ""
+    return f"{best['mean_return']:,.2f}{interval}{success}"
+
+
+def rate_text(row: Row) -> str:
+    """Returns the steps a second, and the time that is left."""
+    rate, left = row["steps_per_second"], row["seconds_left"]
+    rest = f", {left:,.0f} s left" if left is not None and math.isfinite(left) else ""
+    return f"{rate:,.0f}/s{rest}" if math.isfinite(rate) else "-"
+
+
+def bars(values: list[float]) -> str:
+    """Returns a small curve as text.
+
+    >>> bars([0.0, 1.0, 2.0, 4.0])
+    '▁▃▅█'
+    """
+    low, high = min(values, default=0.0), max(values, default=0.0)
+    scale = (len(BARS) - 1) / ((high - low) or 1.0)
+    return "".join(BARS[round((value - low) * scale)] for value in values[:: max(len(values) // 10, 1)])

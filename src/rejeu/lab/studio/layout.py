@@ -1,0 +1,87 @@
+"""What all pages share: the frame with the navigation, and elements that are refreshed.
+
+Texts of runs go into ``ui.label``, ``ui.table``, ``ui.select`` and the like, which show them as text. Nothing of a run goes
+into ``ui.html``, ``ui.markdown``, ``ui.code``, the slots of a table as HTML, or a script.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from urllib.parse import urlencode
+
+from nicegui import ui
+
+from rejeu.lab.studio.state import Studio
+
+EVERY = 1.0
+"""Seconds between two looks whether what a page shows has changed."""
+STYLE = """
+:root { --q-primary: #1d4f91; }
+body { font-family: system-ui, sans-serif; }
+.nicegui-content { padding: 0; }
+.page { width: 100%; max-width: 1400px; margin: 0 auto; padding: 16px; gap: 12px; }
+.header { background: var(--bar, #1d4f91); min-height: 48px; padding: 4px 12px; }
+.q-table td, .q-table th { padding: 4px 8px; }
+.q-table td { max-width: 22rem; overflow: hidden; text-overflow: ellipsis; }
+.text { white-space: pre-wrap; overflow-wrap: anywhere; }
+.body--dark { --bar: #16263d; }
+@media (max-width: 600px) { .page { padding: 8px; } }
+"""
+MODES = {None: "brightness_auto", False: "light_mode", True: "dark_mode"}
+"""Symbols of the colors of a page: those of the system, light and dark."""
+
+
+@contextmanager
+def frame(title: str, path: str, links: Sequence[tuple[str, str]]) -> Iterator[None]:
+    """Context whose elements are the content of a page.
+
+    Args:
+        title: of the page.
+        path: of the page.
+        links: path and title of each page in the navigation.
+    """
+    ui.add_css(STYLE)
+    dark = ui.dark_mode(None)
+    with ui.header().classes("header items-center gap-1 no-wrap"):
+        ui.label("rejeu").classes("text-subtitle1 text-weight-bold q-mr-sm gt-xs")
+        with ui.row().classes("gap-0 no-wrap").style("overflow-x: auto"):
+            for target, name in links:
+                line = "text-decoration: underline; text-underline-offset: 6px" if target == path else ""
+                ui.link(name, target).classes("text-white q-px-sm no-underline").style(line)
+        ui.space()
+        ui.button(icon=MODES[None], on_click=lambda event: next_mode(event.sender, dark)).props(
+            "flat round dense color=white aria-label='light or dark'"
+        )
+    with ui.column().classes("page"):
+        yield
+
+
+def next_mode(button: ui.button, dark: ui.dark_mode) -> None:
+    """Changes the colors of a page: those of the system, light, dark."""
+    modes = [*MODES]
+    dark.value = modes[(modes.index(dark.value) + 1) % len(modes)]
+    button.props(f"icon={MODES[dark.value]}")
+
+
+def follow(studio: Studio, show: Callable[[], object], every: float = EVERY) -> None:
+    """Calls a function now, and again whenever the rows of the studio have changed, as long as the page is open."""
+    seen = -1
+
+    def look() -> None:
+        nonlocal seen
+        if seen != studio.version:
+            seen = studio.version
+            show()
+
+    look()
+    ui.timer(every, look)
+
+
+def address(path: str, **query: str) -> str:
+    """Returns the address of a page with query parameters, which may hold anything.
+
+    >>> address("/run", run="a b/<c>")
+    '/run?run=a+b%2F%3Cc%3E'
+    """
+    return f"{path}?{urlencode(query)}" if query else path

@@ -1,0 +1,83 @@
+"""The server of the studio: its pages, on a port of this computer."""
+
+from __future__ import annotations
+
+import secrets
+import socket
+from collections.abc import Callable
+from contextlib import closing
+from typing import NamedTuple
+
+import uvicorn
+from fastapi import FastAPI, Request
+from nicegui import ui
+
+from rejeu.lab.studio import runs
+from rejeu.lab.studio.guard import HOST, Guard
+from rejeu.lab.studio.layout import frame
+from rejeu.lab.studio.state import Studio
+
+PORTS = 100
+"""How many ports are tried."""
+
+
+class Page(NamedTuple):
+    """A page of the studio."""
+
+    path: str
+    title: str
+    build: Callable[[Studio, Request], None]
+    """Makes its elements, below the header. Query parameters are untrusted."""
+    is_listed: bool = True
+    """Whether the navigation leads to it."""
+
+
+PAGES = (Page("/", "Runs", runs.build),)
+
+
+def serve(studio: Studio, port: int, ready: Callable[[str], None]) -> None:
+    """Serves the studio until Ctrl-C; ``ready`` is called with the address.
+
+    Args:
+        studio: what is shown.
+        port: the port, or the first free one after it; 0 for any.
+        ready: called before the first request is answered.
+    """
+    with closing(bound(port)) as listening, studio:
+        own_port = listening.getsockname()[1]
+        token = secrets.token_urlsafe(24)
+        server = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
+        links = [(page.path, page.title) for page in PAGES if page.is_listed]
+        for page in PAGES:
+            add(page, studio, links)
+        ui.run_with(server, title="rejeu studio", dark=None, show_welcome_message=False)
+        config = uvicorn.Config(Guard(server, token, own_port), log_level="warning", ws_max_size=2**24, lifespan="on")
+        ready(f"http://{HOST}:{own_port}/?token={token}")
+        uvicorn.Server(config).run(sockets=[listening])
+
+
+def add(page: Page, studio: Studio, links: list[tuple[str, str]]) -> None:
+    """Adds a page to NiceGUI's application."""
+
+    def show(request: Request) -> None:
+        with frame(page.title, page.path, links):
+            page.build(studio, request)
+
+    ui.page(page.path, title=f"{page.title} · rejeu studio")(show)
+
+
+def bound(port: int) -> socket.socket:
+    """Returns a socket that listens on a port of this computer, or to the first free one after it.
+
+    Raises:
+        OSError: if none of them is free.
+    """
+    for one in range(port, min(port + PORTS, 65536)):
+        made = socket.socket()
+        try:
+            made.bind((HOST, one))
+            made.listen()
+            return made
+        except OSError:
+            made.close()
+    raise OSError(f"no port from {port} on is free on {HOST}; give another with --port, or 0 for any")

@@ -1,0 +1,83 @@
+"""Who the server answers, where it listens, and how it ends. No browser."""
+
+import http.client
+import os
+import socket
+import subprocess
+import sys
+
+import pytest
+
+from tests.lab.studio.conftest import Served, serving
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory):
+    with serving(tmp_path_factory.mktemp("runs")) as one:
+        yield one
+
+
+def asked(served, path="/", **headers):
+    """Returns status and headers of an answer."""
+    connection = http.client.HTTPConnection(*served.host.split(":"), timeout=10)
+    connection.request("GET", path, headers={name.replace("_", "-"): value for name, value in headers.items()})
+    answer = connection.getresponse()
+    answer.read()
+    connection.close()
+    return answer.status, {name.lower(): value for name, value in answer.getheaders()}
+
+
+def test_only_the_address_with_its_token_is_answered_and_then_its_cookie(served):
+    assert [asked(served, path)[0] for path in ("/", "/?token=", "/?token=wrong", "/_nicegui/x")] == [403] * 4
+    status, headers = asked(served, f"/?run=a+b&token={served.token}")
+    assert (status, headers["location"]) == (303, "/?run=a+b")
+    name, _, value = headers["set-cookie"].partition(";")[0].partition("=")
+    assert "httponly" in headers["set-cookie"].lower()
+    status, headers = asked(served, Cookie=f"{name}={value}")
+    assert status == 200
+    assert "default-src 'self'" in headers["content-security-policy"]
+    assert asked(served, Cookie=f"{name}=wrong")[0] == 403
+    assert asked(served, Cookie=f"{name}={value}", Host="evil.example")[0] == 403
+    assert asked(served, Cookie=f"{name}={value}", Origin="http://evil.example")[0] == 403
+
+
+@pytest.mark.parametrize("own", [{}, {"Origin": "http://evil.example"}])
+def test_a_websocket_needs_the_cookie_and_the_own_origin(served, own):
+    _, headers = asked(served, f"/?token={served.token}")
+    cookie = {"Cookie": headers["set-cookie"].partition(";")[0]} if own else {}
+    upgrade = {"Connection": "Upgrade", "Upgrade": "websocket", "Sec-WebSocket-Version": "13"}
+    upgrade |= {"Sec-WebSocket-Key": "AAAAAAAAAAAAAAAAAAAAAA==", **own, **cookie}
+    assert asked(served, "/_nicegui_ws/socket.io/?EIO=4&transport=websocket", **upgrade)[0] == 403
+
+
+def test_it_listens_on_this_computer_only_and_takes_the_next_port(tmp_path, served):
+    port = int(served.host.partition(":")[2])
+    command = [sys.executable, "-m", "rejeu", "studio", str(tmp_path), "--port", str(port), "--no-browser"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    try:
+        line = process.stdout.readline()
+        assert int(line.partition("127.0.0.1:")[2].partition("/")[0]) > port
+    finally:
+        process.kill()
+        process.communicate()
+    with pytest.raises(OSError, match=r"refused|unreachable|timed out|assign"):
+        socket.create_connection(("127.0.0.2", port), timeout=1).close()  # this computer too, by another address
+
+
+def test_without_the_extra_there_is_one_line(tmp_path):
+    (tmp_path / "nicegui.py").write_text("raise ImportError", encoding="utf-8")
+    path = os.pathsep.join([str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])])
+    ended = subprocess.run(
+        [sys.executable, "-m", "rejeu", "studio", str(tmp_path)],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PYTHONPATH": path},
+    )
+    assert (ended.returncode, ended.stdout) == (2, "")
+    expected = 'rejeu: error: the studio needs nicegui, which is not installed; run: pip install "rejeu[studio]"'
+    assert ended.stderr.strip() == expected
+
+
+def test_ctrl_c_ends_it(tmp_path):
+    printed = Served(tmp_path).end()
+    assert "Traceback" not in printed
