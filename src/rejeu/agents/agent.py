@@ -276,7 +276,7 @@ class Agent(BaseAgent):
         without the interruption. Otherwise new episodes start, with a warning. See ``resumed``.
 
         Args:
-            folder: as given to :class:`rejeu.callbacks.Checkpoint`.
+            folder: as given to :class:`rejeu.callbacks.Checkpoint`, or one of the checkpoints in it.
             env: as for the constructor; None makes as many environments of the same id.
             changes: hyperparameters that replace the saved ones.
 

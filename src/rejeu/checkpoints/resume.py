@@ -36,8 +36,8 @@ A = TypeVar("A", bound=BaseAgent)
 
 
 def resume(cls: type[A], folder: Path, env: Any, changes: dict[str, Any]) -> A:
-    """Returns the agent of the newest complete checkpoint; see :meth:`Agent.resume`."""
-    found = run_files(folder)
+    """Returns the agent of the newest complete checkpoint, or of the one that is named; see :meth:`Agent.resume`."""
+    found = [folder] if folder.is_file() else run_files(folder)
     if not found:
         raise FileNotFoundError(f"there is no checkpoint in {folder}")
     skipped: list[str] = []
@@ -45,6 +45,9 @@ def resume(cls: type[A], folder: Path, env: Any, changes: dict[str, Any]) -> A:
         try:
             agent = _resume(cls, path, env, dict(changes))
         except CheckpointError as error:
+            settings = changes.keys() - model_files.AGENT_ARGUMENTS
+            if settings and is_whole(path):  # an older one might fit, and lose what was trained since
+                raise CheckpointError(f"{error}; {', '.join(sorted(settings))} cannot be changed here") from None
             if i + 1 == len(found):
                 raise
             skipped.append(str(error))
@@ -54,6 +57,19 @@ def resume(cls: type[A], folder: Path, env: Any, changes: dict[str, Any]) -> A:
             agent.resumed = agent.resumed._replace(skipped=tuple(skipped))
             return agent
     raise AssertionError
+
+
+def is_whole(path: Path) -> bool:
+    """Returns whether a checkpoint and its files of rows can be read."""
+    try:
+        with checkpoint.opened(path, "run") as file:
+            file.read()
+        for name in convert(file.header, RunHeader).rows:
+            with checkpoint.opened(path.parent / name, "rows") as rows:
+                rows.read()
+    except (FileNotFoundError, *WRONG):
+        return False
+    return True
 
 
 def _resume(cls: type[A], path: Path, env: Any, changes: dict[str, Any]) -> A:

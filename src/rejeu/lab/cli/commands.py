@@ -147,18 +147,11 @@ class Sweep:
     json: Json = False
 
 
-@dataclass(frozen=True)
-class Resume(RunOptions):
-    """Resumes a run that was stopped, or that crashed, from its newest checkpoint; or a sweep or a study.
-
-    Without --steps or --minutes it trains to the goal that was set when it began. Example: rejeu resume runs/NAME
-    """
+@dataclass(frozen=True, kw_only=True)
+class Continued(RunOptions):
+    """How a run goes on from a checkpoint. Abstract."""
 
     run: RunPath
-    finish: bool = False
-    """Of a complete run whose process ended before all files were written: write them, rather than report an error."""
-    workers: Several = None
-    """Of a sweep or a study: runs at once; by default half as many as there are cores."""
     ray: Annotated[str | None, Shown("ADDRESS"), Topic.ENVIRONMENT] = None
     """Of a sweep, or of a run with --backend ray: use this Ray cluster, auto or HOST:PORT."""
     steps: Count = None
@@ -176,6 +169,32 @@ class Resume(RunOptions):
     no_report: NoReport = False
     no_video: NoVideo = False
     json: Json = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class Resume(Continued):
+    """Resumes a run that was stopped, or that crashed, from its newest checkpoint; or a sweep or a study.
+
+    Without --steps or --minutes it trains to the goal that was set when it began. Example: rejeu resume runs/NAME
+    """
+
+    finish: bool = False
+    """Of a complete run whose process ended before all files were written: write them, rather than report an error."""
+    workers: Several = None
+    """Of a sweep or a study: runs at once; by default half as many as there are cores."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Branch(Continued):
+    """Begins a new run from a checkpoint of another, with other hyperparameters; the other run is not changed.
+
+    Up to the checkpoint both are the same. Example: rejeu branch runs/NAME --at 50000 --set learning_rate=1e-4
+    """
+
+    at: Annotated[Annotated[int, Meta(ge=0)] | None, Shown("STEP")] = None
+    """Environment step to begin from: the checkpoint of this step, or the nearest before it; by default the newest."""
+    out: Folder = None
+    """Run folder, as for rejeu train."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -520,7 +539,7 @@ class Pull:
 
 
 TASKS: dict[str, tuple[Callable[..., Any], ...]] = {
-    "train": (List, Check, Train, Resume, Clone, Tune, Sweep),
+    "train": (List, Check, Train, Resume, Branch, Clone, Tune, Sweep),
     "look": (Studio, Evaluate, Watch, Record, Report, Runs, Status, Compare),
     "share": (Export, Import, Push, Pull),
     "teach": (Play, Course, Class),
@@ -529,6 +548,7 @@ TASKS: dict[str, tuple[Callable[..., Any], ...]] = {
 COMMANDS = {kind.__name__.lower(): kind for kinds in TASKS.values() for kind in kinds}
 """The arguments of each command, by its name."""
 MODULES = {
+    "branch": "resume",
     "class": "courses",
     "course": "courses",
     "evaluate": "models",

@@ -1,28 +1,34 @@
-"""``rejeu resume``: continues a run exactly where it was stopped, or trains a complete one further."""
+"""``rejeu resume`` and ``rejeu branch``: a run goes on from a checkpoint.
+
+A run is continued exactly where it was stopped, a complete one is trained further, or a new run begins from the state of
+another.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import secrets
+import shutil
 import warnings
+from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 from rejeu.agents import Agent, agent_of_file
 from rejeu.algorithms import config as configs
-from rejeu.checkpoints.run_folder import RunFolder
+from rejeu.checkpoints.run_folder import RunFolder, check_free, create, run_files, step_of
 from rejeu.core import devices
 from rejeu.core.interrupt import Interrupt
 from rejeu.envs.make import WorkerOptions
 from rejeu.lab.cli import environment as environments, sweep, tune
-from rejeu.lab.cli.commands import Resume
+from rejeu.lab.cli.commands import Branch, Continued, Resume
 from rejeu.lab.cli.output import Stopwatch, echo
 from rejeu.lab.cli.session import Session, TrainingLimits, has_reached_goal, make_evaluation_env
 from rejeu.lab.experiments.folder import is_sweep
 from rejeu.lab.experiments.study import StudyFolder
 from rejeu.lab.runs import config as configs_of_runs
-from rejeu.lab.runs.config import DecidedRun, merged, read_folder
-from rejeu.logs.formatting import quoted
+from rejeu.lab.runs.config import DecidedRun, Origin, merged, read_folder
 from rejeu.logs.logging import require
 from rejeu.logs.tables import read_table
 
@@ -40,11 +46,77 @@ def run_resume(arguments: Resume) -> tuple[int, dict[str, Any]]:
         return sweep.resume(arguments) if holds_sweep else tune.resume_study(arguments)
     if arguments.workers is not None:
         raise ValueError(f"{arguments.run} is a single run; --workers is for the folder of a sweep or a study")
-    return resume(arguments)
+    folder = RunFolder(arguments.run)
+    return resume(arguments, folder.checkpoints, lambda agent, config: (folder, config), arguments.finish)
 
 
-def resume(arguments: Resume) -> tuple[int, dict[str, Any]]:
-    """Trains; returns the exit status and the result."""
+def run_branch(arguments: Branch) -> tuple[int, dict[str, Any]]:
+    """Trains, as ``rejeu resume`` does, in a folder of its own, which is there once the checkpoint is read."""
+    check_free(arguments.out)
+    parent = RunFolder(arguments.run)
+    read_folder(parent)  # it has no checkpoint to name if it is no run folder
+    checkpoint = nearest(parent.checkpoints, arguments.at)
+
+    def begin(agent: Agent, config: DecidedRun) -> tuple[RunFolder, DecidedRun]:
+        folder = create(arguments.out, config.env, config.algorithm, config.seed)
+        for table in (parent.metrics, parent.metrics.with_suffix(".json"), parent.evaluations):
+            if table.is_file():
+                shutil.copyfile(table, folder.path / table.name)  # the session leaves out later rows
+        agent.run_id = secrets.token_hex(8)
+        write_best(agent, folder.best)
+        step = step_of(checkpoint)
+        nearest_to = (
+            "" if arguments.at in (None, step) else f", whose checkpoint nearest before step {arguments.at:,} is used"
+        )
+        echo(f"branch of     {parent.path}{nearest_to}")
+        origin = Origin(run=str(parent.path), step=step, changes=arguments.hyperparameters)
+        return folder, dataclasses.replace(config, origin=origin)
+
+    return resume(arguments, checkpoint, begin)
+
+
+def write_best(agent: Agent, path: Path) -> None:
+    """Writes the model that evaluated best so far, if there is one; the file of the other run may be of a later step."""
+    run, best = agent.run, agent.best
+    if best is None or best.by != "evaluation":
+        return
+    now = run.state, run.step
+    run.state, run.step = best.state, best.step
+    try:
+        agent.save(path)
+    finally:
+        run.state, run.step = now
+
+
+def nearest(checkpoints: Path, step: int | None) -> Path:
+    """Returns the newest checkpoint up to a step; None for the newest of all.
+
+    Raises:
+        FileNotFoundError: if there is none.
+    """
+    every = run_files(checkpoints)
+    found = next((path for path in every if step is None or step_of(path) <= step), None)
+    if found is None:
+        steps = ", ".join(f"{step_of(path):,}" for path in reversed(every))
+        has = f"there are those of steps {steps}" if every else f"there is no checkpoint in {checkpoints}"
+        raise FileNotFoundError(f"--at {step}: no checkpoint is of this step or before it; {has}")
+    return found
+
+
+def resume(
+    arguments: Continued,
+    checkpoint: Path,
+    begin: Callable[[Agent, DecidedRun], tuple[RunFolder, DecidedRun]],
+    finish: bool = False,
+) -> tuple[int, dict[str, Any]]:
+    """Trains; returns the exit status and the result.
+
+    Args:
+        arguments: of the command.
+        checkpoint: to begin from, or a folder of checkpoints.
+        begin: returns the folder of the run, and its configuration, from that of the run that the checkpoint is of.
+        finish: whether only the files of a complete run are to be written.
+    """
     stopwatch = Stopwatch()
     folder = RunFolder(arguments.run)
     config = read_folder(folder)
@@ -60,11 +132,14 @@ def resume(arguments: Resume) -> tuple[int, dict[str, Any]]:
     with closing(environment.vector(config.n_envs, config.backend, config.seed, workers)) as env:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "resumed at step", UserWarning)  # printed below
-            agent = kind.resume(folder.checkpoints, env, device=device, **changes(arguments, config))
+            agent = kind.resume(checkpoint, env, device=device, **changes(arguments, config))
+        limits = choose_limits(agent, arguments, finish)
+        before = config
         if arguments.hyperparameters:
             config = dataclasses.replace(config, hyperparameters=configs.to_json(agent.config))
+        folder, config = begin(agent, config)
+        if config is not before:
             configs_of_runs.write(folder.config, config)
-        limits = choose_limits(agent, arguments)
         echo(f"run folder    {folder.path}: {environment}, {config.algorithm}, seed {config.seed}")
         echo(f"checkpoint    {agent.resumed}")
         with closing(make_evaluation_env(config, environment)) as evaluation_env, Interrupt() as stop:
@@ -82,7 +157,7 @@ def resume(arguments: Resume) -> tuple[int, dict[str, Any]]:
             return session.run(stop, stopwatch)
 
 
-def changes(arguments: Resume, config: DecidedRun) -> dict[str, Any]:
+def changes(arguments: Continued, config: DecidedRun) -> dict[str, Any]:
     """Returns the hyperparameters that ``--set`` changes."""
     names = {name.split(".")[0] for name in arguments.hyperparameters}
     changed = merged(arguments.hyperparameters, config.hyperparameters)
@@ -94,7 +169,7 @@ def is_evaluated(run: Path, agent: Agent) -> bool:
     return agent.num_timesteps in read_table(RunFolder(run).evaluations, ("step",)).column("step")
 
 
-def choose_limits(agent: Agent, arguments: Resume) -> TrainingLimits:
+def choose_limits(agent: Agent, arguments: Continued, finish: bool) -> TrainingLimits:
     """Returns how far to train: to the goal of the run, to a pause before it, or further than it.
 
     Raises:
@@ -102,12 +177,11 @@ def choose_limits(agent: Agent, arguments: Resume) -> TrainingLimits:
     """
     steps, minutes = arguments.steps, arguments.minutes
     if has_reached_goal(agent):
-        if arguments.finish or (steps is None and minutes is None and not is_evaluated(arguments.run, agent)):
+        if finish or (steps is None and minutes is None and not is_evaluated(arguments.run, agent)):
             return TrainingLimits()
         if steps is None and minutes is None:
             raise ValueError(
-                f"the run is complete after {agent.num_timesteps:,} steps; to train further: "
-                f"rejeu resume {quoted(arguments.run)} --steps N, or --minutes M"
+                f"the run is complete after {agent.num_timesteps:,} steps; give --steps N, or --minutes M, to train further"
             )
         return TrainingLimits(steps, minutes)
     assert agent.training_call is not None

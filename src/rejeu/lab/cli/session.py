@@ -215,7 +215,8 @@ class Session(NamedTuple):
             render = self.environment.rendering
             callbacks.append(RecordVideo(folder.videos, config.video_every, env=render, max_steps=VIDEO_STEPS))
         if config.checkpoint_minutes:
-            callbacks.append(Checkpoint(folder.checkpoints, minutes=config.checkpoint_minutes))
+            minutes, keep = config.checkpoint_minutes, config.keep_checkpoints
+            callbacks.append(Checkpoint(folder.checkpoints, minutes=minutes, keep=keep))
         return evaluate, callbacks
 
     def plot_curve(self, evaluate: Evaluate) -> None:

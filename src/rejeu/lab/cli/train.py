@@ -180,5 +180,6 @@ def make_config(
         evaluate_every=arguments.evaluate_every or base.evaluate_every,
         evaluate_episodes=arguments.evaluate_episodes or base.evaluate_episodes,
         checkpoint_minutes=arguments.checkpoint_minutes or None,
+        keep_checkpoints=arguments.keep_checkpoints,
         log=logs,
     )

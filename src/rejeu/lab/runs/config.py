@@ -25,7 +25,18 @@ from msgspec import Meta
 from rejeu.checkpoints.run_folder import RunFolder, newest_inside
 from rejeu.core import atomic
 from rejeu.core.errors import CheckpointError
-from rejeu.core.records import Duration, EnvCount, Malformed, Positive, Seed, convert, json_text, read_json, shown
+from rejeu.core.records import (
+    Count,
+    Duration,
+    EnvCount,
+    Malformed,
+    Positive,
+    Seed,
+    convert,
+    json_text,
+    read_json,
+    shown,
+)
 from rejeu.core.validation import with_value
 from rejeu.logs.formatting import LOGS, quoted
 
@@ -180,6 +191,26 @@ class EnvironmentOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Origin:
+    """Where a run began that is a branch of another."""
+
+    run: str
+    """Folder of the other run."""
+    step: Count
+    """Environment step of its checkpoint."""
+    changes: dict[Key, Any] = field(default_factory=dict)
+    """Hyperparameters that are not the other run's, by dotted name."""
+
+    def words(self) -> list[str]:
+        """Returns the words of the command line that begins the same branch.
+
+        >>> Origin(run="runs/a", step=500, changes={"gamma": 0.9}).words()
+        ['branch', 'runs/a', '--at', '500', '--set', 'gamma=0.9']
+        """
+        return ["branch", self.run, "--at", str(self.step), *assignment_words("--set", self.changes)]
+
+
+@dataclass(frozen=True, kw_only=True)
 class RunConfig(EnvironmentOptions):
     """The description of a run."""
 
@@ -217,6 +248,8 @@ class RunConfig(EnvironmentOptions):
     """Environment steps between two videos of the policy, in the folder videos; by default none are recorded."""
     checkpoint_minutes: Annotated[Annotated[float, Meta(ge=0)] | None, Shown("M"), Topic.OUTPUT] = 5.0
     """Minutes between two checkpoints, from which rejeu resume continues; 0 for none."""
+    keep_checkpoints: Annotated[Positive, Shown("N"), Topic.OUTPUT] = 2
+    """How many checkpoints are kept, the newest; rejeu branch begins from any of them."""
     evaluate_every: Annotated[Positive | None, Shown("N"), Topic.EVALUATION] = None
     """Environment steps between two evaluations; by default the preset's, else 5000."""
     evaluate_episodes: Annotated[Annotated[int, Meta(ge=1, le=MAX_EPISODES)] | None, Shown("N"), Topic.EVALUATION] = (
@@ -230,6 +263,8 @@ class RunConfig(EnvironmentOptions):
     """How the environment was named on the command line, if that is not its id. It is never imported."""
     policy: str = ""
     """Empty where the environment decides."""
+    origin: Origin | None = None
+    """None of a run that began with its first step."""
 
     def __post_init__(self) -> None:
         if self.steps is not None and self.minutes is not None:
@@ -277,6 +312,8 @@ class RunConfig(EnvironmentOptions):
         >>> RunConfig(env="CartPole-v1", algorithm="PPO", n_envs=8, hyperparameters={"gamma": 0.9}).words()
         ['train', 'CartPole-v1', '--algo', 'PPO', '--envs', '8', '--set', 'gamma=0.9']
         """
+        if self.origin is not None:
+            return [*self.origin.words(), *self.environment_words(option=True)]
         words = ["train", *self.environment_words()]
         for one in options(RunConfig):
             value = getattr(self, one.field)
