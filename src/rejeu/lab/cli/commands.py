@@ -398,7 +398,7 @@ class Report(RunOptions):
     open: bool = False
     """Open the page in the web browser."""
     live: bool = False
-    """Serve the page to this computer and update it while the runs train, until Ctrl-C."""
+    """Is now rejeu studio RUN, which follows runs while they train."""
     replay: Count = None
     """First let the trained agent play this many episodes, from the seeds 0, 1, 2 ...; the page lists them by return."""
 

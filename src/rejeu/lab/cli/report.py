@@ -1,36 +1,28 @@
-"""``rejeu report``: a page about runs, also while they train."""
+"""``rejeu report``: a page about runs."""
 
 from __future__ import annotations
 
-import time
 import webbrowser
 from contextlib import closing
 from pathlib import Path
 
 from rejeu.checkpoints.run_folder import RunFolder, find_model
 from rejeu.core import atomic
-from rejeu.core.interrupt import leaving
 from rejeu.core.validation import whole
 from rejeu.lab.cli.commands import Report
 from rejeu.lab.reporting.report import write_report
-from rejeu.lab.reporting.report.live import make_server
 
 SUFFIXES = (".html", ".htm")
 
 
 def run_report(arguments: Report) -> tuple[int, None]:
-    """Writes the page, or serves it until Ctrl-C.
+    """Writes the page.
 
     Raises:
-        ValueError: for ``--out`` or ``--replay`` with ``--live``, or for a file that is no page.
+        ValueError: for a file that is no page.
     """
     if arguments.live:
-        if arguments.out is not None:
-            raise ValueError("--live serves the page and writes no file; leave out --out, or --live")
-        if arguments.replay is not None:
-            raise ValueError("--replay plays the trained agent; leave out --replay, or --live")
-        follow(arguments)
-        return 0, None
+        raise ValueError("--live is now the studio, which follows runs while they train: rejeu studio RUN")
     if arguments.out is not None and arguments.out.suffix.lower() not in SUFFIXES:
         raise ValueError(f"--out {arguments.out} must end in {' or '.join(SUFFIXES)}")
     for path in arguments.runs if arguments.replay is not None else ():
@@ -63,18 +55,3 @@ def replay(path: Path, arguments: Report) -> None:
             played = agent.evaluate(1, env=env, seed=seed)
             rows.append(f"{seed},{played.mean_return},{played.mean_length:.0f},{played.success_rate}")
     atomic.write(RunFolder(path).replays, "\n".join(rows) + "\n")
-
-
-def follow(arguments: Report) -> None:
-    """Serves the page until Ctrl-C or SIGTERM ends the process; waits for the folders of runs that are about to begin."""
-    awaited = [path for path in arguments.runs if not path.exists()]
-    for path in awaited:
-        print(f"there is no run folder {path} yet; waiting for it (Ctrl-C ends it)", flush=True)
-    while not all(RunFolder(path).config.is_file() for path in awaited):
-        time.sleep(0.5)
-    server, address = make_server(arguments.runs)
-    print(f"{address} (Ctrl-C ends it)", flush=True)
-    if arguments.open:
-        webbrowser.open(address)
-    with server, leaving("the page is no longer served"):
-        server.serve_forever()

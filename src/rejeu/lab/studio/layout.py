@@ -12,6 +12,7 @@ from urllib.parse import urlencode
 
 from nicegui import ui
 
+from rejeu.lab.studio import figures
 from rejeu.lab.studio.state import Studio
 
 EVERY = 1.0
@@ -41,6 +42,7 @@ def frame(title: str, path: str, links: Sequence[tuple[str, str]]) -> Iterator[N
         path: of the page.
         links: path and title of each page in the navigation.
     """
+    figures.add_scripts()
     ui.add_css(STYLE)
     dark = ui.dark_mode(None)
     with ui.header().classes("header items-center gap-1 no-wrap"):

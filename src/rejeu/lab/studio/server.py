@@ -12,7 +12,7 @@ import uvicorn
 from fastapi import FastAPI, Request
 from nicegui import ui
 
-from rejeu.lab.studio import runs
+from rejeu.lab.studio import figures, runs
 from rejeu.lab.studio.guard import HOST, Guard
 from rejeu.lab.studio.layout import frame
 from rejeu.lab.studio.state import Studio
@@ -48,6 +48,7 @@ def serve(studio: Studio, port: int, ready: Callable[[str], None]) -> None:
         token = secrets.token_urlsafe(24)
         server = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
         links = [(page.path, page.title) for page in PAGES if page.is_listed]
+        figures.serve_scripts()
         for page in PAGES:
             add(page, studio, links)
         ui.run_with(server, title="rejeu studio", dark=None, show_welcome_message=False)

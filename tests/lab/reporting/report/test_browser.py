@@ -1,13 +1,9 @@
 """Pages about runs in headless Chromium: drawn, interactive, silent, and never running what a run folder contains."""
 
-import threading
-import time
-
 import pytest
 
 from rejeu.lab.reporting.comparison import compare
 from rejeu.lab.reporting.report import write_report
-from rejeu.lab.reporting.report.live import make_server
 from tests.lab.reporting.report.folders import write, write_hostile
 from tests.lab.reporting.test_comparison import write_run
 from tests.tiers import crossed, exhaustive
@@ -128,26 +124,6 @@ def test_policy_stops_an_injected_script_and_requests(browser, report):
         page.wait_for_timeout(300)
         assert page.evaluate("window.hacked") is None
         assert len([text for text in opened.messages if "Content Security Policy" in text]) >= 3
-
-
-def test_live_page_follows_the_run(browser, tmp_path):
-    folder = write(tmp_path / "run", videos=False)
-    server, address = make_server([folder])
-    threading.Thread(target=server.serve_forever, args=(0.05,), daemon=True).start()
-    with server, Opened(browser, address) as opened:
-        page = opened.page
-        with (folder / "evaluations.csv").open("a", encoding="utf-8") as file:
-            file.writelines(f"{3001 + i},35.0,1.0,111.0,1.0,222.0,20,1\n" for i in range(40))
-        page.locator("td", has_text="3,040").wait_for(timeout=60_000)
-        page.evaluate("document.querySelector('.tall').scrollTop = 100")
-        with (folder / "evaluations.csv").open("a", encoding="utf-8") as file:
-            file.write("3500,35.0,1.0,222.0,1.0,222.0,20,1\n")
-        page.locator("td", has_text="222.00").wait_for(timeout=60_000)
-        assert page.evaluate("document.querySelector('.tall').scrollTop") == 100
-        assert page.locator(".tall").bounding_box()["height"] <= 480
-        time.sleep(0.5)
-        assert opened.messages == []
-        server.shutdown()
 
 
 @exhaustive

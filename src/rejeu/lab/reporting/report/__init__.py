@@ -85,14 +85,13 @@ def write_page(runs: Sequence[RunSummary], out: Path) -> Path:
     return atomic.write(out, render(runs, out.absolute().parent))
 
 
-def render(runs: Sequence[RunSummary], folder: Path | None, live: bool = False) -> str:
+def render(runs: Sequence[RunSummary], folder: Path | None) -> str:
     """Returns the page as text.
 
     Args:
         runs: what is shown.
         folder: where the page will be, for links to videos that are not embedded; None for no links.
-        live: let the page ask its server for new data.
     """
     parts = sections.build(runs, folder)
     title = sections.title_of(runs)
-    return page.render("report.html", parts.data, title=title, runs=parts.runs, live=live)
+    return page.render("report.html", parts.data, title=title, runs=parts.runs)

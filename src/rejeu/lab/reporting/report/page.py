@@ -18,13 +18,12 @@ if TYPE_CHECKING:
 TEMPLATES = Path(__file__).parent / "templates"
 
 
-def render(template: str, data: Any, *, live: bool = False, **context: Any) -> str:
+def render(template: str, data: Any, **context: Any) -> str:
     """Returns a page that extends ``base.html``.
 
     Args:
         template: name of the template.
         data: JSON data for the script: ``{"charts": {id: chart}, "histograms": {id: histogram}, ...}``.
-        live: allow the page to ask its server for new data.
         context: variables of the template.
 
     Raises:
@@ -35,27 +34,22 @@ def render(template: str, data: Any, *, live: bool = False, **context: Any) -> s
     from markupsafe import Markup
 
     nonce = secrets.token_urlsafe(18)
-    network = "'self'" if live else "'none'"
     policy = (
         f"default-src 'none'; script-src 'nonce-{nonce}'; style-src 'unsafe-inline'; img-src data:; media-src data:; "
-        f"connect-src {network}; base-uri 'none'; form-action 'none'"
+        "connect-src 'none'; base-uri 'none'; form-action 'none'"
     )
-    own = {name: Markup((TEMPLATES / name).read_text(encoding="utf-8")) for name in ("page.css", "page.js")}
+    own = ("charts.css", "page.css", "charts.js", "page.js")
+    charts_style, style, charts, script = (Markup((TEMPLATES / name).read_text(encoding="utf-8")) for name in own)
     return page.render(
         nonce=nonce,
         policy=policy,
         data=data,
-        live=live,
-        style=own["page.css"],
-        script=own["page.js"],
+        style=charts_style + style,
+        charts=charts,
+        script=script,
         plotly=Markup(plotly_script()),
         **context,
     )
-
-
-def part(name: str, run: Any) -> str:
-    """Returns one part of the page as HTML, such as ``"headline"``."""
-    return str(getattr(environment().get_template("parts.html").module, name)(run))
 
 
 @cache

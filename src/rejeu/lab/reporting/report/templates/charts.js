@@ -1,0 +1,127 @@
+// Draws the charts and histograms of rejeu.logs.charts with Plotly: in pages that are one file, and in the studio.
+const RejeuCharts = (() => {
+  "use strict";
+  const bare = { displayModeBar: false, responsive: true, scrollZoom: false };
+
+  const color = (name) => getComputedStyle(document.body).getPropertyValue(`--${name}`).trim();
+  const faded = (name, share) => {
+    const value = parseInt(color(name).slice(1), 16);
+    return `rgba(${value >> 16},${(value >> 8) & 255},${value & 255},${share})`;
+  };
+  // Plotly shows a few HTML tags in its labels; here all text is plain.
+  const plain = (text) => String(text).replace(/&/g, "&amp;").replace(/</g, "&lt;");
+  const switchedOff = new WeakMap(); // the numbers of the series that the reader switched off, by plot
+
+  function layout(chart, more = {}) {
+    const phone = matchMedia("(pointer: coarse)").matches;
+    const line = { gridcolor: color("rule"), zeroline: false, linecolor: color("rule"), automargin: true };
+    const title = (text) => ({ text: plain(text), font: { size: 12, color: color("muted") }, standoff: 6 });
+    return {
+      margin: { l: 8, r: 14, t: 6, b: 8 }, paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)", showlegend: false,
+      font: { family: getComputedStyle(document.body).fontFamily, size: 12, color: color("muted") },
+      hoverlabel: { bgcolor: color("card"), bordercolor: color("rule"), font: { color: color("ink") }, namelength: -1 },
+      hovermode: "closest", dragmode: phone ? false : "zoom",
+      xaxis: {
+        ...line, showgrid: false, tickformat: "~s", title: title(more.x ?? ""), range: more.range, nticks: 8,
+      },
+      yaxis: {
+        ...line, title: title(chart.y ?? ""), range: chart.range ?? undefined, nticks: 7, exponentformat: "power",
+        tickformat: chart.percent ? ".0%" : "", separatethousands: true,
+      },
+      ...more.layout,
+    };
+  }
+
+  function traces(chart, axis, hidden) {
+    const found = [];
+    chart.series.forEach((series, number) => {
+      const x = series[axis];
+      const value = chart.percent ? "%{y:.1%}" : "%{y:,.5~g}";
+      const common = {
+        x, name: plain(series.name), visible: !hidden.has(number), type: "scatter",
+        hovertemplate: `${value}${series.name ? ` ${plain(series.name)}` : ""}<br>${chart.x ? `${plain(chart.x)} %{x:,.4~g}` : axis === "x" ? "step %{x:,d}" : "%{x:,.4~g} min"}<extra></extra>`,
+      };
+      const own = color(series.color);
+      if (series.kind === "dots") {
+        const size = Math.min(5.5, Math.max(3, 60 / Math.sqrt(x.length)));
+        const opacity = Math.min(0.65, Math.max(0.3, 400 / x.length));
+        found.push({ ...common, y: series.y, mode: "markers", marker: { color: own, size, opacity } });
+      } else if (series.kind === "line") {
+        found.push({ ...common, y: series.y, mode: "lines", line: { color: own, width: 2 } });
+      } else if (series.kind === "points") {
+        const reach = (end, sign) => series.y.map((y, i) => (end?.[i] == null ? 0 : sign * (end[i] - y)));
+        const bars = { type: "data", symmetric: false, array: reach(series.high, 1), arrayminus: reach(series.low, -1) };
+        found.push({
+          ...common, y: series.y, mode: "markers", cliponaxis: false,
+          marker: { color: own, size: 8, line: { color: color("card"), width: 1.5 } },
+          error_y: { ...bars, color: own, thickness: 1.3, width: 0, visible: Boolean(series.low) },
+        });
+      } else if (series.kind === "band") {
+        const keep = x.map((_, i) => i).filter((i) => series.low[i] != null && series.high[i] != null);
+        const edge = { ...common, x: keep.map((i) => x[i]), mode: "lines", line: { width: 0 }, hoverinfo: "skip", hovertemplate: undefined };
+        found.push({ ...edge, y: keep.map((i) => series.low[i]) });
+        found.push({ ...edge, y: keep.map((i) => series.high[i]), fill: "tonexty", fillcolor: faded(series.color, 0.2) });
+      } else if (series.kind === "area") {
+        found.push({ ...common, y: series.y, mode: "lines", line: { width: 0.5, color: own }, fillcolor: own, stackgroup: "all" });
+      }
+    });
+    return found;
+  }
+
+  // Draws a chart over steps (axis "x") or minutes ("t"), and its legend into the box if there is one.
+  function draw(element, chart, axis, box) {
+    if (!switchedOff.has(element)) switchedOff.set(element, new Set());
+    const hidden = switchedOff.get(element);
+    const stacked = chart.series.some((series) => series.kind === "area");
+    const more = { layout: stacked ? { hovermode: "x unified" } : {} };
+    if (!chart.small) more.x = chart.x ?? (axis === "x" ? "environment steps" : "minutes of training");
+    const last = Math.max(0, ...chart.series.map((series) => series[axis].findLast((x) => x != null) ?? 0));
+    more.range = chart.x_range ?? (last > 0 ? [0, last * (stacked ? 1 : 1.02)] : undefined);
+    Plotly.react(element, traces(chart, axis, hidden), layout(chart, more), bare);
+    if (box) legend(element, chart, axis, box, hidden);
+  }
+
+  function legend(element, chart, axis, box, hidden) {
+    const focused = [...box.children].indexOf(document.activeElement);
+    box.replaceChildren();
+    chart.series.forEach((series, number) => {
+      if (!series.name) return;
+      const button = document.createElement("button");
+      const sign = document.createElement("i");
+      button.type = "button";
+      button.setAttribute("aria-pressed", String(!hidden.has(number)));
+      sign.className = series.kind;
+      sign.style.background = series.kind === "band" ? faded(series.color, 0.35) : color(series.color);
+      button.append(sign, series.name);
+      button.addEventListener("click", () => {
+        if (!hidden.delete(number)) hidden.add(number);
+        draw(element, chart, axis, box);
+      });
+      box.append(button);
+    });
+    box.children[focused]?.focus(); // of the keyboard, which was on the button before
+  }
+
+  const digits = (value) => (Number.isInteger(value) ? {} : { maximumSignificantDigits: 6 });
+  const short = (value) => (value == null ? "–" : value.toLocaleString("en-US", digits(value)).replace("-", "−"));
+  const rangeOf = (h, i) => `${short(i === 0 ? h.least : h.edges[i])} to ${short(i === h.counts.length - 1 ? h.most : h.edges[i + 1])}`;
+
+
+  // Draws a histogram; the bar that is chosen has another color, and a click calls choose with the number of its bar.
+  function histogram(element, h, chosen, choose) {
+    const middles = h.counts.map((_, i) => (h.edges[i] + h.edges[i + 1]) / 2);
+    const colors = h.counts.map((_, i) => (i === chosen ? color("accent") : color("dots")));
+    const text = h.counts.map((n, i) => `${n.toLocaleString("en-US")} episodes<br>${rangeOf(h, i)}`);
+    const bars = {
+      type: "bar", x: middles, y: h.counts, width: h.edges[1] - h.edges[0], hovertext: text, hovertemplate: "%{hovertext}<extra></extra>",
+      marker: { color: colors, line: { color: color("card"), width: 1 } },
+    };
+    const axes = layout({ y: "episodes" }, { x: "return", layout: { dragmode: false, bargap: 0 } });
+    Object.assign(axes.yaxis, { rangemode: "tozero", exponentformat: "none" });
+    const isNew = !element.classList.contains("js-plotly-plot");
+    Plotly.react(element, [bars], axes, bare);
+    if (isNew) element.on("plotly_click", (event) => choose(event.points[0].pointNumber));
+  }
+
+  return { draw, histogram, rangeOf, short };
+})();

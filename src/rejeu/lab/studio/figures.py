@@ -1,0 +1,55 @@
+"""Charts and histograms of :mod:`rejeu.logs.charts` on a page, drawn by the same script as those of a report."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from importlib import resources
+from typing import Any
+
+from nicegui import app, ui
+from nicegui.element import Element
+
+from rejeu.lab.reporting.report.page import TEMPLATES
+
+SCRIPTS = ("/plotly.min.js", "/charts.js")
+
+
+class Figure(Element, component="chart.js"):
+    """A chart or a histogram. Mutable: ``show`` replaces it.
+
+    Args:
+        chart: as the functions of :mod:`rejeu.logs.charts` return it; None draws nothing yet.
+        height: in CSS.
+        choose: called with the number of the bar of a histogram that was clicked.
+    """
+
+    def __init__(
+        self, chart: dict[str, Any] | None = None, height: str = "240px", choose: Callable[[int], object] | None = None
+    ) -> None:
+        super().__init__()
+        self.props.update(chart=chart, axis="x", height=height)
+        self.classes("w-full")
+        if choose is not None:
+            self.on("choose", lambda event: choose(int(event.args)))
+
+    def show(self, chart: dict[str, Any] | None = None, **props: Any) -> None:
+        """Draws another chart, or the same over another ``axis`` ("x" are steps, "t" minutes), or with a ``chosen`` bar."""
+        changed = props if chart is None else {"chart": chart, **props}
+        if any(self.props.get(name) != value for name, value in changed.items()):
+            self.props.update(changed)
+            self.update()
+
+
+def serve_scripts() -> None:
+    """Serves the scripts that draw; they are those of the report, and Plotly's package."""
+    plotly = resources.files("plotly").joinpath("package_data", "plotly.min.js")
+    for url, file in zip(SCRIPTS, (plotly, TEMPLATES / "charts.js"), strict=True):
+        app.add_static_file(local_file=str(file), url_path=url)
+
+
+def add_scripts() -> None:
+    """Adds the scripts and the colors to the page that is built."""
+    ui.add_head_html("".join(f'<script src="{url}"></script>' for url in SCRIPTS))
+    css = (TEMPLATES / "charts.css").read_text(encoding="utf-8")
+    ui.add_css(re.sub(r"@media [^{]+\{\s*:root (\{.*?\})\s*\}", r".body--dark \1", css, flags=re.DOTALL))
