@@ -23,6 +23,7 @@ from rejeu.lab.reporting.runs import (
     RunSummary,
     best_row,
     has_process,
+    is_file,
     is_recent,
 )
 from rejeu.logs import charts
@@ -35,7 +36,8 @@ POINTS = 40
 COLUMNS = ("run", "environment", "algorithm", "state", "steps", "best", "rate", "curve")
 """Titles of a table, in the order of :func:`cells`."""
 BARS = "▁▂▃▄▅▆▇█"
-FILES = (CONFIG, EPISODES, METRICS, EVALUATIONS, WARNINGS, "agent.safetensors", "checkpoints", "replays.csv")
+FILES = (CONFIG, EPISODES, METRICS, EVALUATIONS, WARNINGS, "agent.safetensors", "checkpoints", "video.mp4")
+PICTURES = ("video.mp4", "curve.png")
 SHARE = 20.0
 """A run whose reading takes a second is read at most once in so many seconds."""
 SLICE = 64
@@ -163,6 +165,8 @@ def describe(run: RunSummary) -> Row:
         "best": best_evaluation(run),
         "evaluations": len(run.evaluations),
         "curve": curve(run),
+        "changed": max((time_of(run.path / name) or (0, 0))[0] for name in FILES) / 1e9,
+        "pictures": tuple(name for name in PICTURES if is_file(run.path / name)),
         "warnings": run.warnings,
         "notes": run.notes,
     }

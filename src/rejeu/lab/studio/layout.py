@@ -25,6 +25,10 @@ body { font-family: system-ui, sans-serif; }
 .header { background: var(--bar, #1d4f91); min-height: 48px; padding: 4px 12px; }
 .q-table td, .q-table th { padding: 4px 8px; }
 .q-table td { max-width: 22rem; overflow: hidden; text-overflow: ellipsis; }
+.quiet { color: var(--muted); }
+.picture { width: 84px; height: 48px; object-fit: cover; border-radius: 4px; display: block; }
+.notes { max-width: 16rem; white-space: normal; }
+a.run { color: var(--line); overflow-wrap: anywhere; }
 .text { white-space: pre-wrap; overflow-wrap: anywhere; }
 .body--dark { --bar: #16263d; }
 @media (max-width: 600px) { .page { padding: 8px; } }

@@ -9,8 +9,9 @@ from contextlib import closing
 from typing import NamedTuple
 
 import uvicorn
-from fastapi import FastAPI, Request
-from nicegui import ui
+from fastapi import FastAPI, Request, Response
+from fastapi.responses import FileResponse
+from nicegui import app, ui
 
 from rejeu.lab.studio import figures, runs
 from rejeu.lab.studio.guard import HOST, Guard
@@ -19,6 +20,9 @@ from rejeu.lab.studio.state import Studio
 
 PORTS = 100
 """How many ports are tried."""
+
+
+PICTURES = {"video.mp4": "video/mp4", "curve.png": "image/png"}
 
 
 class Page(NamedTuple):
@@ -49,6 +53,7 @@ def serve(studio: Studio, port: int, ready: Callable[[str], None]) -> None:
         server = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
         links = [(page.path, page.title) for page in PAGES if page.is_listed]
         figures.serve_scripts()
+        add_files(studio)
         for page in PAGES:
             add(page, studio, links)
         ui.run_with(server, title="rejeu studio", dark=None, show_welcome_message=False)
@@ -65,6 +70,16 @@ def add(page: Page, studio: Studio, links: list[tuple[str, str]]) -> None:
             page.build(studio, request)
 
     ui.page(page.path, title=f"{page.title} · rejeu studio")(show)
+
+
+def add_files(studio: Studio) -> None:
+    """Serves the pictures of runs, and nothing else of their folders."""
+
+    def show(name: str, run: str) -> Response:
+        path = studio.file(run, name) if name in PICTURES else None
+        return Response(status_code=404) if path is None else FileResponse(path, media_type=PICTURES[name])
+
+    app.get("/file/{name}")(show)
 
 
 def bound(port: int) -> socket.socket:

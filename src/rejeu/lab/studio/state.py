@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
 
 from rejeu.lab.reporting.rows import Row, Rows
+from rejeu.lab.reporting.runs import RunSummary, is_file
 
 EVERY = 1.0
 """Seconds between two looks at the folder, and longest look, after which rows are shown though some runs are not read yet."""
@@ -19,6 +21,8 @@ class Studio:
         self.folder = folder
         self.rows: list[Row] = []
         """One a run, as :meth:`rejeu.lab.reporting.rows.Rows.read` returns them. Replaced when they change, never changed."""
+        self.summaries: Mapping[str, RunSummary] = {}
+        """The runs without their tables, by the names of their rows."""
         self.version = 0
         """Rises when the rows change."""
         self._reader = Rows(folder)
@@ -36,9 +40,16 @@ class Studio:
         """Returns the row of a run by its path below the folder, as pages have it in their address; None if there is none."""
         return next((row for row in self.rows if row["run"] == run), None)
 
+    def file(self, run: str, name: str) -> Path | None:
+        """Returns a regular file in the folder of a run; None if there is none, or it is a symbolic link."""
+        row = self.row(run)
+        path = None if row is None else Path(row["path"]) / name
+        return path if path is not None and is_file(path) else None
+
     def _follow(self) -> None:
         while not self._ended.is_set():
             rows = self._reader.read(EVERY)
             if rows != self.rows:
-                self.rows, self.version = rows, self.version + 1
+                self.rows, self.summaries = rows, self._reader.summaries()
+                self.version += 1
             self._ended.wait(EVERY)
