@@ -15,7 +15,7 @@ import rejeu
 from rejeu.algorithms import ppo
 from rejeu.algorithms.actor_critic.config import ActorCriticConfig
 from rejeu.algorithms.actor_critic.network import ActorCritic, action_kind, is_value
-from rejeu.algorithms.actor_critic.steps import Samples, explained_variance, shuffled, standardized
+from rejeu.algorithms.actor_critic.steps import Samples, explained_variance, permuted, shuffled, standardized
 from rejeu.core.algorithm import Clock, Rollout
 from rejeu.core.prng import nth
 from rejeu.core.spaces import leaves
@@ -232,7 +232,7 @@ def test_updates_are_counted_as_they_were_taken_where_the_divergence_stops_them(
     ids=str,
 )
 def test_an_order_holds_every_step_once_the_valid_ones_first(n, n_valid):
-    """Few steps are sorted as single words, more than 2^14 as pairs."""
+    """Few steps are sorted, more than 2^14 permuted by a network of rounds."""
     valid = np.random.default_rng(0).permutation(np.arange(n) < n_valid)
     orders = np.asarray(shuffled(nth(jax.random.PRNGKey(0), 3), jnp.array(valid), 5, 4))
     assert (orders.shape, orders.dtype) == ((5, n + 4), np.int32)
@@ -247,6 +247,25 @@ def test_every_step_comes_first_equally_often():
     """1200 orders of 6 steps: each is expected first 200 times, with a deviation of 13."""
     orders = np.asarray(shuffled(nth(jax.random.PRNGKey(1), 0), jnp.ones(6, bool), 1200, 0))
     assert np.abs(np.bincount(orders[:, 0], minlength=6) - 200).max() < 5 * 13
+
+
+@pytest.mark.parametrize("n", [81, 100, 121])
+def test_permutations_that_are_not_sorted_are_uniform(n):
+    """Chi-square over 20,000 orders: of the number at each place, of neighbors, and of the distance between neighbors."""
+    n_orders = 20_000
+    orders = np.asarray(jax.jit(permuted, static_argnums=(1, 3))(jax.random.PRNGKey(n), n, jnp.int32(n), n_orders))
+    places = np.stack([np.bincount(column, minlength=n) for column in orders.T])
+    first, second = orders[:, 0], orders[:, 1]
+    pairs = np.bincount(first * n + second, minlength=n * n).reshape(n, n)[~np.eye(n, dtype=bool)]
+    distances = np.bincount((second - first) % n, minlength=n)[1:]
+    freedoms = ((n - 1) ** 2, pairs.size - 1, distances.size - 1)
+    for counts, freedom in zip((places, pairs, distances), freedoms, strict=True):
+        expected = counts.mean()
+        statistic = ((counts - expected) ** 2 / expected).sum()
+        assert abs(statistic - freedom) < 4 * np.sqrt(2 * freedom)
+    fixed = (orders == np.arange(n)).sum(axis=1)  # of a random permutation: 1 on average, with a variance of 1
+    assert abs(fixed.mean() - 1) < 5 / np.sqrt(n_orders)
+    assert abs(fixed.var() - 1) < 0.1
 
 
 def test_training_actions_are_drawn_and_the_deterministic_one_is_the_mode():

@@ -19,8 +19,10 @@ from rejeu.core.distributions import is_squashed
 from rejeu.core.schedules import at
 
 D = TypeVar("D")
-MOST_PACKED = 2**14
-"""Steps of a rollout up to which they are shuffled as single words, which leaves 17 bits or more for the random number."""
+MOST_SORTED = 2**14
+"""Steps of a rollout up to which they are sorted by random numbers, which leaves these 17 bits or more of a word."""
+N_ROUNDS = 8
+"""Rounds of the network that permutes more steps, four for each half of a number."""
 
 
 class Samples(NamedTuple):
@@ -146,13 +148,14 @@ def minibatches(data: D, key: Array, n_epochs: int, batch_size: int) -> tuple[Ca
 def shuffled(key: Array, valid: Array, n_epochs: int, n_padding: int) -> Array:
     """Returns a random order of all steps for every epoch, the valid ones first, ``int32 (n_epochs, n + padding)``.
 
-    Up to ``MOST_PACKED`` steps each is one word, with random bits above its own index, because XLA sorts single words on a
-    CPU four times as fast as pairs. Of equal random bits, the smaller index comes first.
+    Up to ``MOST_SORTED`` steps each is one word, with random bits above its own index. More are :func:`permuted`, which is
+    faster; its permutations of less than 50 steps are not uniform.
     """
     n = valid.shape[0]
-    if n > MOST_PACKED:
-        drawn = jax.random.uniform(key, (n_epochs, n)) + jnp.where(valid, 0.0, 2.0)[None]
-        orders = jnp.argsort(drawn, axis=1).astype(jnp.int32)
+    if n > MOST_SORTED:
+        place = jnp.where(valid, jnp.cumsum(valid), jnp.sum(valid) + jnp.cumsum(~valid)) - 1
+        valid_first = jnp.zeros(n, jnp.int32).at[place].set(jnp.arange(n, dtype=jnp.int32), unique_indices=True)
+        orders = valid_first[permuted(key, n, jnp.sum(valid), n_epochs)]
     else:
         width = jnp.uint32((n - 1).bit_length())
         drawn = jax.random.bits(key, (n_epochs, n), jnp.uint32) >> (width + 1) << width
@@ -160,3 +163,39 @@ def shuffled(key: Array, valid: Array, n_epochs: int, n_padding: int) -> Array:
         words = drawn | (is_missing | jnp.arange(n, dtype=jnp.uint32))[None]
         orders = (jnp.sort(words, axis=1) & ((jnp.uint32(1) << width) - 1)).astype(jnp.int32)
     return jnp.pad(orders, ((0, 0), (0, n_padding)))
+
+
+def permuted(key: Array, n: int, n_first: Array, n_epochs: int) -> Array:
+    """Returns random permutations of the first of ``n`` numbers, which the others follow, ``int32 (n_epochs, n)``.
+
+    A number is a row and a column of a grid that is nearly square. In turn, a hash of the column shifts the row, and one of
+    the row the column: an unbalanced Feistel network, a bijection of the grid. A number that leaves the ``n_first`` is
+    encrypted again until it is one of them (Black and Rogaway, 2002, "Ciphers with arbitrary finite domains").
+    """
+    number, n_first = jnp.arange(n, dtype=jnp.uint32)[None], n_first.astype(jnp.uint32)
+    n_rows = jnp.ceil(jnp.sqrt(jnp.maximum(n_first, 1).astype(jnp.float32))).astype(jnp.uint32)
+    sizes = n_rows, (n_first + n_rows - 1) // n_rows
+    round_keys = jax.random.bits(key, (N_ROUNDS, n_epochs, 1), jnp.uint32)
+
+    def encrypted(number: Array) -> Array:
+        cell = [number // sizes[1], number % sizes[1]]
+        for i, round_key in enumerate(round_keys):
+            here, size = i % 2, sizes[i % 2]
+            shifted = cell[here] + ((hashed(cell[1 - here] ^ round_key) >> 16) * size >> 16)
+            cell[here] = jnp.where(shifted < size, shifted, shifted - size)
+        return cell[0] * sizes[1] + cell[1]
+
+    def again(drawn: Array) -> Array:
+        return jnp.where(drawn < n_first, drawn, encrypted(drawn))
+
+    drawn = jax.lax.while_loop(
+        lambda drawn: jnp.any(drawn >= n_first), again, encrypted(jnp.minimum(number, n_first - 1))
+    )
+    return jnp.where(number < n_first, drawn, number).astype(jnp.int32)
+
+
+def hashed(word: Array) -> Array:
+    """Returns a hash of 32 bits, each bit of which depends on all of ``word``: multiplications and shifts in turn."""
+    word = (word ^ (word >> 16)) * jnp.uint32(0x7FEB352D)
+    word = (word ^ (word >> 15)) * jnp.uint32(0x846CA68B)
+    return word ^ (word >> 16)
