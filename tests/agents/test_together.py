@@ -150,22 +150,8 @@ def test_environments_that_would_be_shared_and_wrong_seeds_are_refused(env: Any,
 
 
 @pytest.mark.exhaustive
-def test_an_error_of_one_run_names_its_batch(tmp_path: Any) -> None:
-    def callbacks(agent: Any) -> list[Any]:
-        agent.report_folder = tmp_path / str(agent.config.learning_rate)
-        return []
-
-    with pytest.raises(rejeu.NonFiniteError) as raised:
-        rejeu.train_seeds(
-            rejeu.DQN,
-            "MlpPolicy",
-            "jax/CartPole-v1",
-            120,
-            seeds=1,
-            learning_rate=[1e-3, 1e30],
-            callback=callbacks,
-            **SMALL,
-        )
-    assert raised.value.batch is not None
-    assert raised.value.batch.parent == tmp_path / "1e+30"
+def test_an_error_of_one_run_names_it() -> None:
+    numbers: dict[str, Any] = {"learning_rate": [1e-3, 1e30], **SMALL}
+    with pytest.raises(rejeu.NonFiniteError, match="in the environment steps") as raised:
+        rejeu.train_seeds(rejeu.DQN, "MlpPolicy", "jax/CartPole-v1", 120, seeds=1, **numbers)
     assert str(raised.value).startswith("seed 0, learning_rate=1e+30: ")

@@ -246,27 +246,6 @@ def test_rows_of_the_device_are_copied_to_the_host_with_their_counters(n: int) -
         np.testing.assert_array_equal(ring.kind[index], expected.kind[index])
 
 
-@pytest.mark.parametrize("n", only([60], [5, 60]))
-def test_steps_on_the_device_are_undone(n: int) -> None:
-    """What a chunk has overwritten is put back, so that the chunk can be repeated."""
-    ring = filled(N_ENVS, n)
-    priorities = prioritized(ring)
-    replay = device_replay(N_ENVS, priorities=priorities.config)
-    before = uploaded(replay, ring)._replace(priorities=device_priorities.uploaded(priorities, [], 1, BATCH))
-    saved, after = jax.jit(replay.next_rows, static_argnums=1)(before, 11), before
-    for action, reward, terminated, next_obs, ended, first in steps(N_ENVS, 5):
-        after = replay.begin(
-            replay.add(after, action, reward, terminated, next_obs, np.ones(N_ENVS, bool)), first, ended
-        )
-    undone = replay.with_rows(after, saved)
-    assert (after.head != before.head).all()
-    for name in ("obs", "action", "reward", "kind", "head"):
-        for one, two in zip(*(jax.tree.leaves(getattr(x, name)) for x in (undone, before)), strict=True):
-            np.testing.assert_array_equal(one, two, err_msg=name)
-    for name in ("values", "largest"):
-        np.testing.assert_array_equal(getattr(undone.priorities, name), getattr(before.priorities, name), err_msg=name)
-
-
 def test_whole_numbers_from_random_bits_equal_64_bit_arithmetic() -> None:
     rng = np.random.default_rng(0)
     bits = rng.integers(2**32, size=1000, dtype=np.uint32)

@@ -62,17 +62,17 @@ def require_memory(agent: BaseAgent, n_runs: int = 1) -> None:
     Raises:
         MemoryError: if it has not, with the numbers and what to lower.
     """
-    run, shared_by = agent.run, devices.local(agent.device)
-    free = devices.room(shared_by[0])
+    run, on = agent.run, devices.local(agent.device)[0]
+    free = devices.room(on)
     if free is None:
         return
-    is_cpu = shared_by[0].platform == "cpu"  # whose devices have one memory, that of the host
+    is_cpu = on.platform == "cpu"  # whose memory is that of the host
     of_one = of_run(run, agent.learner, agent.gradient_batch_size(agent.n_envs)) + is_cpu * unwritten(run)
-    needed = of_one * (n_runs if is_cpu else -(-n_runs // len(shared_by)))
+    needed = of_one * n_runs
     if needed > free:
         what, seeds = (f"{n_runs} runs", " or the number of seeds") if n_runs > 1 else ("the run", "")
         raise MemoryError(
-            f"{what} would need about {needed / GIB:.1f} GiB on {shared_by[0]}, which has {free / GIB:.1f} GiB free; lower "
+            f"{what} would need about {needed / GIB:.1f} GiB on {on}, which has {free / GIB:.1f} GiB free; lower "
             f"{reducible(run)}{seeds}"
         )
 
@@ -94,10 +94,10 @@ def of_run(run: Run, learner: Learner, batch_size: int) -> int:
 def of_experience(buffer: Any) -> int:
     """Returns the bytes of a replay buffer or rollout buffer on the device."""
     if isinstance(buffer, RolloutBuffer):
-        return 2 * buffer.nbytes  # before a chunk and after it
+        return buffer.nbytes
     n = len(buffer.ring.kind)
     tables = 3 * 4 * n if buffer.ring.counters else 0  # instead of the counters: the tables of episodes
-    return buffer.ring.nbytes + tables + (0 if buffer.priorities is None else 8 * n)  # and their copy before a chunk
+    return buffer.ring.nbytes + tables + (0 if buffer.priorities is None else 4 * n)
 
 
 def unwritten(run: Run) -> int:

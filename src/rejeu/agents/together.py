@@ -20,17 +20,16 @@ from rejeu.agents.device import require_memory
 from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.callbacks.base import Callback, in_order, listed
 from rejeu.callbacks.progress_bar import ProgressBar
-from rejeu.core import devices, hardware, xla
+from rejeu.core import devices
 from rejeu.core.interrupt import Interrupt
 from rejeu.core.validation import whole, whole_seed
-from rejeu.envs.functional import is_functional
 from rejeu.envs.functional.protocol import FunctionalEnv
 from rejeu.envs.make import make_vector
 from rejeu.exploration import explorer as exploration
 from rejeu.logs.logging import Sink
 from rejeu.training import finite
 from rejeu.training.compiled import Stops, train
-from rejeu.training.finite import NonFiniteUpdate
+from rejeu.training.finite import NonFiniteSteps
 from rejeu.training.run import TrainingCall
 
 A = TypeVar("A", bound=Agent)
@@ -70,7 +69,7 @@ def train_seeds(
         callback: called with each agent before training; returns its callbacks.
         log_interval: episodes of a run between two rows of its statistics.
         progress_bar: show the progress of the first run, which is that of all that are trained together.
-        device: ``"auto"``, ``"cpu"`` or ``"gpu"``. If JAX has several devices of the kind, they share the runs.
+        device: ``"auto"``, ``"cpu"`` or ``"gpu"``.
         settings: arguments of the agent. A list of numbers in place of a float hyperparameter, such as
             ``learning_rate=[1e-4, 3e-4, 1e-3]``, trains every seed with each of them, or with each combination of several.
 
@@ -100,8 +99,6 @@ def train_seeds(
     lists = {name: value for name, value in settings.items() if is_list_of_numbers(value)}
     fixed = {name: value for name, value in settings.items() if name not in lists}
     values = [dict(zip(lists, one, strict=True)) for one in itertools.product(*lists.values())]
-    if isinstance(env, FunctionalEnv) or is_functional(env):
-        start_device(len(numbers) * len(values))
     agents: list[A] = []
     for one in values:
         vector = lambda seed: make_vector(env, n_envs, seed=seed)  # noqa: E731
@@ -136,13 +133,6 @@ def numbers_of(seeds: int | Iterable[int]) -> list[int]:
     if not numbers or len({*numbers}) < len(numbers):
         raise ValueError(f"seeds={seeds!r} must be a number of at least 1, or different seeds")
     return numbers
-
-
-def start_device(n_runs: int) -> None:
-    """Starts JAX's device for so many runs in one program: a CPU as one device for each core, which share the runs."""
-    n_devices = min(hardware.cores(), n_runs)
-    if n_devices > 1:
-        xla.start_device(hardware.cores() // n_devices, n_devices)
 
 
 def is_list_of_numbers(value: Any) -> bool:
@@ -225,7 +215,6 @@ def learn_together(
                     active,
                     remake,
                     hyper,
-                    devices.local(first.device),
                 )
                 stack.callback(turns.close)  # which copies what is still on the device
                 for chunk in named(turns, differing, first):
@@ -235,10 +224,10 @@ def learn_together(
                         break
             for agent in agents:
                 agent.interrupted, agent.interrupted_by = interrupt.requested, interrupt.signal
-        except NonFiniteUpdate as broken:
+        except NonFiniteSteps as broken:
             which = agents[broken.which]
             values = [f"{name}={getattr(which.config, name):g}" for name in differing]
-            raise finite.reported(which, broken, f"{', '.join([f'seed {which.seed}', *values])}: ") from None
+            raise finite.steps_reported(which, broken, f"{', '.join([f'seed {which.seed}', *values])}: ") from None
 
 
 def common_stops(

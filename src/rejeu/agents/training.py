@@ -22,7 +22,7 @@ from rejeu.core.interrupt import Interrupt
 from rejeu.exploration.noise import warn_without_noise
 from rejeu.logs.logging import Console, RetryingSink, Sink, guarded, next_folder, open_log
 from rejeu.training import finite
-from rejeu.training.finite import NonFiniteUpdate
+from rejeu.training.finite import NonFiniteSteps, NonFiniteUpdate
 from rejeu.training.run import Episode, Progress, TrainingCall, checked_limits, time_shares
 
 TABLE_SECONDS = 2.0
@@ -210,6 +210,8 @@ def train(
             finite.settle(agent)
         except NonFiniteUpdate as broken:
             raise finite.reported(agent, broken) from None
+        except NonFiniteSteps as broken:
+            raise finite.steps_reported(agent, broken) from None
 
 
 @contextmanager

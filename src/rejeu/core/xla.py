@@ -20,8 +20,6 @@ from rejeu.core.hardware import cores
 
 THREADS = "NPROC"
 """Environment variable with the size of XLA's CPU thread pool."""
-DEVICES = "--xla_force_host_platform_device_count"
-"""Option of XLA with the number of devices as which the CPU appears."""
 LITTLE_WORK = 2**23
 """Multiplications in the largest layer of an update up to which one thread is faster than two. Measured on 2 cores: with
 two threads a step of DDPG with batches of 128 and layers 128-128 takes 1.5 times as long; with one thread batches of 256 and
@@ -69,11 +67,11 @@ def threads_for(work: float) -> int:
     return 1 if work <= LITTLE_WORK else cores()
 
 
-def start_device(n_threads: int, n_devices: int = 1) -> None:
-    """Starts JAX's device, on a CPU with ``n_threads`` threads, or the CPU as several devices.
+def start_device(n_threads: int) -> None:
+    """Starts JAX's device, on a CPU with ``n_threads`` threads.
 
-    Both numbers are fixed when the device starts, once in a process. They are not changed if the program has used JAX before
-    or ``NPROC`` is set; the second also not if the user set it by ``XLA_FLAGS`` or ``jax_num_cpu_devices``.
+    The number is fixed when the device starts, once in a process. It is not changed if the program has used JAX before or
+    ``NPROC`` is set.
     """
     global _threads
     if _threads is not None:
@@ -83,9 +81,6 @@ def start_device(n_threads: int, n_devices: int = 1) -> None:
         _threads = int(given) if given.isdecimal() and int(given) > 0 else cores()
         return
     _threads = n_threads
-    is_set = DEVICES in os.environ.get("XLA_FLAGS", "") or jax.config.jax_num_cpu_devices >= 0  # type: ignore[attr-defined]
-    if n_devices > 1 and not is_set:
-        jax.config.update("jax_num_cpu_devices", n_devices)
     os.environ[THREADS] = str(n_threads)
     try:
         jax.local_devices()

@@ -22,7 +22,7 @@ import numpy as np
 from jax import Array
 
 from rejeu.core import schedules
-from rejeu.core.algorithm import PyTree, Transition, copy
+from rejeu.core.algorithm import PyTree, Transition
 from rejeu.core.prng import below
 from rejeu.replay import device_priorities
 from rejeu.replay.device_priorities import DevicePriorities
@@ -149,33 +149,6 @@ class DeviceReplay:
         kind = put(ring.kind, index, jnp.full(self.n_envs, STEP, jnp.uint8))
         episode = put(ring.episode, index, ring.n_begun - 1) if self.strategy is not None else ring.episode
         return ring._replace(obs=stores, kind=kind, episode=episode, head=head)
-
-    def next_rows(self, ring: DeviceRing, n: int) -> dict[str, Any]:
-        """Returns what adding ``n - 1`` rows to each environment may change, to undo it with :meth:`with_rows`.
-
-        These are the newest rows and those that would be overwritten, and the priorities.
-        """
-        index = self._next_positions(ring.head, n)
-        found: dict[str, Any] = {"obs": [store[index] for store in ring.obs], "head": jnp.copy(ring.head)}
-        found |= {name: getattr(ring, name)[index] for name in ("action", "reward", "kind")}
-        if ring.priorities is not None:
-            found["priorities"] = {
-                name: copy(getattr(ring.priorities, name)) for name in ("values", "largest", "pending")
-            }
-        return found
-
-    def with_rows(self, ring: DeviceRing, found: dict[str, Any]) -> DeviceRing:
-        """Returns the ring as far as :func:`download` reads it, as it was when :meth:`next_rows` returned ``found``."""
-        index = self._next_positions(found["head"], found["kind"].shape[1])
-        obs = [store.at[index].set(rows) for store, rows in zip(ring.obs, found["obs"], strict=True)]
-        parts = {name: getattr(ring, name).at[index].set(found[name]) for name in ("action", "reward", "kind")}
-        if ring.priorities is not None:
-            parts["priorities"] = ring.priorities._replace(**found["priorities"])
-        return ring._replace(obs=obs, head=found["head"], **parts)
-
-    def _next_positions(self, head: Array, n: int) -> Array:
-        """Returns the positions of the newest row of each environment and of those after it, ``(n_envs, n)``."""
-        return self.positions(jnp.arange(self.n_envs)[:, None], head[:, None] + jnp.arange(n)[None])
 
     def oldest(self, ring: DeviceRing) -> Array:
         """Returns the absolute time of the oldest row that is kept, by environment, ``(n_envs,)``."""

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import itertools
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -47,8 +47,20 @@ class NonFiniteUpdate(Exception):
         self.n_updates = n_updates
         """Total number of gradient steps before it."""
         self.batches, self.clock, self.in_a_row = batches, clock, in_a_row
-        self.which = 0
-        """Its run, where several are trained together."""
+
+
+class NonFiniteSteps(Exception):
+    """An update of the program on the device left NaN or infinity; :func:`steps_reported` explains it."""
+
+    def __init__(self, which: int, steps: range, names: list[str], in_a_row: int) -> None:
+        super().__init__("an update left numbers that are not finite")
+        self.which = which
+        """Its run, where several are trained together, which has the state before ``steps``."""
+        self.steps = steps
+        """The environment steps of the chunk."""
+        self.names = names
+        """Of what is not finite, each with the first such number."""
+        self.in_a_row = in_a_row
 
 
 def gradient_steps(reward: Array | np.ndarray) -> int:
@@ -197,15 +209,30 @@ def settle(agent: Any) -> None:
         raise reported(agent, update) from None
 
 
-def reported(agent: Any, update: NonFiniteUpdate, of: str = "") -> NonFiniteError:
-    """Puts the agent into the state before a bad update, saves its batch, and returns the error that explains it.
-
-    The running episodes end: the actions chosen since are invalid. ``of`` names the run where there are several.
-    """
-    run, learner = agent.run, agent.learner
+def end_episodes(agent: Any) -> None:
+    """Ends the running episodes of an agent: the actions chosen since a bad update are invalid."""
+    run = agent.run
     run.td_errors, run.obs, run.action = [], None, None
     keep_finite = lambda fresh, leaf: leaf if np.isfinite(leaf).all() else fresh  # noqa: E731
-    run.carry = jax.tree.map(keep_finite, learner.initial_carry(agent.n_envs), run.carry)
+    run.carry = jax.tree.map(keep_finite, agent.learner.initial_carry(agent.n_envs), run.carry)
+
+
+def steps_reported(agent: Any, bad: NonFiniteSteps, of: str = "") -> NonFiniteError:
+    """Returns the error that explains a bad update on the device; ``of`` names the run where there are several."""
+    end_episodes(agent)
+    message = (
+        f"{of}{_what(bad.names, bad.in_a_row)}, in the environment steps {bad.steps[0]:,} to {bad.steps[-1]:,}. The agent is "
+        f"as it was before them, apart from its experience{_last_model(agent)}. {_advice(agent.config)}. The loop of the host "
+        "(agent.on_device = False) names the update and saves its batch"
+    )
+    names = [text.split(" ")[0] for text in bad.names]
+    return NonFiniteError(message, names=names, step=bad.steps[-1], n_updates=agent.n_updates)
+
+
+def reported(agent: Any, update: NonFiniteUpdate) -> NonFiniteError:
+    """Puts the agent into the state before a bad update, saves its batch, and returns the error that explains it."""
+    run, learner = agent.run, agent.learner
+    end_episodes(agent)
     run.state = run.state if update.state is None else update.state
     state, n_updates, compiled = learner.state(run.state), update.n_updates, jax.jit(learner.algorithm.update)
     for i, batch in enumerate(one_by_one(update.batches)):
@@ -219,16 +246,11 @@ def reported(agent: Any, update: NonFiniteUpdate, of: str = "") -> NonFiniteErro
     run.n_updates = n_updates + (update.state is None)  # an update that was skipped counts
     names = [text.split(" ")[0] for text in found]
     path, saved = _save(agent, batch, clock, names, n_updates + 1)
-    what, more = ", ".join(found[:3]) or "an update", len(found) - 3
-    what += f" and {more} more" * (more > 0) + " became NaN or infinite"
-    if spoiled := bad_parts(batch):
-        what = f"the batch held {', '.join(spoiled[:3])}"
-    if update.in_a_row >= MAX_SKIPPED:
-        what = f"{update.in_a_row} updates in a row were skipped, so nothing is learned any more; in the last of them {what}"
-    model = f"; last saved model: {agent.last_saved}" if agent.last_saved is not None else ""
+    spoiled = bad_parts(batch)
+    what = f"the batch held {', '.join(spoiled[:3])}" if spoiled else ""
     message = (
-        f"{of}{what}, at environment step {int(clock.step)}, update {n_updates + 1}. The agent is as it was before that "
-        f"update. {saved}{model}. {_advice(agent.config, spoiled, batch)}"
+        f"{_what(found, update.in_a_row, what)}, at environment step {int(clock.step)}, update {n_updates + 1}. The agent is "
+        f"as it was before that update. {saved}{_last_model(agent)}. {_advice(agent.config, spoiled, batch)}"
     )
     return NonFiniteError(message, names=names, step=int(clock.step), n_updates=n_updates + 1, batch=path)
 
@@ -240,13 +262,31 @@ def one_by_one(batches: Transition | Rollout) -> list[Any]:
     return [jax.tree.map(lambda leaf, i=i: leaf[i], batches) for i in range(len(batches.reward))]
 
 
-def _advice(config: Any, spoiled: list[str], batch: Transition | Rollout) -> str:
+def _what(names: list[str], in_a_row: int, cause: str = "") -> str:
+    """Returns what happened: what is not finite, or its ``cause``."""
+    more = len(names) - 3
+    what = f"{', '.join(names[:3]) or 'an update'}{f' and {more} more' * (more > 0)} became NaN or infinite"
+    what = cause or what
+    if in_a_row < MAX_SKIPPED:
+        return what
+    return f"{in_a_row} updates in a row were skipped, so nothing is learned any more; in the last of them {what}"
+
+
+def _last_model(agent: Any) -> str:
+    return f"; last saved model: {agent.last_saved}" if agent.last_saved is not None else ""
+
+
+def _advice(config: Any, spoiled: Sequence[str] = (), batch: Transition | Rollout | None = None) -> str:
     if "reward" in str(spoiled):
         return "Check the environment's reward function; hindsight replay takes rewards from compute_reward"
-    rewards = np.abs(batch.reward, where=np.isfinite(batch.reward), out=np.zeros(np.shape(batch.reward), np.float32))
+    largest = ""
+    if batch is not None:
+        size = np.shape(batch.reward)
+        rewards = np.abs(batch.reward, where=np.isfinite(batch.reward), out=np.zeros(size, np.float32))
+        largest = f" (the largest of this batch is {rewards.max():.3g})"
     return (
-        f"Try to scale the rewards down (the largest of this batch is {rewards.max():.3g}), lower learning_rate (it is "
-        f'{config.learning_rate!r}), set normalize=True, or skip such updates with nonfinite="skip"'
+        f"Try to scale the rewards down{largest}, lower learning_rate (it is {config.learning_rate!r}), set normalize=True, "
+        'or skip such updates with nonfinite="skip"'
     )
 
 

@@ -153,9 +153,7 @@ def shuffled(key: Array, valid: Array, n_epochs: int, n_padding: int) -> Array:
     """
     n = valid.shape[0]
     if n > MOST_SORTED:
-        place = jnp.where(valid, jnp.cumsum(valid), jnp.sum(valid) + jnp.cumsum(~valid)) - 1
-        valid_first = jnp.zeros(n, jnp.int32).at[place].set(jnp.arange(n, dtype=jnp.int32), unique_indices=True)
-        orders = valid_first[permuted(key, n, jnp.sum(valid), n_epochs)]
+        orders = valid_first(valid)[permuted(key, n, jnp.sum(valid), n_epochs)]
     else:
         width = jnp.uint32((n - 1).bit_length())
         drawn = jax.random.bits(key, (n_epochs, n), jnp.uint32) >> (width + 1) << width
@@ -163,6 +161,13 @@ def shuffled(key: Array, valid: Array, n_epochs: int, n_padding: int) -> Array:
         words = drawn | (is_missing | jnp.arange(n, dtype=jnp.uint32))[None]
         orders = (jnp.sort(words, axis=1) & ((jnp.uint32(1) << width) - 1)).astype(jnp.int32)
     return jnp.pad(orders, ((0, 0), (0, n_padding)))
+
+
+def valid_first(valid: Array) -> Array:
+    """Returns the numbers of the valid steps, and after them those of the others, ``int32 (n,)``."""
+    n = len(valid)
+    place = jnp.where(valid, jnp.cumsum(valid), jnp.sum(valid) + jnp.cumsum(~valid)) - 1
+    return jnp.zeros(n, jnp.int32).at[place].set(jnp.arange(n, dtype=jnp.int32), unique_indices=True)
 
 
 def permuted(key: Array, n: int, n_first: Array, n_epochs: int) -> Array:

@@ -11,7 +11,7 @@ from typing import Any
 
 from rejeu.agents import find_agent, training
 from rejeu.agents.device import reason_against, require_memory
-from rejeu.agents.together import learn_together, sibling, start_device
+from rejeu.agents.together import learn_together, sibling
 from rejeu.checkpoints.run_folder import RunFolder, check_free, dated
 from rejeu.core import devices
 from rejeu.core.errors import MissingExtra
@@ -158,7 +158,6 @@ def train_together(arguments: Train, begin: Begin) -> tuple[int, dict[str, Any]]
     stopwatch, jobs = Stopwatch(), make_jobs(arguments)
     devices.start_with("--device", arguments.device)
     path = choose_folder(arguments)
-    start_device(len(jobs))
     with ExitStack() as stack:
         first = begin(arguments, jobs[0].seed, stack)
         if reason := reason_against(first.agent, ()):

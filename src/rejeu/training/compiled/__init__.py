@@ -9,27 +9,25 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.algorithms.rollout_config import RolloutConfig
+from rejeu.core.errors import BadEnvironmentError
 from rejeu.core.xla import clock
 from rejeu.training.checks import check_state
 from rejeu.training.compiled.off_policy import OffPolicyProgram
 from rejeu.training.compiled.on_policy import OnPolicyProgram
 from rejeu.training.compiled.program import MAX_TURNS, NO_LIMIT, Limits, Remake
-from rejeu.training.compiled.trainer import DeviceTrainer, group_size
-from rejeu.training.finite import NonFiniteUpdate
-from rejeu.training.learner import Learner
+from rejeu.training.compiled.trainer import DeviceTrainer
+from rejeu.training.finite import NonFiniteSteps
+from rejeu.training.learner import Learner, bad_leaves, checked
 from rejeu.training.run import Progress, Run, add_time, start_clock
 
 SECONDS = 0.2
 """Wall time of a chunk that is aimed at: progress bar, callbacks and Ctrl-C wait for its end."""
-ALL = 2**31 - 1
 
 
 class Stops(NamedTuple):
@@ -60,7 +58,6 @@ def train(
     active: Sequence[int],
     remake: Remake | None = None,
     hyper: Sequence[dict[str, float]] | None = None,
-    devices: Sequence[jax.Device] = (),
 ) -> Iterator[list[Progress | None]]:
     """Trains runs of equal settings for exactly ``n_steps`` environment steps each; yields after every chunk.
 
@@ -75,12 +72,11 @@ def train(
             as they are, and None stands for what they did. There must be one.
         remake: makes the algorithm, if hyperparameters differ.
         hyper: those that differ, by run.
-        devices: of which each computes some of the runs; none for JAX's default device.
 
     Raises:
         BadEnvironmentError: if a reward or an observation is not finite.
         NonFiniteError: if the state is not finite when training begins.
-        NonFiniteUpdate: if an update leaves numbers that are not finite.
+        NonFiniteSteps: if an update leaves numbers that are not finite. The run has the state before that chunk.
         ValueError: if the steps are too many to be counted with 32 bits.
     """
     kind: Any = OnPolicyProgram if isinstance(config, RolloutConfig) else OffPolicyProgram
@@ -95,7 +91,7 @@ def train(
         stops_at_episode=stops.at_episodes,
         remake=remake,
     )
-    trainer = DeviceTrainer(program, runs, learner, group_size(len(runs), devices), devices, hyper)
+    trainer = DeviceTrainer(program, runs, learner, hyper or [{}] * len(runs))
     first = runs[active[0]].step
     last = None if n_steps is None else first + n_steps
     if last is not None and last >= NO_LIMIT:
@@ -108,9 +104,7 @@ def train(
     try:
         yield from take_chunks(trainer, first, last, progress, stops, active)
     finally:
-        for run in runs:
-            run.copy_replay()
-            run.state, run.carry = jax.tree.map(jnp.array, (run.state, run.carry))  # views of arrays of all runs
+        trainer.close(active)
 
 
 def take_chunks(
@@ -134,7 +128,7 @@ def take_chunks(
                 trainer.program.begin_episodes(run)
         if trained != [*active] or any(now is not then for now, then in zip(held(runs), known, strict=True)):
             trained = [*active]
-            trainer.push(float(progress(leader.step - first)), leader)
+            trainer.push(float(progress(leader.step - first)), active[0])
         for run in runs:
             add_time(run, "replay", began)
         step = leader.step
@@ -145,21 +139,18 @@ def take_chunks(
             np.int32(n_turns),
             np.uint32(NO_LIMIT if last is None else last),
             schedule(progress, step - first, n_turns, n_envs, capacity, last, first),
-            np.int32(ALL),
             np.uint32(leader.learn_from),
             np.bool_(trainer.program.uses_part(leader, n_turns, last)),
         )
-        began, paced = time.perf_counter(), clock()
-        trainer.take(limits, active)
-        for i in active:
-            if trainer.fault(i):
-                raise_fault(trainer, i, limits)
-        turns: list[Progress | None] = [None] * len(runs)
+        began, paced, before = time.perf_counter(), clock(), [(run.state, run.n_updates) for run in runs]
+        trainer.take(limits)
         for i in active:
             add_time(runs[i], "update", began)
-            pulling = time.perf_counter()
-            turns[i] = trainer.pull(i)
-            add_time(runs[i], "replay", pulling)
+        began, turns = time.perf_counter(), trainer.pull(active)
+        for i in active:
+            add_time(runs[i], "replay", began)
+            if trainer.fault(i):
+                raise_fault(trainer, i, step, before[i])
         pace.note(n_turns, clock() - paced)
         if step <= leader.learn_from <= leader.step:
             pace.turns = min(8, pace.turns)
@@ -167,13 +158,20 @@ def take_chunks(
         yield turns
 
 
-def raise_fault(trainer: DeviceTrainer, which: int, limits: Limits) -> None:
-    """Raises the error of a run in a chunk; an error of an update says which run it is."""
-    try:
-        trainer.raise_fault(which, limits)
-    except NonFiniteUpdate as error:
-        error.which = which
-        raise
+def raise_fault(trainer: DeviceTrainer, which: int, first_step: int, before: tuple[Any, int]) -> NoReturn:
+    """Raises the error of a run in a chunk after ``first_step``, before which its state and updates were ``before``."""
+    run, report, after = trainer.runs[which], trainer.reports[which], trainer.carries[which].state
+    run.state, run.n_updates = before
+    if report.nonfinite_env:
+        run.obs = run.action = None
+        raise BadEnvironmentError(
+            f"{run.env.env_id} returned a reward or an observation that is not finite in one of the steps {first_step + 1:,} "
+            f"to {run.step:,}; agent.on_device = False trains with the loop of the host, which says which one it was"
+        )
+    metrics = {name: value for name, value in report.metrics.items() if not trainer.program.skips}
+    names = [*bad_leaves(checked(metrics)), *(f"{leaf} of the state" for leaf in trainer.learner.bad_leaves(after))]
+    in_a_row = int(trainer.carries[which].in_a_row) if trainer.program.skips else 0
+    raise NonFiniteSteps(which, range(first_step + 1, run.step + 1), names, in_a_row)
 
 
 def held(runs: Sequence[Run]) -> list[Any]:

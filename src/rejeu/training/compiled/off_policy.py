@@ -115,13 +115,6 @@ class OffPolicyProgram(Program):
         random = lambda: spaces.random_action(run.env.action_space, self.n_envs, np.random.default_rng(0))  # noqa: E731
         return jnp.array(random() if run.action is None else run.action)
 
-    def rows_changed(self, n_turns: int) -> int:
-        """Returns one of few numbers, for each of which a program is compiled. A turn may add a step and a new episode."""
-        size = 64
-        while size < 2 * n_turns + 1:
-            size *= 8
-        return min(size, self.replay.rows)
-
     def uploaded(self, run: Run) -> DeviceRing:
         replay, buffer = self.replay, run.replay
         ring = uploaded(replay, buffer.ring)
@@ -167,7 +160,6 @@ def take_turn(program: OffPolicyProgram, env: FunctionalEnv, loop: Loop, limits:
     n_ended = (episodes.n_finished - before.episodes.n_finished).astype(jnp.int32)
     n, counts = due(config, before.counts, jnp.sum(result.kept, dtype=jnp.int32), n_ended, limits.learn_from)
     clock = Clock(counts.step, episodes.n_finished, limits.progress[i + 1], program.n_envs)
-    n_pending = jnp.where(n <= limits.most_updates, before.counts.pending, 0)
     carry, root = loop.carry._replace(counts=counts), draws(before.key, clock.step)
 
     def one(u: Array, passed: tuple[Learned, Pending | None]) -> tuple[Learned, Pending | None]:
@@ -181,10 +173,10 @@ def take_turn(program: OffPolicyProgram, env: FunctionalEnv, loop: Loop, limits:
     if config.overlap:
         carry = program.choose(env, carry, learned.state, clock)
     pending = None if ring.priorities is None else ring.priorities.pending
-    learned, pending = jax.lax.fori_loop(0, jnp.minimum(n, limits.most_updates), one, (learned, pending))
+    learned, pending = jax.lax.fori_loop(0, n, one, (learned, pending))
     if not config.overlap:
         carry = program.choose(env, carry, learned.state, clock)
-    ring = replay.update_priorities(ring, n_pending)  # all batches of the turn have been drawn
+    ring = replay.update_priorities(ring, before.counts.pending)  # all batches of the turn have been drawn
     if pending is not None and ring.priorities is not None:
         ring = ring._replace(priorities=ring.priorities._replace(pending=pending))
     return loop._replace(carry=carry, experience=ring, learned=learned)

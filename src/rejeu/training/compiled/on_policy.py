@@ -54,17 +54,15 @@ class OnPolicyProgram(Program):
             i, loop = inner
             return i + 1, take_turn(self, env, loop, limits, i)
 
-        def one_rollout(outer: tuple[Array, Loop, Array]) -> tuple[Array, Loop, Array]:
-            i, loop = jax.lax.while_loop(fills, one_turn, outer[:2])
+        def one_rollout(outer: tuple[Array, Loop]) -> tuple[Array, Loop]:
+            i, loop = jax.lax.while_loop(fills, one_turn, outer)
             counts = loop.carry.counts
             is_done = (counts.length == n_steps) | (limits.uses_part & (counts.step == limits.last))
-            is_done &= outer[2] < limits.most_updates
             clock = Clock(counts.step, loop.carry.episodes.n_finished, limits.progress[i])
             loop = jax.lax.cond(is_done, lambda loop: end_of_rollout(self, loop, clock), lambda loop: loop, loop)
-            return i, loop, outer[2] + is_done
+            return i, loop
 
-        begin = (jnp.int32(0), loop, jnp.int32(0))
-        return jax.lax.while_loop(lambda outer: may_go_on(*outer[:2]), one_rollout, begin)[1]
+        return jax.lax.while_loop(lambda outer: may_go_on(*outer), one_rollout, (jnp.int32(0), loop))[1]
 
     def begin_episodes(self, run: Run) -> None:
         begin_episodes(run, self.config)
@@ -87,9 +85,6 @@ class OnPolicyProgram(Program):
         return RolloutCounts(jnp.uint32(run.step), jnp.int32(run.replay.length))
 
     def action_of(self, run: Run) -> None:
-        return None
-
-    def rows_changed(self, n_turns: int) -> None:
         return None
 
     def uploaded(self, run: Run) -> Rollout:

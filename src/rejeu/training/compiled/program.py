@@ -59,8 +59,6 @@ class Limits(NamedTuple):
     """Total environment steps at which training ends, ``uint32[]``, ``NO_LIMIT`` for never."""
     progress: Any
     """Progress of schedules after 0, 1, ... turns of the chunk, ``float32 (capacity + 1,)``."""
-    most_updates: Any
-    """Gradient steps of a turn at most, or updates from rollouts, ``int32[]``; used to find the one that left NaN."""
     learn_from: Any
     """The environment step after which off-policy updates begin, ``uint32[]``."""
     uses_part: Any
@@ -157,7 +155,7 @@ class Loop(NamedTuple):
     result: StepResult
     log: EpisodeLog
     nonfinite_env: Array
-    """Whether a reward or an observation was not finite in this chunk, ``bool[]``."""
+    """Whether a reward or an observation was not finite in this chunk after a finite action, ``bool[]``."""
 
 
 class ChunkReport(NamedTuple):
@@ -216,10 +214,6 @@ class Program(ABC):
     @abstractmethod
     def action_of(self, run: Run) -> Array | None:
         """Returns :attr:`Carry.action`; where none was chosen yet, any of its shape."""
-
-    @abstractmethod
-    def rows_changed(self, n_turns: int) -> int | None:
-        """Returns how many rows of each environment so many turns may change in place, at least; None if they copy them."""
 
     @abstractmethod
     def uploaded(self, run: Run) -> Any:
@@ -387,7 +381,7 @@ def step_envs(program: Program, env: FunctionalEnv, loop: Loop, action: Array, l
         carry=loop.carry._replace(episodes=episodes),
         result=StepResult(obs, reward, terminated, truncated, kept, action),
         log=log,
-        nonfinite_env=loop.nonfinite_env | ~all_finite(reward, *jax.tree.leaves((obs, fresh))),
+        nonfinite_env=loop.nonfinite_env | (all_finite(action) & ~all_finite(reward, *jax.tree.leaves((obs, fresh)))),
     )
 
 
