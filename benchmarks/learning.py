@@ -100,7 +100,9 @@ def train_one(preset: presets.Preset, seed: int, arguments: argparse.Namespace) 
 def curves_of(callback: Evaluate) -> dict[str, list]:
     """Returns the mean return at each evaluation, and for goals the share of episodes that succeeded."""
     points = [(one.step, one.evaluation) for one in callback.results]
-    success = [[step, evaluation.success_rate] for step, evaluation in points if not math.isnan(evaluation.success_rate)]
+    success = [
+        [step, evaluation.success_rate] for step, evaluation in points if not math.isnan(evaluation.success_rate)
+    ]
     return {
         "curve": [[step, evaluation.mean_return] for step, evaluation in points],
         **({"success_curve": success} if success else {}),
