@@ -59,6 +59,14 @@ class RunFolder:
     video = File("video.mp4")
     """A few episodes of the best model."""
 
+    models = File("models")
+    """Folder of the models of some evaluations, in the course of training."""
+    watch = File("watch")
+    """Request to show the current policy; see :mod:`rejeu.lab.runs.requests`."""
+    stop = File("stop")
+    """Request to stop."""
+    live = File("live.safetensors")
+    """The current model, while it is watched."""
     videos = File("videos")
     """Folder of videos of the policy during training."""
 

@@ -39,6 +39,7 @@ FILES = {
     "episodes.csv",
     "evaluations.csv",
     "metrics.csv",
+    "models",
     "report.html",
     "video.mp4",
 }
@@ -495,7 +496,7 @@ def test_resume_with_steps_pauses_and_keeps_the_goal(run, tmp_path, capsys):
         arguments = ["train", "Pendulum-v1", "--steps", "850", "--out", str(out), "--evaluate-episodes", "2", *argv]
         assert main([*arguments, "--set", *TINY]) == 130
     assert "stopped by Ctrl-C; everything is saved" in capsys.readouterr().out
-    assert {path.name for path in out.iterdir()} == FILES - {"curve.png", "video.mp4", "report.html"}
+    assert {path.name for path in out.iterdir()} == FILES - {"curve.png", "models", "report.html", "video.mp4"}
     assert rejeu.load(out / "agent.safetensors").num_timesteps == 100
     assert main(["resume", str(out), "--steps", "1e2", *FEWER_FILES]) == 0
     text = capsys.readouterr().out

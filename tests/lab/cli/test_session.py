@@ -22,8 +22,8 @@ from tests.lab.reporting.test_comparison import write_run
 
 def test_an_evaluation_is_a_row_with_its_own_values_in_each_column(tmp_path, capsys):
     evaluation = Evaluation(np.array([1.0, 5.0]), np.array([10, 30]), np.array([0.0, 1.0]))
-    agent = SimpleNamespace(seconds={"total": 7.0})
-    report = output.reporter(agent, CsvFile(tmp_path / "table.csv"), "seed 3: ")
+    agent = SimpleNamespace(seconds={"total": 7.0}, last_saved=None, snapshot=lambda path: lambda: path)
+    report = output.reporter(agent, CsvFile(tmp_path / "table.csv"), tmp_path / "models", "seed 3: ")
     report(Evaluated(40, evaluation), True)
     (row,) = csv.DictReader((tmp_path / "table.csv").read_text().splitlines())
     expected = {"step": 40, "seconds": 7, "success_rate": 0.5, "mean_return": 3, "std_return": 2}

@@ -85,9 +85,11 @@ def entrants(tmp_path):
         "anna.safetensors",
         "ben/best.safetensors",
         "ben/agent.safetensors",
+        "ben/live.safetensors",
+        "ben/models/step_000000000100.safetensors",
         "odd/agent.safetensors",
     ):
-        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         agent.save(tmp_path / name)
     (tmp_path / "ben" / "config.json").write_text("{}", encoding="utf-8")
     with zipfile.ZipFile(tmp_path / "theirs.zip", "w") as file:

@@ -20,6 +20,7 @@ from rejeu.core import atomic, xla
 from rejeu.core.interrupt import NAMES
 from rejeu.lab.cli.environment import Environment
 from rejeu.lab.runs.config import DecidedRun
+from rejeu.lab.runs.requests import keep_model
 from rejeu.logs.formatting import counted, quoted
 from rejeu.logs.logging import Sink
 
@@ -54,8 +55,8 @@ def header(config: DecidedRun, environment: Environment, backend: str, folder: R
     )
 
 
-def reporter(agent: Agent, table: Sink, label: str = "") -> Callable[[Evaluated, bool], None]:
-    """Returns a function that prints an evaluation, after ``label``, and adds it to a table."""
+def reporter(agent: Agent, table: Sink, models: Path, label: str = "") -> Callable[[Evaluated, bool], None]:
+    """Returns a function that prints an evaluation, after ``label``, adds it to a table, and keeps its model in a folder."""
 
     def report(result: Evaluated, is_best: bool) -> None:
         evaluation = result.evaluation
@@ -71,6 +72,7 @@ def reporter(agent: Agent, table: Sink, label: str = "") -> Callable[[Evaluated,
                 "best": int(is_best),
             },
         )
+        keep_model(agent, models, result.step)
         success = "" if math.isnan(evaluation.success_rate) else f"success {evaluation.success_rate:6.1%}  "
         echo(
             f"{label}step {result.step:>9,}  {success}return {evaluation.mean_return:,.2f}{'  (best)' if is_best else ''}"

@@ -25,6 +25,7 @@ from rejeu.lab.cli.environment import Environment
 from rejeu.lab.cli.output import Stopwatch, as_dict, echo, noted_in, reporter, summary
 from rejeu.lab.reporting import report
 from rejeu.lab.runs.config import DecidedRun
+from rejeu.lab.runs.requests import Requests
 from rejeu.logs import plots, video
 from rejeu.logs.formatting import counted, quoted
 from rejeu.logs.history import EpisodeTable
@@ -195,7 +196,7 @@ class Session(NamedTuple):
         """Returns the callback that evaluates, and all callbacks of the run."""
         agent, config, folder = self.agent, self.config, self.folder
         table = CsvFile(folder.evaluations, None if self.is_new else agent.num_timesteps)
-        report = reporter(agent, RetryingSink(table, agent.failed_writes), self.label)
+        report = reporter(agent, RetryingSink(table, agent.failed_writes), folder.models, self.label)
         every, episodes = config.evaluate_every, config.evaluate_episodes
         evaluate = Evaluate(self.evaluation_env, every, episodes, folder.best, report=report)
         is_pause_due = pause(agent, self.limits)
@@ -210,7 +211,7 @@ class Session(NamedTuple):
                 evaluate_now(evaluate, agent)  # here, and not after learn, so that the last checkpoint contains it
             return not (stop.requested or is_pause_due(turn))
 
-        callbacks: list[Any] = [save, evaluate, finish, *self.more]
+        callbacks: list[Any] = [Requests(folder, stop), save, evaluate, finish, *self.more]
         if config.video_every is not None:
             render = self.environment.rendering
             callbacks.append(RecordVideo(folder.videos, config.video_every, env=render, max_steps=VIDEO_STEPS))

@@ -94,7 +94,7 @@ def texts() -> dict[str, dict[str, Any]]:
 def models(folder: Path) -> list[Path]:
     """Returns the model files in a folder and the folders in it, sorted; symbolic links are not followed.
 
-    A run folder is one model, the best, and its checkpoints are none.
+    A run folder is one model, the best; its checkpoints and the models of the course of its training are none.
 
     Raises:
         FileNotFoundError: if there is no such folder, or no model in it.
@@ -103,10 +103,17 @@ def models(folder: Path) -> list[Path]:
         raise FileNotFoundError(f"there is no folder {folder}")
     suffixes = (checkpoint.SUFFIX, ".zip")
     files = (one for one in folder.rglob("*") if one.suffix in suffixes and one.is_file() and not one.is_symlink())
-    found = {find_model(one.parent) if is_of_run(one) else one for one in files if one.parent.name != "checkpoints"}
+    found = {find_model(one.parent) if is_of_run(one) else one for one in files if not is_passing(one)}
     if not found:
         raise FileNotFoundError(f"{folder} holds no {' or '.join(suffixes)} files; agent.save(name) writes them")
     return sorted(found)
+
+
+def is_passing(path: Path) -> bool:
+    """Returns whether a file is of the course of the training of a run."""
+    run, inner = RunFolder(path.parent.parent), RunFolder(path.parent)
+    is_kept = path.parent == run.models and run.config.is_file()
+    return is_kept or path.parent.name == run.checkpoints.name or (path == inner.live and inner.config.is_file())
 
 
 def is_of_run(path: Path) -> bool:

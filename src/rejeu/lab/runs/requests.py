@@ -1,0 +1,93 @@
+"""What others ask of a run while it trains, by files in its folder: to stop, and to show its current policy.
+
+Files need no signals and no connection, so that it works on every system, for runs that were started anywhere.
+"""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from rejeu.callbacks.base import TrainingCallback
+from rejeu.checkpoints.run_folder import RunFolder
+from rejeu.core.interrupt import Interrupt
+from rejeu.training.run import Progress
+
+EVERY = 1.0
+"""Seconds between two looks at the folder."""
+STALE = 10.0
+"""Seconds after which a request to show the policy is over, unless it was renewed."""
+MOST_MODELS = 16
+"""Most models of the course of training that are kept; of more every second one is dropped."""
+
+
+def ask(path: Path) -> None:
+    """Makes or renews a request, unless the folder cannot be written to."""
+    with suppress(OSError):
+        path.touch()
+
+
+def is_asked(path: Path) -> bool:
+    """Returns whether a request was made or renewed a moment ago."""
+    try:
+        return -STALE < time.time() - path.stat().st_mtime < STALE
+    except OSError:
+        return False
+
+
+class Requests(TrainingCallback):
+    """Callback that answers requests. Mutable. Those from before training are dropped."""
+
+    def __init__(self, folder: RunFolder, stop: Interrupt) -> None:
+        self.folder, self.stop = folder, stop
+        self._next = 0.0
+
+    def before_training(self, agent: Any) -> None:
+        """Drops older requests."""
+        self.withdraw()
+
+    def after_training(self, agent: Any, error: BaseException | None) -> None:
+        """Removes the files."""
+        self.withdraw()
+
+    def __call__(self, agent: Any, progress: Progress) -> None:
+        """Answers, at most once a second: writes the current model while it is watched; stops as Ctrl-C does."""
+        now = time.monotonic()
+        if now < self._next:
+            return
+        if self.folder.stop.exists():
+            self.stop.signal = signal.SIGINT
+        if is_asked(self.folder.watch):
+            show(agent, self.folder.live)
+        self._next = now + EVERY
+
+    def withdraw(self) -> None:
+        """Removes the files of requests and of what was shown."""
+        for path in (self.folder.stop, self.folder.watch, self.folder.live):
+            with suppress(OSError):
+                path.unlink(missing_ok=True)
+
+
+def show(agent: Any, path: Path) -> None:
+    """Writes the current model for those who watch, if that is possible; no error message names it as the last one."""
+    saved = agent.last_saved
+    with suppress(OSError):
+        agent.snapshot(path)()
+    agent.last_saved = saved
+
+
+def keep_model(agent: Any, folder: Path, step: int) -> None:
+    """Writes the model of a step among those of the course of training; of too many every second one is removed."""
+    show(agent, folder / f"step_{step:012}.safetensors")
+    kept = models(folder)
+    for one in kept[1::2] if len(kept) > MOST_MODELS else ():
+        one.unlink(missing_ok=True)
+
+
+def models(folder: Path) -> Sequence[Path]:
+    """Returns the models of the course of training, oldest first."""
+    return sorted(folder.glob("step_*.safetensors"))
