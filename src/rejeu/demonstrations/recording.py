@@ -83,8 +83,8 @@ class Recording:
         if not self.episodes:
             return f"{self.folder}: nothing was played, nothing is recorded"
         return (
-            f"{self.folder}: {counted(self.episodes, 'episode')} in {VIDEO_NAME} and for MINARI_DATASETS_PATH={self.folder}, "
-            f"minari.load_dataset({self.dataset_id!r})"
+            f"{self.folder}: {counted(self.episodes, 'episode')}{f' in {VIDEO_NAME} and' if self._video else ''} "
+            f"for MINARI_DATASETS_PATH={self.folder}, minari.load_dataset({self.dataset_id!r})"
         ) + (f"; {lost}" if (lost := self._writes.summary()) else "")
 
     def begin(self, obs: Any, seed: int | None, frame: np.ndarray | None = None) -> None:

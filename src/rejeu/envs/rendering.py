@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes.util
 import os
 import sys
+import threading
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -19,6 +20,8 @@ from rejeu.envs.validation import describe_value, keeps_values
 
 DEFAULT_FPS = 30.0
 """Frames per second of environments that declare none."""
+RENDERING = threading.RLock()
+"""One thread at a time renders: the drivers are chosen by variables of the process."""
 
 
 def make_rendering_env(
@@ -65,7 +68,7 @@ def rgb_frame(env: gym.Env) -> np.ndarray:
     Raises:
         ValueError: if it renders anything else, or if MuJoCo has no OpenGL context.
     """
-    with display_for_pygame(), explain_mujoco_errors(env):
+    with RENDERING, display_for_pygame(), explain_mujoco_errors(env):
         shown: Any = env.render()
     frame = shown[..., None] if isinstance(shown, np.ndarray) and shown.ndim == 2 else shown
     if isinstance(frame, np.ndarray) and frame.shape[2:] in ((1,), (3,), (4,)) and keeps_values(frame, np.uint8):

@@ -19,6 +19,8 @@ from rejeu.lab.runs.config import MAX_EPISODES, EnvironmentOptions, RunConfig, S
 WHICH = "Of a folder: the model that evaluated best in training, or the last."
 EPISODES = "Episodes of each evaluation; by default the preset's, else 20."
 
+PORT = 8080
+"""Where the studio is looked for first."""
 Which = Annotated[Literal["best", "last"], Shown("{best,last}", help=WHICH)]
 EnvironmentId = Annotated[str, Shown("ENV", is_positional=True)]
 ModelPath = Annotated[
@@ -333,10 +335,11 @@ class Play(EnvironmentOptions):
 class Watch(RunOptions):
     """Opens a window in which a trained agent plays, in the environment's own package.
 
-    r restarts the episode, p pauses, q quits.
+    r restarts the episode, p pauses, q quits. Two agents play side by side, from the same starts, in the web browser.
     """
 
-    run: ModelPath
+    runs: Annotated[tuple[Path, ...], Shown("RUN ...", is_positional=True)]
+    """One or two folders of runs, or model files (.safetensors, .zip)."""
     episodes: Count = None
     """Close after so many; by default when you do."""
     seed: SeedOrNone = None
@@ -412,7 +415,7 @@ class Studio:
 
     folder: Annotated[Path, Shown("FOLDER", is_positional=True)] = Path("runs")
     """Folder below which all runs are shown, and new ones begin."""
-    port: Annotated[Annotated[int, Meta(ge=0, le=65535)], Shown("N")] = 8080
+    port: Annotated[Annotated[int, Meta(ge=0, le=65535)], Shown("N")] = PORT
     """Port of this computer; if it is taken, the next free one. 0 for any."""
     no_browser: bool = False
     """Print the address, and do not open it in the web browser."""

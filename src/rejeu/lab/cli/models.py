@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from contextlib import closing, nullcontext
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rejeu.agents import load
@@ -78,15 +79,41 @@ def run_export(arguments: Export) -> tuple[int, dict[str, Any]]:
     return 0, found.to_dict()
 
 
-def run_watch(arguments: Watch) -> tuple[int, dict[str, Any]]:
-    """Shows an agent in a window, and prints its scores."""
+def run_watch(arguments: Watch) -> tuple[int, dict[str, Any] | None]:
+    """Shows an agent in a window, and prints its scores; or two in the web browser."""
     from rejeu.teaching.play import watch
 
-    model = find_model(arguments.run, arguments.which)
+    if len(arguments.runs) > 1:
+        return watch_together(arguments)
+    model = find_model(arguments.runs[0], arguments.which)
     made = environment.environment_of(model, arguments)
     game = watch(load(model), made.make, seed=arguments.seed, fps=arguments.fps, episodes=arguments.episodes)
     echo(scores(game))
     return 0, as_dict(game)
+
+
+def watch_together(arguments: Watch) -> tuple[int, None]:
+    """Shows two agents side by side in the studio.
+
+    Raises:
+        ValueError: for more than two, twice the same, or options of the window.
+    """
+    from rejeu.lab.cli.studio import open_studio
+
+    if len(arguments.runs) > 2 or arguments.runs[0] == arguments.runs[1]:
+        raise ValueError("rejeu watch takes one or two different agents; rejeu studio compares more")
+    if arguments.fps is not None or arguments.episodes is not None:
+        raise ValueError("--fps and --episodes are for one agent, in a window; leave them out")
+    models = [find_model(run, arguments.which) for run in arguments.runs]
+    guests = {
+        str(run): (model, environment.environment_of(model, arguments))
+        for run, model in zip(arguments.runs, models, strict=True)
+    }
+    seed = [] if arguments.seed is None else [("seed", str(arguments.seed))]
+    open_studio(
+        Path("runs"), guests=guests, page=("/play", [*(("agent", name) for name in guests), ("watch", "1"), *seed])
+    )
+    return 0, None
 
 
 def run_play(arguments: Play) -> tuple[int, dict[str, Any]]:

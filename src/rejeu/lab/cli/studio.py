@@ -3,21 +3,46 @@
 from __future__ import annotations
 
 import webbrowser
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 from rejeu.core.errors import MissingExtra
-from rejeu.lab.cli.commands import Studio
+from rejeu.lab.cli.commands import PORT, Studio
+from rejeu.lab.cli.environment import Environment
 
 
 def run_studio(arguments: Studio) -> tuple[int, None]:
     """Serves the studio until Ctrl-C.
 
     Raises:
-        MissingExtra: if NiceGUI is not installed.
         NotADirectoryError: if the folder is something else.
-        OSError: if no port is free.
     """
     if arguments.folder.exists() and not arguments.folder.is_dir():
         raise NotADirectoryError(f"{arguments.folder} is no folder; expected one of runs, such as runs")
+    open_studio(arguments.folder, arguments.port, not arguments.no_browser)
+    return 0, None
+
+
+def open_studio(
+    folder: Path,
+    port: int = PORT,
+    has_browser: bool = True,
+    guests: Mapping[str, tuple[Path, Environment]] | None = None,
+    page: tuple[str, Sequence[tuple[str, str]]] = ("/", ()),
+) -> None:
+    """Serves the studio until Ctrl-C.
+
+    Args:
+        folder: of the runs.
+        port: the port, or the first free one after it; 0 for any.
+        has_browser: whether the page is opened in the web browser.
+        guests: models that may be elsewhere, with their environments, by their names.
+        page: that is opened, and its query.
+
+    Raises:
+        MissingExtra: if NiceGUI is not installed.
+        OSError: if no port is free.
+    """
     try:
         import nicegui  # noqa: F401 - a missing one is named in one line
     except ImportError:
@@ -26,8 +51,7 @@ def run_studio(arguments: Studio) -> tuple[int, None]:
 
     def ready(address: str) -> None:
         print(f"{address} (Ctrl-C ends it; runs go on)", flush=True)
-        if not arguments.no_browser:
+        if has_browser:
             webbrowser.open(address)
 
-    server.serve(state.Studio(arguments.folder), arguments.port, ready)
-    return 0, None
+    server.serve(state.Studio(folder, guests), port, ready, page)

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import secrets
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from typing import NamedTuple
+from urllib.parse import urlencode
 
 import uvicorn
 from fastapi import FastAPI, Request, Response
 from fastapi.responses import FileResponse
 from nicegui import app, ui
 
-from rejeu.lab.studio import figures, runs
+from rejeu.lab.studio import figures, play, runs
 from rejeu.lab.studio.guard import HOST, Guard
 from rejeu.lab.studio.layout import frame
 from rejeu.lab.studio.state import Studio
@@ -36,29 +37,36 @@ class Page(NamedTuple):
     """Whether the navigation leads to it."""
 
 
-PAGES = (Page("/", "Runs", runs.build),)
+PAGES = (Page("/", "Runs", runs.build), Page("/play", "Play", play.build))
 
 
-def serve(studio: Studio, port: int, ready: Callable[[str], None]) -> None:
+def serve(
+    studio: Studio,
+    port: int,
+    ready: Callable[[str], None],
+    page: tuple[str, Sequence[tuple[str, str]]] = ("/", ()),
+) -> None:
     """Serves the studio until Ctrl-C; ``ready`` is called with the address.
 
     Args:
         studio: what is shown.
         port: the port, or the first free one after it; 0 for any.
         ready: called before the first request is answered.
+        page: that the address leads to, and its query.
     """
     with closing(bound(port)) as listening, studio:
         own_port = listening.getsockname()[1]
         token = secrets.token_urlsafe(24)
         server = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
-        links = [(page.path, page.title) for page in PAGES if page.is_listed]
+        links = [(one.path, one.title) for one in PAGES if one.is_listed]
         figures.serve_scripts()
         add_files(studio)
-        for page in PAGES:
-            add(page, studio, links)
+        for one in PAGES:
+            add(one, studio, links)
         ui.run_with(server, title="rejeu studio", dark=None, show_welcome_message=False)
         config = uvicorn.Config(Guard(server, token, own_port), log_level="warning", ws_max_size=2**24, lifespan="on")
-        ready(f"http://{HOST}:{own_port}/?token={token}")
+        path, query = page
+        ready(f"http://{HOST}:{own_port}{path}?{urlencode([*query, ('token', token)])}")
         uvicorn.Server(config).run(sockets=[listening])
 
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
 
+from rejeu.lab.cli.environment import Environment
 from rejeu.lab.reporting.rows import Row, Rows
 from rejeu.lab.reporting.runs import RunSummary, is_file
 
@@ -17,8 +18,10 @@ EVERY = 1.0
 class Studio:
     """The folder of a studio, and the rows of its runs; a thread reads them while the context is entered."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, guests: Mapping[str, tuple[Path, Environment]] | None = None) -> None:
         self.folder = folder
+        self.guests = dict(guests or {})
+        """Models that the command line named, with their environments; they may be elsewhere."""
         self.rows: list[Row] = []
         """One a run, as :meth:`rejeu.lab.reporting.rows.Rows.read` returns them. Replaced when they change, never changed."""
         self.summaries: Mapping[str, RunSummary] = {}

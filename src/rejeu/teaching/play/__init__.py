@@ -1,16 +1,16 @@
 """Play environments by hand, or watch agents, in a window.
 
-``keys.py`` maps keys to actions, ``game.py`` holds the state of a game, ``window.py`` draws it and reads the keyboard,
-``recording.py`` writes a dataset and a video.
+``keys.py`` maps keys to actions, ``game.py`` holds the state of a game, ``window.py`` draws it and reads the keyboard. The
+studio shows the same games in the web browser.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -59,25 +59,10 @@ def play(
         ValueError: for an unknown environment, one that does not render, or an action space without keys.
         OSError: if there is no display.
     """
-    seed, episodes = _check(seed, fps, episodes)
-    with ExitStack() as stack:
-        playing_env = rendering(env)
-        stack.callback(playing_env.close)
-        env_id = id_of(playing_env)
-        keys_of_env = keys_for(env_id, playing_env.action_space, keys)
-        fps = natural_fps(playing_env) if fps is None else fps
-        by_hand = Player("you", playing_env, lambda obs, held, step: keys_of_env.action(held, step))
-        players = [by_hand]
-        if against is not None:
-            opponent_env = for_agent(against, rendering(env))
-            stack.callback(opponent_env.close)
-            players.append(Player(_name(against), opponent_env, _policy(against)))
-        if record is not None:
-            by_hand.recording = Recording(record, playing_env, fps)
-            stack.callback(by_hand.recording.close)
-        game = Game(players, seed, keys_of_env.names, episodes, rest=round(REST_SECONDS * fps))
-        _run(Window(f"rejeu play {env_id}"), game, keys_of_env, fps)
-    return game
+    opponents = {} if against is None else {_name(against): against}
+    with opened(env, opponents, keys=keys, seed=seed, fps=fps, episodes=episodes, record=record) as made:
+        _run(Window(f"rejeu play {made.env_id}"), made)
+    return made.game
 
 
 def watch(
@@ -102,28 +87,73 @@ def watch(
         ValueError: for an unknown environment or one that does not render.
         OSError: if there is no display.
     """
+    with opened(env, {_name(agent): agent}, by_hand=False, seed=seed, fps=fps, episodes=episodes) as made:
+        _run(Window(f"rejeu watch {made.env_id}"), made)
+    return made.game
+
+
+class Opened(NamedTuple):
+    """A game, and what shows it needs of it."""
+
+    game: Game
+    env_id: str
+    keys: KeyMap | None
+    """None if nobody plays by hand."""
+    fps: float
+
+    def begin(self) -> None:
+        """Starts the first round."""
+        self.game.begin()
+        for player in self.game.players:
+            player.act(player.obs, frozenset(), 0)  # an agent compiles at its first action, which would delay the game
+
+
+@contextmanager
+def opened(
+    env: str | Callable[..., gym.Env],
+    agents: Mapping[str, Any],
+    by_hand: bool = True,
+    *,
+    keys: Mapping[str, Any] | None = None,
+    seed: int | None = None,
+    fps: float | None = None,
+    episodes: int | None = None,
+    record: str | Path | None = None,
+    has_video: bool = True,
+) -> Iterator[Opened]:
+    """Context of a game that has not begun, whose environments are closed and whose recording is completed at the end.
+
+    ``agents`` play, under these names, and with ``by_hand`` a person too, as the first player. ``has_video`` says whether a
+    recording has a video. The other arguments are those of :func:`play`.
+    """
     seed, episodes = _check(seed, fps, episodes)
     with ExitStack() as stack:
-        playing_env = for_agent(agent, rendering(env))
-        stack.callback(playing_env.close)
-        fps = natural_fps(playing_env) if fps is None else fps
-        player = Player(_name(agent), playing_env, _policy(agent))
-        game = Game([player], seed, episodes=episodes, rest=round(REST_SECONDS * fps))
-        _run(Window(f"rejeu watch {id_of(playing_env)}"), game, None, fps)
-    return game
+
+        def made(agent: Any = None) -> gym.Env:
+            one = rendering(env) if agent is None else for_agent(agent, rendering(env))
+            stack.callback(one.close)
+            return one
+
+        players, bound = [], None
+        if by_hand:
+            own = made()
+            bound = keys_for(id_of(own), own.action_space, keys)
+            players.append(Player("you", own, _hand(bound)))
+        players += [Player(name, made(agent), _policy(agent)) for name, agent in agents.items()]
+        first = players[0]
+        fps = natural_fps(first.env) if fps is None else fps
+        if record is not None:
+            first.recording = Recording(record, first.env, fps if has_video else None)
+            stack.callback(first.recording.close)
+        names = frozenset() if bound is None else bound.names
+        game = Game(players, seed, names, episodes, rest=round(REST_SECONDS * fps))
+        yield Opened(game, id_of(first.env), bound, fps)
 
 
 def turn(window: Window, game: Game) -> None:
     """Processes the events since the last call, advances the game by one step and draws it."""
     for event in window.events():
-        if event.kind == "press":
-            game.press(event.key)
-        elif event.kind == "release":
-            game.release(event.key)
-        elif event.kind == "leave":
-            game.release_all()
-        else:
-            game.closed = True
+        game.handle(event)
     game.tick()
     window.draw(game)
 
@@ -141,16 +171,14 @@ def rendering(env: str | Callable[..., gym.Env]) -> gym.Env:
     return make_rendering_env(partial(make_env, env_id), env_id)
 
 
-def _run(window: Window, game: Game, keys: KeyMap | None, fps: float) -> None:
+def _run(window: Window, made: Opened) -> None:
     with window, Interrupt() as stop:
-        game.begin()
-        for player in game.players:
-            player.act(player.obs, frozenset(), 0)  # an agent compiles at its first action, which would delay the game
-        window.open(game, keys)
-        while not game.closed:
+        made.begin()
+        window.open(made.game, made.keys)
+        while not made.game.closed:
             stop.check()
-            turn(window, game)
-            window.wait(fps)
+            turn(window, made.game)
+            window.wait(made.fps)
 
 
 def _check(seed: int | None, fps: float | None, episodes: int | None) -> tuple[int, int | None]:
@@ -166,6 +194,10 @@ def _check(seed: int | None, fps: float | None, episodes: int | None) -> tuple[i
     if seed is None:
         return int(np.random.default_rng().integers(10_000)), episodes
     return whole("seed", seed, least=0), episodes
+
+
+def _hand(keys: KeyMap) -> Act:
+    return lambda obs, held, step: keys.action(held, step)
 
 
 def _policy(agent: Any) -> Act:

@@ -56,14 +56,8 @@ class Seat:
         """
         while not self.game.closed and interrupt.requested() is None:
             for event in self.window.events():
-                if event.kind == "press" and (event.key in self.keys.names or CONTROLS.get(event.key) != "restart"):
-                    self.game.press(event.key)
-                elif event.kind == "release":
-                    self.game.release(event.key)
-                elif event.kind == "leave":
-                    self.game.release_all()
-                elif event.kind == "close":
-                    self.game.closed = True
+                if event.kind != "press" or event.key in self.keys.names or CONTROLS.get(event.key) != "restart":
+                    self.game.handle(event)
             if self.game.closed:
                 self.close()
                 break

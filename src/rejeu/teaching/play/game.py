@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -17,6 +17,15 @@ from rejeu.teaching.play.keys import CONTROLS
 
 Act = Callable[[Any, frozenset[str], int], Any]
 """Maps the observation, the held keys and the step of the episode (from 0) to an action, or None to wait."""
+
+
+class Event(NamedTuple):
+    """An event of the keyboard or the window."""
+
+    kind: str
+    """``press``, ``release``, ``leave`` (the window lost the keyboard focus) or ``close``."""
+    key: str = ""
+    """SDL's name of the key in lower case."""
 
 
 @dataclass
@@ -110,6 +119,17 @@ class Game:
         self.phase = "ready" if self.bound else "running"
         self.paused = False
 
+    def handle(self, event: Event) -> None:
+        """Handles an event."""
+        if event.kind == "press":
+            self.press(event.key)
+        elif event.kind == "release":
+            self.held.discard(event.key)
+        elif event.kind == "leave":
+            self.held.clear()
+        else:
+            self.closed = True
+
     def press(self, key: str) -> None:
         """Handles a key press."""
         command = None if key in self.bound else CONTROLS.get(key)
@@ -124,14 +144,6 @@ class Game:
         else:
             self.held.add(key)
             self.tapped.add(key)
-
-    def release(self, key: str) -> None:
-        """Handles a key release."""
-        self.held.discard(key)
-
-    def release_all(self) -> None:
-        """Releases all keys, when the window loses the keyboard focus."""
-        self.held.clear()
 
     def tick(self) -> None:
         """Advances the game by one step."""

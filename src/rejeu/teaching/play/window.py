@@ -12,7 +12,7 @@ from rejeu.core import hardware
 from rejeu.core.errors import MissingExtra
 from rejeu.core.language import said
 from rejeu.logs.formatting import counted
-from rejeu.teaching.play.game import Game, Player
+from rejeu.teaching.play.game import Event, Game, Player
 from rejeu.teaching.play.keys import KeyMap, equivalent_keys
 
 Color = tuple[int, int, int]
@@ -30,15 +30,6 @@ SHARE_OF_SCREEN = 0.9
 OFFSCREEN_DRIVERS = ("dummy", "offscreen")
 """SDL's drivers without a screen. They are used only if SDL_VIDEODRIVER selects them, as in the tests."""
 HELP = (("r", "restart"), ("p", "pause"), ("q", "quit"))
-
-
-class Event(NamedTuple):
-    """An event of the keyboard or the window."""
-
-    kind: str
-    """``press``, ``release``, ``leave`` (the window lost the keyboard focus) or ``close``."""
-    key: str = ""
-    """SDL's name of the key in lower case."""
 
 
 class LegendEntry(NamedTuple):

@@ -1,0 +1,173 @@
+"""Games that threads play for pages: who plays what, from where on."""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rejeu.agents import load
+from rejeu.checkpoints.run_folder import dated, find_model
+from rejeu.core.language import said
+from rejeu.lab.cli import environment, expected_errors, one_line
+from rejeu.lab.cli.commands import RunOptions
+from rejeu.lab.cli.environment import Environment
+from rejeu.lab.runs.config import EnvironmentOptions
+from rejeu.lab.studio.state import Studio
+from rejeu.teaching.play import Opened, opened
+from rejeu.teaching.play.game import Event, Game, Player
+from rejeu.teaching.play.keys import full_name
+from rejeu.teaching.play.window import message, number, score_summary
+
+MAX_PIXELS = 1440
+"""Most pixels in a row of a picture."""
+SLOW = 20.0
+"""Steps a second below which a key that is pressed acts at once, rather than at the next step."""
+
+
+class Wanted(NamedTuple):
+    """A game that somebody asks for."""
+
+    env: str
+    """Id of the environment; empty for that of the first agent."""
+    agents: Sequence[str]
+    """Names of models: paths below the folder of the studio, or those that the command line named."""
+    by_hand: bool
+    seed: int | None
+    record: bool
+
+    def open(self, studio: Studio) -> AbstractContextManager[Opened]:
+        """Returns the context of the game.
+
+        Raises:
+            ValueError: if the environment or an agent cannot be used, or nobody plays.
+            OSError: if there is no such model.
+        """
+        if not self.agents and not self.by_hand:
+            raise ValueError("nobody plays; choose an agent, or play yourself")
+        players = {name: find_agent(studio, name) for name in self.agents}
+        made = next((one for _, one in players.values()), None)
+        if made is None:
+            env_id = full_name(self.env)
+            if environment.imports(env_id):  # an address may not name code
+                raise ValueError(f"{env_id!r} would be imported; play it with rejeu play")
+            made = environment.from_arguments(env_id, EnvironmentOptions())
+        for name, (_, own) in players.items():
+            if own.env_id != (self.env or made.env_id):
+                raise ValueError(f"{name} plays {own.env_id}, not {self.env or made.env_id}")
+        agents = {name: load(model, device="cpu") for name, (model, _) in players.items()}
+        folder = studio.folder / "played" / dated(made.env_id).name if self.record and self.by_hand else None
+        return opened(made.make, agents, self.by_hand, seed=self.seed, record=folder, has_video=False)
+
+
+def find_agent(studio: Studio, name: str) -> tuple[Path, Environment]:
+    """Returns the model of a name, and its environment.
+
+    Raises:
+        ValueError: if the name leads out of the folder, or the environment must be named on the command line.
+        FileNotFoundError: if there is no such model.
+    """
+    if name in studio.guests:
+        return studio.guests[name]
+    path = Path(name)
+    if path.is_absolute() or ".." in path.parts:
+        raise ValueError(f"{name!r} is not in the folder of the studio")
+    model = find_model(studio.folder / path)
+    return model, environment.environment_of(model, RunOptions())
+
+
+class Playing:
+    """A game that a thread plays until it is closed. Mutable.
+
+    Args:
+        start: returns the context of the game; it is entered in the thread, to which drivers that render may be bound.
+        show: called with the pictures, the captions, and how many keys had been pressed before.
+    """
+
+    def __init__(self, start: Callable[[], AbstractContextManager[Opened]], show: Callable[..., object]) -> None:
+        self.opened: Opened | None = None
+        """None until it has begun."""
+        self.said = ""
+        """What there is to say at the end: an error, or what was recorded."""
+        self.ended = False
+        self._start, self._show = start, show
+        self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
+        self._presses = 0
+        threading.Thread(target=self._run, daemon=True).start()
+
+    def handle(self, event: Event) -> None:
+        """Passes an event to the game."""
+        self._events.put(event)
+
+    def handle_all(self, kind: str, keys: Sequence[str]) -> None:
+        """Passes events of the same kind of several keys."""
+        for key in keys:
+            self.handle(Event(kind, key))
+
+    def _run(self) -> None:
+        try:
+            with self._start() as made:
+                made.begin()
+                self.opened = made
+                self._play(made)
+                recording = made.game.players[0].recording
+            self.said = "" if recording is None else str(recording)
+        except expected_errors() as error:
+            self.said = one_line(error)
+        finally:
+            self.ended = True
+
+    def _play(self, made: Opened) -> None:
+        game, drawn, due = made.game, None, time.perf_counter()
+        while not game.closed:
+            self._take_events(game, due, at_once=made.fps < SLOW)
+            game.tick()
+            now = (
+                self._presses,
+                game.seed,
+                game.phase,
+                game.paused,
+                *((one.steps, len(one.scores)) for one in game.players),
+            )
+            if now != drawn:
+                drawn = now
+                pictures = [fitted(player.frame) for player in game.players]
+                self._show(pictures, [caption(game, player) for player in game.players], self._presses)
+            at = time.perf_counter()
+            due = max(min(due, at) + 1 / made.fps, at)  # a step that took too long is not caught up
+
+    def _take_events(self, game: Game, due: float, at_once: bool) -> None:
+        """Handles events until the next step is due, or until a key is pressed that acts at once."""
+        is_due = False
+        while not is_due:
+            try:
+                left = due - time.perf_counter()
+                event = self._events.get(timeout=left) if left > 0 else self._events.get_nowait()
+            except queue.Empty:
+                return
+            game.handle(event)
+            self._presses += event.kind == "press"
+            is_due = game.closed or (at_once and event.kind == "press")
+
+
+def caption(game: Game, player: Player) -> dict[str, Any]:
+    """Returns the texts of a player's picture."""
+    return {
+        "name": said(player.name),
+        "score": said("score {}", number(player.score)) + " · " + said("step {}", player.steps),
+        "about": score_summary(player, by_hand=bool(game.bound)),
+        "message": message(game, player),
+        "won": player.success == 1.0,
+    }
+
+
+def fitted(frame: np.ndarray) -> np.ndarray:
+    """Returns a picture, of which every second, third, ... pixel is left out if it is wider than a page shows it."""
+    step = -(-frame.shape[1] // MAX_PIXELS)
+    return frame[::step, ::step]

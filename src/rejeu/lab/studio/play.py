@@ -1,0 +1,107 @@
+"""The page on which environments are played by keys, alone or beside agents, and agents are watched."""
+
+from __future__ import annotations
+
+from functools import partial
+
+from fastapi import Request
+from nicegui import ui
+
+from rejeu.agents import presets
+from rejeu.core.language import said
+from rejeu.lab.studio.games import Playing, Wanted
+from rejeu.lab.studio.screen import CSS, Screen
+from rejeu.lab.studio.state import Studio
+from rejeu.teaching.play.game import Event
+from rejeu.teaching.play.keys import KNOWN, KeyMap
+from rejeu.teaching.play.window import HELP, legend
+
+MOST_AGENTS = 2
+LOOK = 0.1
+"""Seconds between two looks whether a game has begun or ended."""
+CHIP = 'outline no-caps padding="4px 10px"'
+
+
+def build(studio: Studio, request: Request) -> None:
+    """Makes the page, a form and the game.
+
+    Its address may name ``env``, ``agent`` once or twice, a ``seed``, and ``watch`` for a game without keys; it then begins.
+    """
+    ui.add_css(CSS)
+    asked = request.query_params
+    named = asked.getlist("agent")[:MOST_AGENTS]
+    first = studio.row(named[0]) if named else None
+    chosen = asked.get("env") or (first["env"] if first is not None else "")
+    seed = asked.get("seed", "")
+    with ui.row().classes("items-center w-full"):
+        env_ids = dict.fromkeys([*environments(studio), *filter(None, [chosen])])
+        env = ui.select(
+            [*env_ids], label="environment", value=chosen or None, with_input=True, new_value_mode="add-unique"
+        ).classes("w-64")
+        agents = ui.select(offered(studio, chosen, named), label="agents", value=named, multiple=True).classes("w-64")
+        agents.props(f"use-chips max-values={MOST_AGENTS}")
+        by_hand = ui.switch("I play", value="watch" not in asked)
+        record = ui.switch("record").bind_enabled_from(by_hand, "value")
+        number = ui.number("seed", value=int(seed) if seed.isdecimal() else None, min=0, precision=0).classes("w-20")
+        start = ui.button("Start", icon="play_arrow")
+    place = ui.column().classes("w-full")
+
+    def begin() -> None:
+        from_seed = None if number.value is None else int(number.value)
+        wanted = Wanted(env.value or "", tuple(agents.value), bool(by_hand.value), from_seed, bool(record.value))
+        place.clear()  # the screen of an earlier game ends it
+        with place:
+            show(studio, wanted)
+
+    env.on_value_change(lambda: agents.set_options(offered(studio, env.value, agents.value), value=agents.value))
+    start.on_click(begin)
+    if chosen or named:
+        begin()
+
+
+def environments(studio: Studio) -> list[str]:
+    """Returns the ids of environments with presets, with keys, and of the runs."""
+    return sorted(
+        {*KNOWN, *(one.env_id for one in presets.every()), *(row["env"] for row in studio.rows if row["env"])}
+    )
+
+
+def offered(studio: Studio, env_id: str | None, chosen: list[str]) -> list[str]:
+    """Returns the names of the agents that play an environment, and of those that are chosen."""
+    runs = [row["run"] for row in studio.rows if row["env"] == env_id]
+    return [*dict.fromkeys([*chosen, *studio.guests, *runs])]
+
+
+def show(studio: Studio, wanted: Wanted) -> None:
+    """Begins a game, and shows it."""
+    status = ui.label("The environment is made, and agents are compiled ...").classes("text")
+    screen = Screen(lambda event: playing.handle(event))
+    buttons = ui.row().classes("gap-1 items-center")
+    playing = Playing(lambda: wanted.open(studio), screen.show)
+    screen.on_leave = lambda: playing.handle(Event("close"))
+
+    def look() -> None:
+        if playing.opened is not None and not buttons.default_slot.children:
+            status.text = ""
+            with buttons:
+                show_keys(playing, playing.opened.keys)
+        if playing.ended:
+            timer.deactivate()
+            buttons.clear()
+            status.text = playing.said or "The game has ended."
+
+    timer = ui.timer(LOOK, look)
+
+
+def show_keys(playing: Playing, keys: KeyMap | None) -> None:
+    """Shows what each key does, as buttons that are that key."""
+    entries = [] if keys is None else legend(keys)
+    for entry in entries:
+        for text, _ in entry.keys:
+            button = ui.button(text).props(CHIP).style("touch-action: none")
+            for name, kind in (("pointerdown", "press"), ("pointerup", "release"), ("pointerleave", "release")):
+                button.on(name, partial(playing.handle_all, kind, text.split("+")))
+        ui.label(entry.label).classes("q-mr-sm text-caption")
+    for key, label in HELP:
+        ui.button(key, on_click=partial(playing.handle_all, "press", [key])).props(CHIP)
+        ui.label(said(label)).classes("q-mr-sm text-caption")

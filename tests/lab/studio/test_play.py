@@ -1,0 +1,179 @@
+"""The page on which environments are played and agents watched: in headless Chromium, and its games without a page."""
+
+from __future__ import annotations
+
+import queue
+import re
+from functools import partial
+from urllib.parse import quote
+
+import numpy as np
+import pytest
+
+import rejeu
+from rejeu.demonstrations import read
+from rejeu.lab.cli import main, studio as command
+from rejeu.lab.studio.games import Playing, Wanted, fitted
+from rejeu.lab.studio.state import Studio
+from rejeu.teaching.play import opened as game_opened
+from tests.lab.cli.test_cli import error_of
+from tests.lab.studio.conftest import opened, serving
+from tests.playing import LEVER, Pull
+
+pytest.importorskip("pygame")
+PICTURE = "() => [...document.querySelectorAll('.screen canvas')].map((canvas) => canvas.toDataURL())"
+HOSTILE = "<img src=x onerror=window.hacked=1>"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A folder with two models, one of which has a hostile name."""
+    path = tmp_path_factory.mktemp("runs")
+    for name, seed in (("first", 0), (HOSTILE, 1)):
+        rejeu.PPO("MlpPolicy", "CartPole-v1", seed=seed).save(path / f"{name}.safetensors")
+    return path
+
+
+@pytest.fixture(scope="module")
+def served(folder):
+    with serving(folder) as one:
+        yield one
+
+
+def pictures(page):
+    return page.evaluate(PICTURE)
+
+
+def test_a_game_is_played_by_keys_recorded_and_read_again(browser, served):
+    with opened(browser, served, "/play?env=FrozenLake-v1&seed=1") as page:
+        page.wait_for_selector("text=press a key to begin")
+        page.get_by_role("switch", name="record").click()
+        page.get_by_role("button", name="Start").click()
+        page.wait_for_selector("text=press a key to begin")
+        before = pictures(page)
+        for i, key in enumerate(("ArrowRight", "d", "ArrowDown")):
+            page.keyboard.press(key)
+            page.wait_for_selector(f".screen[data-presses='{i + 1}']")
+        assert "step 3" in page.locator(".screen").inner_text()
+        assert pictures(page) != before
+        page.get_by_role("button", name="q", exact=True).click()
+        page.wait_for_selector("text=1 episode for MINARI_DATASETS_PATH")
+    (recorded,) = (served.folder / "played").iterdir()
+    (episode,) = read(recorded).episodes
+    assert episode.actions.tolist() == [2, 2, 1]  # right, right, down
+
+
+@pytest.mark.parametrize("width", [1280, 400])
+def test_two_agents_are_shown_side_by_side_from_the_same_start(browser, served, width):
+    query = f"agent=first.safetensors&agent={quote(HOSTILE)}.safetensors&watch=1&seed=3"
+    with opened(browser, served, f"/play?{query}", width=width) as page:
+        page.wait_for_selector(".screen canvas >> nth=1")
+        before = pictures(page)
+        assert len(before) == 2
+        page.wait_for_function(f"(before) => ({PICTURE})().every((one, i) => one !== before[i])", arg=before)
+        names = page.locator(".screen b").all_inner_texts()
+        assert names == ["first.safetensors", f"{HOSTILE}.safetensors"]
+        assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
+        page.keyboard.press("p")
+        page.wait_for_selector("text=pause >> nth=0")
+
+
+def test_an_error_is_one_line_on_the_page(browser, served):
+    with opened(browser, served, f"/play?env={quote(HOSTILE)}&agent={quote(HOSTILE)}&seed={HOSTILE}") as page:
+        page.wait_for_selector(f"text=there is no run folder or model file {served.folder / HOSTILE}")
+
+
+@pytest.mark.parametrize(
+    ("wanted", "message"),
+    [
+        (Wanted("evil:Env-v0", (), True, None, False), "'evil:Env-v0' would be imported"),
+        (Wanted("evil.py", (), True, None, False), "'evil.py' would be imported"),
+        (Wanted("", ("../first.safetensors",), True, None, False), "is not in the folder of the studio"),
+        (Wanted("", ("/etc/passwd",), True, None, False), "is not in the folder of the studio"),
+        (Wanted("Pendulum-v1", ("first.safetensors",), True, None, False), "plays CartPole-v1, not Pendulum-v1"),
+        (Wanted("Pendulum-v1", (), False, None, False), "nobody plays"),
+    ],
+)
+def test_an_address_names_no_code_and_no_file_elsewhere(folder, wanted, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        wanted.open(Studio(folder))
+
+
+class Shown:
+    """What a game shows, and a game that is entered in its thread."""
+
+    def __init__(self, **settings):
+        self.seen = queue.SimpleQueue()
+        start = partial(
+            game_opened, LEVER, settings.pop("agents", {}), settings.pop("by_hand", True), seed=4, **settings
+        )
+        self.playing = Playing(start, lambda *what: self.seen.put(what))
+
+    def next(self):
+        return self.seen.get(timeout=20)
+
+    def until(self, message):
+        while True:
+            images, captions, presses = self.next()
+            if captions[0]["message"].startswith(message):
+                return images, captions, presses
+
+    def press(self, *keys):
+        self.playing.handle_all("press", keys)
+
+
+def test_a_game_in_a_thread_takes_keys_and_compares_scores():
+    shown = Shown(agents={"pull": Pull()}, fps=200.0)
+    images, captions, presses = shown.next()
+    assert [image.shape for image in images] == [(300, 400, 3)] * 2
+    assert [one["name"] for one in captions] == ["you", "pull"]
+    assert (captions[0]["message"], presses) == ("press a key to begin", 0)
+    shown.press("d")
+    _, captions, presses = shown.until("success")
+    assert [one["score"] for one in captions] == ["score 10 · step 5"] * 2
+    assert (captions[1]["won"], presses) == (True, 1)
+    shown.press("q")
+    while not shown.playing.ended:
+        shown.next() if not shown.seen.empty() else None
+    assert shown.playing.said == ""
+
+
+def test_a_slow_game_acts_at_once_when_a_key_is_pressed():
+    shown = Shown(fps=0.01)  # a step in 100 seconds
+    shown.next()
+    for i in range(4):
+        shown.press("d")
+        _, captions, _ = shown.next()
+        assert captions[0]["score"].endswith(f"step {i + 1}")
+    shown.press("q")
+
+
+def test_an_error_of_a_game_is_what_it_says():
+    playing = Playing(partial(game_opened, "rejeu-play-test/Dark-v0", {}), lambda *what: None)
+    while not playing.ended:
+        pass
+    assert "cannot be rendered to arrays" in playing.said
+
+
+def test_a_wide_picture_is_made_smaller():
+    assert fitted(np.zeros((100, 3000, 3), np.uint8)).shape == (34, 1000, 3)
+    assert fitted(np.zeros((100, 600, 3), np.uint8)).shape == (100, 600, 3)
+
+
+def test_watch_of_two_opens_the_studio_with_both(folder, monkeypatch, capsys):
+    calls = []
+    monkeypatch.setattr(command, "open_studio", lambda *_, **settings: calls.append(settings))
+    names = [str(folder / "first"), str(folder / f"{HOSTILE}.safetensors")]
+    assert main(["watch", *names, "--seed", "5"]) == 0
+    (call,) = calls
+    assert call["page"] == ("/play", [("agent", names[0]), ("agent", names[1]), ("watch", "1"), ("seed", "5")])
+    assert [(model.name, made.env_id) for model, made in call["guests"].values()] == [
+        ("first.safetensors", "CartPole-v1"),
+        (f"{HOSTILE}.safetensors", "CartPole-v1"),
+    ]
+    wanted = Wanted("", tuple(names), by_hand=False, seed=5, record=False)
+    with wanted.open(Studio(folder, call["guests"])) as made:
+        assert [player.name for player in made.game.players] == names
+    assert "one or two different agents" in error_of(capsys, "watch", *names, names[0])
+    assert "one or two different agents" in error_of(capsys, "watch", names[0], names[0])
+    assert "--fps and --episodes are for one agent" in error_of(capsys, "watch", *names, "--fps", "5")
