@@ -341,46 +341,53 @@ def rows(action: Any) -> Any:
     return [*zip(*map(rows, action), strict=True)] if isinstance(action, tuple) else action
 
 
-def scale_action(space: spaces.Space, action: np.ndarray) -> np.ndarray:
+def scale_action(space: spaces.Space, action: Any, xp: Any = np) -> Any:
     """Returns actions in the range of the environment from those of an algorithm.
 
     Box: from [-1, 1] to [low, high], ``(batch, action_dim)`` to ``(batch, *shape)``; actions are clipped, and components
     without finite bounds are not scaled. Of a Box of integers, each number from low to high gets an equal part of [-1, 1].
     Discrete and MultiDiscrete: from 0 to n - 1 to the numbers of the space. MultiBinary: the bits. Dict and Tuple: from the
     numbers of all parts, ``float32 (batch, action_width)``, to a dict or tuple of the parts' arrays.
+
+    With ``xp=jax.numpy`` everything has 32 bits, so between bounds that are not symmetric about 0 the last bit may differ.
+
+    >>> scale_action(spaces.Box(-2.0, 2.0, (1,)), np.array([[0.25], [3.0]])).tolist()
+    [[0.5], [2.0]]
     """
-    return action_scaler(space)(action)
+    return action_scaler(space, xp)(action)
 
 
-def action_scaler(space: spaces.Space) -> Callable[[np.ndarray], np.ndarray]:
+def action_scaler(space: spaces.Space, xp: Any = np) -> Callable[[Any], Any]:
     """Returns :func:`scale_action` for one space."""
+    if isinstance(space, spaces.Dict | spaces.Tuple):
+        return lambda action: nested_action(space, action, lambda part, numbers: scale_action(part, numbers, xp))
+    shape, dtype = (-1, *(space.shape or ())), space.dtype if xp is np else narrow(space.dtype)
     if isinstance(space, spaces.Box):
-        shape = (-1, *space.shape)
-        if space.dtype == np.float32 and (space.low == -1.0).all() and (space.high == 1.0).all():
-            return lambda action: action.reshape(shape).clip(-1.0, 1.0)
-        low, high = space.low.astype(np.float64), space.high.astype(np.float64)
-        if space.dtype.kind != "f":
-            half, whole = 0.5 * (high - low + 1.0), space.dtype
-            return lambda action: np.floor(low + (action.reshape(shape) + 1.0) * half).clip(low, high).astype(whole)
-        start, half = np.where(bounded(space), low, -1.0), np.where(bounded(space), 0.5 * (high - low), 1.0)
-        dtype = space.dtype
-
-        def scale(action: np.ndarray) -> np.ndarray:
-            return (start + (action.reshape(shape) + 1.0) * half).clip(low, high).astype(dtype)
-
-        return scale
+        return box_scaler(space, shape, dtype, xp)
     if isinstance(space, spaces.Discrete):
         first = int(space.start)
-        return lambda action: action.astype(np.int64) + first
+        return lambda action: action.astype(dtype) + first
     if isinstance(space, spaces.MultiDiscrete):
-        shape, starts, dtype = (-1, *space.nvec.shape), np.broadcast_to(space.start, space.nvec.shape), space.dtype
+        starts = np.broadcast_to(space.start, space.nvec.shape)[None].astype(dtype)
         return lambda action: (action.reshape(shape) + starts).astype(dtype)
     if isinstance(space, spaces.MultiBinary):
-        shape, dtype = (-1, *space.shape), space.dtype
         return lambda action: action.reshape(shape).astype(dtype)
-    if isinstance(space, spaces.Dict | spaces.Tuple):
-        return lambda action: nested_action(space, action, scale_action)
     raise TypeError(f"cannot scale actions of {space}")
+
+
+def box_scaler(space: spaces.Box, shape: tuple[int, ...], dtype: Any, xp: Any) -> Callable[[Any], Any]:
+    """Returns :func:`scale_action` for a Box."""
+    if space.dtype == np.float32 and (space.low == -1.0).all() and (space.high == 1.0).all():
+        return lambda action: action.reshape(shape).clip(-1.0, 1.0)
+    real = np.float64 if xp is np else np.float32
+    low, high = space.low[None].astype(np.float64), space.high[None].astype(np.float64)
+    ends = low.astype(real), high.astype(real)
+    if space.dtype.kind != "f":
+        half = (0.5 * (high - low + 1.0)).astype(real)
+        return lambda action: xp.floor(ends[0] + (action.reshape(shape) + 1.0) * half).clip(*ends).astype(dtype)
+    low, high = np.where(bounded(space), low, -1.0), np.where(bounded(space), high, 1.0)
+    middle, half = (0.5 * (low + high)).astype(real), (0.5 * (high - low)).astype(real)
+    return lambda action: (middle + action.reshape(shape) * half).clip(*ends).astype(dtype)
 
 
 def unscale_action(space: spaces.Space, action: np.ndarray) -> np.ndarray:

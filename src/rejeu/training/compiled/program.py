@@ -353,7 +353,8 @@ def step_envs(program: Program, env: FunctionalEnv, loop: Loop, action: Array, l
     before, step = loop.carry.episodes, loop.carry.counts.step
     assert before.env is not None
     kept = jnp.arange(program.n_envs, dtype=jnp.uint32) < jnp.minimum(limits.last - step, jnp.uint32(program.n_envs))
-    vstate, obs, reward, terminated, truncated, success = step_all(env, before.env, scale(env.action_space, action))
+    taken = spaces.scale_action(env.action_space, action, jnp)
+    vstate, obs, reward, terminated, truncated, success = step_all(env, before.env, taken)
     obs, reward = observed(env, obs), reward.astype(jnp.float32)
     episode_return = before.episode_return + jnp.where(kept, reward, 0.0)
     length = before.length + kept
@@ -389,36 +390,6 @@ def all_finite(*arrays: Array) -> Array:
     """Returns whether all numbers are finite, ``bool[]``."""
     floats = [jnp.isfinite(array).all() for array in arrays if jnp.issubdtype(array.dtype, jnp.floating)]
     return jnp.stack(floats).all() if floats else jnp.bool(True)
-
-
-def scale(space: gym.Space, action: Array) -> Any:
-    """Returns actions in the range of the environment, as :func:`rejeu.core.spaces.scale_action` does on the host.
-
-    Between bounds that are not symmetric about 0, the last bit may differ, because the host computes in 64 bits.
-
-    >>> scale(gym.spaces.Box(-2.0, 2.0, (1,)), jnp.array([[0.25], [3.0]])).tolist()
-    [[0.5], [2.0]]
-    """
-    if isinstance(space, gym.spaces.Box):
-        low, high = space.low.astype(np.float64), space.high.astype(np.float64)
-        action = action.reshape(-1, *space.shape)
-        if space.dtype.kind != "f":
-            levels = jnp.floor(low[None] + (action + 1.0) * (0.5 * (high - low + 1.0))[None])
-            return jnp.clip(levels, low[None], high[None]).astype(jax.dtypes.canonicalize_dtype(space.dtype))
-        bounded = spaces.bounded(space)
-        middle = np.where(bounded, 0.5 * (low + high), 0.0).astype(np.float32)
-        half = np.where(bounded, 0.5 * (high - low), 1.0).astype(np.float32)
-        scaled = jnp.clip(middle[None] + action * half[None], space.low[None], space.high[None])
-        return scaled.astype(jax.dtypes.canonicalize_dtype(space.dtype))
-    if isinstance(space, gym.spaces.Discrete):
-        return action.astype(jnp.int32) + int(space.start)
-    if isinstance(space, gym.spaces.MultiDiscrete):
-        starts = np.broadcast_to(space.start, space.nvec.shape).astype(np.int32)
-        return action.reshape(-1, *space.nvec.shape) + starts[None]
-    if isinstance(space, gym.spaces.Dict | gym.spaces.Tuple):
-        return spaces.nested_action(space, action, scale)
-    assert isinstance(space, gym.spaces.MultiBinary)
-    return action.reshape(-1, *space.shape).astype(jnp.int8)
 
 
 def random_action(space: gym.Space, n: int, key: Array, mask: Array | None = None) -> Array:
