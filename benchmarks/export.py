@@ -13,7 +13,6 @@ from __future__ import annotations
 import sys
 import tempfile
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +23,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from rejeu import load_policy
 from rejeu.agents import Agent, exporting
 from rejeu.core import spaces
-from rejeu.core.errors import CheckpointError
-from rejeu.export import check
+from rejeu.export import FORMATS, check
 from rejeu.export.check import Run
+from rejeu.export.contract import Exportable
 from rejeu.lab.runs.config import versions
 from tests.export.policies import KINDS, agent_of
 from trials.provenance import machine, provenance, write
@@ -62,13 +61,12 @@ def measure(agent: Agent, folder: Path, is_timed: bool) -> dict[str, dict[str, A
     card = exporting.card_of(agent, one, "c", "", None)
     for target in ("onnx", "c", "stablehlo"):
         made = one if target == "c" else exporting.policy_for(agent, False, None)
-        contents, run = exporting.written(made, one, card, target, "policy")
+        source = Exportable(made, one, card, agent.observation_space, agent.action_space)
+        contents, run = FORMATS[target].files(source)
         if run is not None:
             runs[target] = run, len(contents[0])
-    saved = agent.save(folder / "model")
-    acting: dict[str, Any] = {"predict": agent} if is_timed else {}
-    with suppress(CheckpointError):  # images or memory
-        acting["numpy"] = load_policy(saved)
+    saved = agent.export(folder / "policy.npz").path
+    acting: dict[str, Any] = {"numpy": load_policy(saved), **({"predict": agent} if is_timed else {})}
     structure = spaces.structure(agent.observation_space)
     names = [port.name for port in one.of("observation")]
     for target, policy in acting.items():

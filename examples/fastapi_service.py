@@ -1,6 +1,6 @@
-"""A web service that acts with a model file, without JAX.
+"""A web service that acts with an exported policy, without JAX.
 
-MODEL=runs/NAME uvicorn --app-dir examples fastapi_service:app
+MODEL=runs/NAME/policy.npz uvicorn --app-dir examples fastapi_service:app
 curl -X POST localhost:8000/action -H "Content-Type: application/json" -d "[0.0, 0.1, 0.0, -0.1]"
 """
 

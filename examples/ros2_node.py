@@ -1,6 +1,6 @@
-"""A ROS 2 node that acts with a model file, without JAX: observations in, actions out, at a fixed rate.
+"""A ROS 2 node that acts with an exported policy, without JAX: observations in, actions out, at a fixed rate.
 
-    python examples/ros2_node.py --ros-args -p model:=runs/NAME -p seconds_per_step:=0.05
+    python examples/ros2_node.py --ros-args -p model:=runs/NAME/policy.npz -p seconds_per_step:=0.05
 
 It reads ``std_msgs/Float32MultiArray`` from ``observation`` and publishes the same from ``action``. When observations stop
 coming or are wrong it publishes zeros, which should stop the robot; use what does on yours.
@@ -19,7 +19,7 @@ class PolicyNode(Node):
 
     def __init__(self) -> None:
         super().__init__("rejeu_policy")
-        self.declare_parameter("model", "model.safetensors")
+        self.declare_parameter("model", "policy.npz")
         self.declare_parameter("seconds_per_step", 0.05)
         self.seconds = self.get_parameter("seconds_per_step").value
         self.policy = rejeu.load_policy(self.get_parameter("model").value)

@@ -47,7 +47,6 @@ NAMES_ALGORITHMS = {
     "agents.conversion": "what the original's files hold",
     "agents.zip_files": "what the original's files hold",
     "agents.presets": "the default for a kind of action space",
-    "export.numpy_policy": "layers are read by the algorithm's name, until it interprets the traced program",
 }
 """Where names of algorithms may stand as text, and why; elsewhere they come from ``algorithms/catalog.toml``."""
 EXCEPTIONS = PUBLIC_IN_SPITE_OF_ITS_NAME | GYMNASIUM_STATE

@@ -22,6 +22,7 @@ import rejeu
 agent = rejeu.PPO("MlpPolicy", "CartPole-v1", n_steps=128, seed=0).learn(512)
 print(agent.evaluate(episodes=2))
 agent.save("cartpole")
+agent.export("cartpole.npz")
 assert rejeu.load("cartpole").num_timesteps == 512
 """
 
@@ -64,7 +65,7 @@ def try_out(wheel: Path, folder: Path) -> None:
 
 
 def try_without_jax(wheel: Path, folder: Path) -> None:
-    """Does what docs/deployment.md says under "Python without JAX", with a model that the full installation saved."""
+    """Does what docs/deployment.md says under "Python without JAX", with a policy that the full installation exported."""
     venv.create(folder / "light", with_pip=True)
     python = folder / "light" / ("Scripts" if os.name == "nt" else "bin") / "python"
     run(python, "-m", "pip", "install", "-q", "--no-deps", wheel)
@@ -81,9 +82,7 @@ def try_without_jax(wheel: Path, folder: Path) -> None:
         "numpy",
         "safetensors",
     )
-    use = (
-        "import rejeu; policy = rejeu.load_policy('cartpole'); print(policy.predict(policy.observation_space.sample()))"
-    )
+    use = "import rejeu; policy = rejeu.load_policy('cartpole.npz'); print(policy.predict(policy.observation_space.sample()))"
     print(run(python, "-c", use, cwd=folder))
 
 

@@ -55,9 +55,9 @@ if TYPE_CHECKING:
         OrnsteinUhlenbeckActionNoise as OrnsteinUhlenbeckActionNoise,
     )
     from rejeu.exploration.parameter_space import ParameterNoise as ParameterNoise
-    from rejeu.export.numpy_policy import load_policy as load_policy
     from rejeu.lab.experiments.sweep import sweep as sweep
     from rejeu.lab.experiments.tune import tune as tune
+    from rejeu.lab.policies import load_policy as load_policy
     from rejeu.lab.reporting.comparison import compare as compare
     from rejeu.lab.reporting.report import write_report as write_report
     from rejeu.logs import plots as plots
@@ -89,10 +89,10 @@ _MODULES = {
     "rejeu.sb3.common.vec_env.adapters": "to_vec_env",
     "rejeu.envs.wrappers": "FlatGoals OldEnvironment TimeLimitTerminates",
     "rejeu.core.errors": "BadEnvironmentError CheckpointError MissingExtra NonFiniteError RunInUseError WorkerError",
-    "rejeu.export.numpy_policy": "load_policy",
     "rejeu.exploration.noise": "NormalActionNoise OrnsteinUhlenbeckActionNoise",
     "rejeu.exploration.parameter_space": "ParameterNoise",
     "rejeu.logs": "plots",
+    "rejeu.lab.policies": "load_policy",
     "rejeu.lab.reporting.comparison": "compare",
     "rejeu.logs.evaluation": "Evaluation",
     "rejeu.lab.reporting.report": "write_report",

@@ -16,7 +16,7 @@ import rejeu
 from rejeu.algorithms import dqn, iqn, qrdqn
 from rejeu.algorithms.quantile_loss import quantile_huber_loss
 from rejeu.core.algorithm import TD_ERROR, Masked
-from rejeu.export import check
+from rejeu.export import c_file
 from tests.algorithms.test_categorical import by_loops
 from tests.algorithms.test_dqn import (
     ACTION_SPACE,
@@ -342,7 +342,7 @@ def test_all_parts_together_learn_save_and_load(kind, place, tmp_path):
     only_tuples([("IQN", "onnx")], [("C51", "onnx"), ("IQN", "onnx"), ("IQN", "c"), ("C51", "stablehlo")]),
 )
 def test_an_exported_policy_acts_as_predict(kind, suffix, tmp_path):
-    if suffix == "c" and not any(map(shutil.which, check.COMPILERS)):
+    if suffix == "c" and not any(map(shutil.which, c_file.COMPILERS)):
         pytest.skip("there is no C compiler")
     cls = rejeu.IQN if kind == "IQN" else rejeu.DQN
     settings = {"policy_kwargs": {"net_arch": [8]}, "seed": 0, **AGENTS[kind], **EVERY}

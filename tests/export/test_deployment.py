@@ -14,8 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rejeu.agents import exporting
-from rejeu.agents.exporting import SUFFIXES
+from rejeu.export import FORMATS, Format
 from rejeu.lab.cli import main
 from rejeu.networks import Linear
 from tests.export.policies import agent_of, made, observations
@@ -219,10 +218,10 @@ def test_a_folder_that_cannot_be_written_is_one_line(tmp_path, capsys):
 @pytest.mark.parametrize("target", only(["c"], ["c", "onnx", "stablehlo"]))
 def test_a_full_disk_leaves_nothing_new(target, tmp_path, monkeypatch):
     agent, disk = agent_of("PPO", "Box"), FullDisk(monkeypatch)
-    path = tmp_path / f"policy{SUFFIXES[target]}"
+    path = tmp_path / f"policy{FORMATS[target].suffix}"
     path.write_bytes(b"older")
-    run = exporting.written
-    monkeypatch.setattr(exporting, "written", lambda *args: (run(*args)[0], setattr(disk, "full", True)))
+    files = Format.files
+    monkeypatch.setattr(Format, "files", lambda *args: (files(*args)[0], setattr(disk, "full", True)))
     with pytest.raises(OSError, match="free some space") as error:
         agent.export(path)
     assert "\n" not in str(error.value)

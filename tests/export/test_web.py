@@ -13,7 +13,7 @@ import pytest
 import rejeu
 from rejeu.agents import exporting
 from rejeu.export import check, web_file
-from rejeu.export.check import node
+from rejeu.export.web_file import node
 from rejeu.lab.cli import main
 from tests.export.policies import made
 from tests.tiers import only
@@ -150,7 +150,7 @@ def test_the_page_plays(env_id):
 def test_what_a_page_cannot_contain_is_one_line(tmp_path):
     agent = agent_for("CartPole-v1")
     for arguments, message in (
-        ({"noise": True}, "a page contains the deterministic policy"),
+        ({"noise": True}, "web contains the deterministic policy"),
         ({"batch": 2}, "web takes one observation at a time"),
     ):
         with pytest.raises(ValueError, match=message):

@@ -24,7 +24,7 @@ from rejeu.logs.formatting import counted
 from rejeu.logs.logging import Logger, Sink
 
 if TYPE_CHECKING:
-    from rejeu.agents.exporting import Exported, Target
+    from rejeu.agents.exporting import Exported
 
 
 class Agent(BaseAgent):
@@ -211,7 +211,7 @@ class Agent(BaseAgent):
     def export(
         self,
         path: str | Path,
-        to: Target | None = None,
+        to: str | None = None,
         *,
         noise: bool = False,
         batch: int | None = None,
@@ -226,11 +226,11 @@ class Agent(BaseAgent):
 
         Args:
             path: of the file. An older one is replaced only when the new one is complete.
-            to: ``"onnx"``, ``"c"``, ``"stablehlo"`` or ``"web"``; None goes by the suffix: ``.onnx``, ``.c`` (with a header
-                beside it), ``.stablehlo`` or ``.html``. A page contains the environment too, which must be CartPole, Pendulum,
-                MountainCar, MountainCarContinuous, Ball or parking.
+            to: ``"onnx"``, ``"c"``, ``"stablehlo"``, ``"npz"`` or ``"web"``; None goes by the suffix: ``.onnx``, ``.c`` (with
+                a header beside it), ``.stablehlo``, ``.npz`` (for :func:`rejeu.load_policy`) or ``.html``. A page contains the
+                environment too, which must be CartPole, Pendulum, MountainCar, MountainCarContinuous, Ball or parking.
             noise: sample from the policy, with the random numbers as further inputs; else take its mode.
-            batch: observations at once; None for any number. C and pages take one.
+            batch: observations at once; None for any number. C and pages take one, NumPy any number.
             frame_stack: frames of which each observation is a stack, as of ``FrameStackObservation`` or ``VecFrameStack``. The
                 file takes single frames then, and the stack is a part of its state. None for the agent's ``frame_stack``.
 

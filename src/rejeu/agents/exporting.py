@@ -8,7 +8,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from importlib import metadata
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import jax
@@ -20,15 +20,13 @@ from rejeu.core.algorithm import Masked
 from rejeu.envs.make import VectorEnv
 from rejeu.envs.masks import mask_leaf
 from rejeu.envs.registry import maker, register
-from rejeu.export import c_file, check, stablehlo_file, web_file
-from rejeu.export.check import Check, Run, SeenSteps
-from rejeu.export.contract import CARD, FrameStack, Policy, frame_stack_of, policy_of
+from rejeu.export import FORMATS, check, npz_file, target_of
+from rejeu.export.check import Check, SeenSteps
+from rejeu.export.contract import CARD, Exportable, FrameStack, Policy, frame_stack_of, policy_of
+from rejeu.export.numpy_policy import NumpyPolicy
 from rejeu.replay.ring import stacked_leaves
 from rejeu.training import finite
 
-Target = Literal["onnx", "c", "stablehlo", "web"]
-SUFFIXES: dict[str, str] = {"onnx": ".onnx", "c": ".c", "stablehlo": ".stablehlo", "web": ".html"}
-"""Of the file of each format."""
 MOST_SECONDS = 60.0
 """Wall time after which no further observation is recorded, in a slow environment."""
 
@@ -57,26 +55,10 @@ class Exported(NamedTuple):
         return {**self._asdict(), "check": None if self.check is None else self.check._asdict()}
 
 
-def target_of(path: Path, to: str | None) -> str:
-    """Returns the format of a file: ``to``, or that of the suffix of ``path``.
-
-    Raises:
-        ValueError: if there is no such format.
-    """
-    found = to if to is not None else next((key for key, suffix in SUFFIXES.items() if suffix == path.suffix), None)
-    if found not in SUFFIXES:
-        wrong = f"to={to!r}" if to is not None else f"the suffix of {str(path)!r}"
-        raise ValueError(
-            f"{wrong} is no format that a policy can be exported to; there are "
-            + ", ".join(f"{key} ({suffix})" for key, suffix in SUFFIXES.items())
-        )
-    return found
-
-
 def export(
     agent: BaseAgent,
     path: str | Path,
-    to: Target | None,
+    to: str | None,
     noise: bool,
     batch: int | None,
     make_env: Callable[[], Any] | None = None,
@@ -90,20 +72,11 @@ def export(
     """
     path = Path(path)
     target = target_of(path, to)
-    path = path if path.suffix else path.with_suffix(SUFFIXES[target])
-    if isinstance(agent.action_space, gym.spaces.Dict | gym.spaces.Tuple):
-        raise ValueError("policies with Dict or Tuple actions cannot be exported; load the model with rejeu.load")
-    if target == "c" and (not path.stem.isprintable() or {*path.stem} & {*'"\\'}):
-        raise ValueError(f"{path.name!r} cannot be included by a C program; leave out quotes and backslashes")
-    if target == "web" and noise:
-        raise ValueError("noise=True: a page contains the deterministic policy; leave it out")
-    if target in ("c", "web"):
-        if batch not in (None, 1):
-            raise ValueError(f"batch={batch}: {target} takes one observation at a time; leave it out")
-        batch = 1
-    elif batch is not None and (isinstance(batch, bool) or not isinstance(batch, int) or batch < 1):
-        raise ValueError(f"batch={batch!r} must be a number of observations, or None for any number")
-    stack = stack_of(agent, frame_stack)
+    form = FORMATS[target]
+    path = path if path.suffix else path.with_suffix(form.suffix)
+    form.check(target, noise, batch, frame_stack)
+    batch = 1 if form.takes == "one" else batch
+    stack = stack_of(agent, frame_stack) if form.frames else None
     one = policy_for(agent, noise, 1, stack)
     recording, duration, stack = record(agent, one, make_env, stack)
     one = one if stack is None else policy_for(agent, noise, 1, stack)
@@ -111,63 +84,25 @@ def export(
     card = card_of(agent, made, target, source, duration)
     if stack is not None:
         card["frame_stack"] = {"n": stack.n, "padding": "zero" if stack.zeros else "reset"}
-    contents, run = written(made, one, card, target, path.stem, made_from(agent) or (None, {}))
+    about = agent.observation_space, agent.action_space, path.stem, *(made_from(agent) or ())
+    contents, run = form.files(Exportable(made, one, card, *about))
     found = None if run is None else check.compare(one, recording, run)
     if found is not None and not found.difference <= found.allowed:
         raise ValueError(
             f"the {target} file differs from predict by {found.difference:.3g}, more than {found.allowed:.3g}, "
             f"on {found.n} observations ({found.source}), and was not kept; please report this with the model"
         )
-    note = "" if run is not None else f"not checked, because {MISSING[target]} is not installed"
-    about = {**card, "sha256": hashlib.sha256(contents[0]).hexdigest(), "check": found and found._asdict()}
+    note = "" if run is not None else f"not checked, because {form.runner} is not installed"
+    card |= {"sha256": hashlib.sha256(contents[0]).hexdigest(), "check": found and found._asdict()}
     card_path = path.with_name(f"{path.name}.json")
     files = [path, path.with_suffix(".h")][: len(contents)]
-    contents = (*contents, json.dumps(about, indent=1).encode())
+    contents = (*contents, json.dumps(card, indent=1).encode())
     with ExitStack() as opened:  # all of them, or none
         for file, content in zip((*files, card_path), contents, strict=True):
             out = opened.enter_context(atomic.replacing(file))
             out.write(content)
             out.flush()
     return Exported(path, card_path, target, len(contents[0]), found, note)
-
-
-MISSING = {"onnx": "onnxruntime", "c": "a C compiler (cc, gcc or clang)", "stablehlo": "JAX", "web": "Node.js"}
-"""What runs the files of each format."""
-
-
-def written(
-    made: Policy,
-    one: Policy,
-    card: dict[str, Any],
-    target: str,
-    stem: str,
-    origin: tuple[str | None, dict[str, Any]] = (None, {}),
-) -> tuple[tuple[bytes, ...], Run | None]:
-    """Returns the contents of the files of a policy, and the run of the first; None if it cannot be run here.
-
-    Args:
-        made: the policy.
-        one: the same for one observation at a time.
-        card: about it.
-        target: the format.
-        stem: the name of the files without suffix.
-        origin: id and arguments of the environment, for a page.
-    """
-    single = made.batch in (None, 1)
-    if target == "c":
-        c, header = c_file.write(one, card, stem)
-        return (c, header), check.c_run(one, c, header, stem)
-    if target == "web":
-        script = web_file.script(one, web_file.environment(*origin), card)
-        return (web_file.write(script),), check.node_run(one, script)
-    if target == "stablehlo":
-        content = stablehlo_file.write(made, card)
-        again = content if single else stablehlo_file.write(one, card)
-        return (content,), check.one_by_one(one, stablehlo_file.read(again))
-    from rejeu.export import onnx_file  # needs an extra
-
-    content = onnx_file.write(made, card)
-    return (content,), check.onnx_run(one, content if single else onnx_file.write(one, card))
 
 
 def stack_of(agent: BaseAgent, n: int | None) -> FrameStack | None:
@@ -181,11 +116,24 @@ def stack_of(agent: BaseAgent, n: int | None) -> FrameStack | None:
 
 
 def policy_for(agent: BaseAgent, noise: bool, batch: int | None, stack: FrameStack | None = None) -> Policy:
-    """Returns the policy of an agent as a program."""
+    """Returns the policy of an agent as a program.
+
+    Raises:
+        ValueError: if its actions are a Dict or Tuple.
+    """
+    if isinstance(agent.action_space, gym.spaces.Dict | gym.spaces.Tuple):
+        raise ValueError("policies with Dict or Tuple actions cannot be exported; load the model with rejeu.load")
     algorithm = agent.learner.algorithm
     mask = mask_leaf(agent.action_space, "the environment") if agent.takes_masks else None
     actor = jax.tree.map(np.asarray, algorithm.actor(agent.state))
     return policy_of(algorithm, actor, agent.observation_space, agent.action_space, mask, batch, noise, stack)
+
+
+def numpy_policy(agent: BaseAgent, source: str) -> NumpyPolicy:
+    """Returns the policy of an agent in NumPy, without a file; ``source`` is for the card."""
+    policy = policy_for(agent, False, None)
+    card = card_of(agent, policy, "npz", source, None)
+    return npz_file.policy_of(Exportable(policy, policy, card, agent.observation_space, agent.action_space))
 
 
 def card_of(agent: BaseAgent, made: Policy, target: str, source: str, duration: float | None) -> dict[str, Any]:

@@ -5,12 +5,18 @@ from __future__ import annotations
 import json
 import math
 import re
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
 from string import Template
 from typing import Any
 
 import numpy as np
 
-from rejeu.export.contract import Policy, Port
+from rejeu.export.check import Run
+from rejeu.export.contract import Exportable, Policy, Port
 from rejeu.export.loops import TEMPLATES, Language, Printer, indented, memory
 
 TYPES = {
@@ -20,6 +26,7 @@ TYPES = {
     "bool": "uint8_t",
 }
 C = Language("C", TYPES)
+COMPILERS = ("cc", "gcc", "clang")
 TAKEN = frozenset((TEMPLATES / "words.txt").read_text(encoding="utf-8").split())
 """Words of C and C++, and names of the mathematical library, which also have the suffixes f and l there."""
 
@@ -72,6 +79,53 @@ def write(policy: Policy, card: dict[str, Any], stem: str) -> tuple[bytes, bytes
         "sizes": "\n".join(f"#define {upper}_{one.upper()}_SIZE {n}" for one, n in sizes),
     }
     return filled("policy.c", **texts), filled("policy.h", **texts, rejeu=card["rejeu"], weights=card["weights"])
+
+
+def files(source: Exportable) -> tuple[tuple[bytes, ...], Run | None]:
+    """Returns the C file and its header, and the run of both.
+
+    Raises:
+        ValueError: if no program can include a header of this name.
+    """
+    stem = source.stem
+    if not stem.isprintable() or {*stem} & {*'"\\'}:
+        raise ValueError(f"{stem + '.c'!r} cannot be included by a C program; leave out quotes and backslashes")
+    code, header = write(source.one, source.card, stem)
+    return (code, header), c_run(source.one, code, header, stem)
+
+
+def c_run(policy: Policy, source: bytes, header: bytes, stem: str, compiler: str | None = None) -> Run | None:
+    """Returns the run of a C file; None without a compiler.
+
+    Raises:
+        RuntimeError: if it does not compile without warnings.
+    """
+    compiler = compiler or next((one for one in COMPILERS if shutil.which(one)), None)
+    if compiler is None:
+        return None
+
+    def run(inputs: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        with tempfile.TemporaryDirectory() as name:
+            folder = Path(name)
+            (folder / "policy.c").write_bytes(source)  # whose own name may be one that a compiler takes for an option
+            (folder / f"{stem}.h").write_bytes(header)
+            (folder / "main.c").write_bytes(main_of(policy, stem))
+            options = ["-O2", "-std=c99", "-Wall", "-Wextra", "-Werror", "-c", "policy.c"]
+            for arguments in (options, ["-O2", "main.c", "policy.o", "-lm", "-o", "main"]):
+                made = subprocess.run([compiler, *arguments], cwd=folder, capture_output=True, text=True, check=False)
+                if made.returncode:
+                    raise RuntimeError(f"{compiler} does not compile the C file: {made.stderr[:1000]}")
+            given = [port for port in policy.inputs if port.role != "state"]
+            n = len(next(iter(inputs.values())))
+            parts = [np.ascontiguousarray(inputs[p.name].reshape(n, -1), p.dtype).view(np.uint8) for p in given]
+            rows = np.concatenate(parts, axis=1)
+            found = subprocess.run([folder / "main"], input=rows.tobytes(), capture_output=True, check=True).stdout
+        action = policy.outputs[0]
+        made_of = np.dtype([("action", action.dtype, action.shape), ("seconds", "f8")])
+        result = np.frombuffer(found, made_of)
+        return result["action"], result["seconds"]
+
+    return run
 
 
 def main_of(policy: Policy, stem: str) -> bytes:

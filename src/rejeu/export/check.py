@@ -2,21 +2,14 @@
 
 from __future__ import annotations
 
-import json
-import shutil
-import subprocess
-import tempfile
 import time
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
-from rejeu.export.c_file import main_of
 from rejeu.export.contract import Policy
-from rejeu.export.loops import TEMPLATES
 from rejeu.export.program import Value
 
 LARGEST_DIFFERENCE = 1e-5
@@ -28,7 +21,6 @@ in another order."""
 OBSERVATIONS = 1000
 DECISIVE = ("argmax", "floor", "gt")
 """Primitives that make whole numbers of others."""
-COMPILERS = ("cc", "gcc", "clang")
 
 
 class SeenSteps(NamedTuple):
@@ -171,76 +163,3 @@ def one_by_one(policy: Policy, call: Callable[[dict[str, np.ndarray]], Mapping[s
         return np.array(actions), np.array(seconds)
 
     return run
-
-
-def onnx_run(policy: Policy, content: bytes) -> Run | None:
-    """Returns the run of an ONNX model; None without ONNX Runtime."""
-    try:
-        import onnxruntime
-    except ImportError:
-        return None
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = 1
-    session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
-    names = [port.name for port in policy.outputs]
-    return one_by_one(policy, lambda inputs: dict(zip(names, session.run(names, inputs), strict=True)))
-
-
-def c_run(policy: Policy, source: bytes, header: bytes, stem: str, compiler: str | None = None) -> Run | None:
-    """Returns the run of a C file; None without a compiler.
-
-    Raises:
-        RuntimeError: if it does not compile without warnings.
-    """
-    compiler = compiler or next((one for one in COMPILERS if shutil.which(one)), None)
-    if compiler is None:
-        return None
-
-    def run(inputs: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        with tempfile.TemporaryDirectory() as name:
-            folder = Path(name)
-            (folder / "policy.c").write_bytes(source)  # whose own name may be one that a compiler takes for an option
-            (folder / f"{stem}.h").write_bytes(header)
-            (folder / "main.c").write_bytes(main_of(policy, stem))
-            options = ["-O2", "-std=c99", "-Wall", "-Wextra", "-Werror", "-c", "policy.c"]
-            for arguments in (options, ["-O2", "main.c", "policy.o", "-lm", "-o", "main"]):
-                made = subprocess.run([compiler, *arguments], cwd=folder, capture_output=True, text=True, check=False)
-                if made.returncode:
-                    raise RuntimeError(f"{compiler} does not compile the C file: {made.stderr[:1000]}")
-            given = [port for port in policy.inputs if port.role != "state"]
-            n = len(next(iter(inputs.values())))
-            parts = [np.ascontiguousarray(inputs[p.name].reshape(n, -1), p.dtype).view(np.uint8) for p in given]
-            rows = np.concatenate(parts, axis=1)
-            found = subprocess.run([folder / "main"], input=rows.tobytes(), capture_output=True, check=True).stdout
-        action = policy.outputs[0]
-        made_of = np.dtype([("action", action.dtype, action.shape), ("seconds", "f8")])
-        result = np.frombuffer(found, made_of)
-        return result["action"], result["seconds"]
-
-    return run
-
-
-def node_run(policy: Policy, script: str) -> Run | None:
-    """Returns the run of a policy in JavaScript; None without Node.js."""
-    if shutil.which("node") is None:
-        return None
-
-    def run(inputs: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        n = len(next(iter(inputs.values())))
-        given = [port.name for port in policy.inputs if port.role == "observation"]
-        starts = next((inputs[port.name] for port in policy.of("episode_start")), np.zeros(n, bool)).tolist()
-        rows = [([inputs[name][i].ravel().tolist() for name in given], starts[i]) for i in range(n)]
-        actions, seconds = node(script + (TEMPLATES / "node.js").read_text(encoding="utf-8"), rows)
-        action = policy.outputs[0]
-        return np.array(actions, action.dtype).reshape(n, *action.shape), np.array(seconds)
-
-    return run
-
-
-def node(script: str, given: Any) -> Any:
-    """Returns what a script writes as JSON, which reads JSON, both by standard input and output."""
-    with tempfile.TemporaryDirectory() as name:
-        path = Path(name) / "main.js"
-        path.write_text(script, encoding="utf-8")
-        found = subprocess.run(["node", path], input=json.dumps(given), capture_output=True, text=True, check=True)
-    return json.loads(found.stdout)

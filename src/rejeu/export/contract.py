@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, Literal, NamedTuple
 
 import gymnasium as gym
@@ -114,6 +115,29 @@ class Policy(NamedTuple):
         return [port for port in self.inputs if port.role == role]
 
 
+class Exportable(NamedTuple):
+    """What the files of a format are written from."""
+
+    policy: Policy
+    one: Policy
+    """The same for one observation at a time."""
+    card: dict[str, Any]
+    """About it."""
+    observation_space: gym.Space
+    action_space: gym.Space
+    stem: str = "policy"
+    """Name of the files without suffix."""
+    env_id: str | None = None
+    """Of the environment that it was trained on, None if that was given as an object."""
+    env_kwargs: Mapping[str, Any] = MappingProxyType({})
+    """Of this environment."""
+
+    @property
+    def is_general(self) -> bool:
+        """Whether the policy itself takes one observation."""
+        return self.policy.batch in (None, 1)
+
+
 def policy_of(
     algorithm: Algorithm,
     actor: PyTree,
@@ -152,7 +176,7 @@ def policy_of(
         for i in stacked:
             low, high = (np.asarray(stack.newest(i, one)) for one in (parts[i].low, parts[i].high))
             parts[i] = gym.spaces.Box(low, high, dtype=parts[i].dtype)
-    scale = action_scaler(action_space)
+    scale = spaces.action_scaler(action_space, jnp)
 
     def act(obs: list[Array], mask: Array | None, memory: list[Array], start: Any, key: Any) -> list[Array]:
         stacks = [
@@ -223,26 +247,3 @@ def bounds(space: gym.Space) -> tuple[Any, Any]:
         return 0, 1
     start, n = np.asarray(body["start"]), np.asarray(body["n" if kind == "Discrete" else "nvec"])
     return start.tolist(), (start + n - 1).tolist()
-
-
-def action_scaler(space: gym.Space) -> Callable[[Array], Array]:
-    """Returns :func:`rejeu.core.spaces.scale_action` in JAX: float32 instead of double precision, int32 instead of int64."""
-    shape = (-1, *(space.shape or ()))
-    if isinstance(space, gym.spaces.Box):
-        bounded = spaces.bounded(space)
-        low, high = (np.where(bounded, one, one.dtype.type(0)).astype(np.float64) for one in (space.low, space.high))
-        if space.dtype.kind != "f":
-            half, first, dtype = jnp.float32(0.5 * (high - low + 1.0)), jnp.float32(low), spaces.narrow(space.dtype)
-            whole = lambda action: jnp.floor(first[None] + (action.reshape(shape) + 1.0) * half[None])  # noqa: E731
-            return lambda action: jnp.clip(whole(action), first[None], jnp.float32(high)[None]).astype(dtype)
-        half = jnp.float32(np.where(bounded, 0.5 * (high - low), 1.0))
-        middle = jnp.float32(0.5 * (low + high))
-        limits = jnp.float32(space.low)[None], jnp.float32(space.high)[None]
-        return lambda action: jnp.clip(middle[None] + action.reshape(shape) * half[None], *limits)
-    if isinstance(space, gym.spaces.MultiBinary):
-        return lambda action: action.reshape(shape).astype(jnp.int8)
-    assert isinstance(space, gym.spaces.Discrete | gym.spaces.MultiDiscrete)
-    start = np.asarray(
-        space.start if isinstance(space, gym.spaces.Discrete) else np.broadcast_to(space.start, shape[1:])
-    )
-    return lambda action: action.reshape(shape) + jnp.int32(start)[None]

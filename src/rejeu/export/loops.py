@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-import tomllib
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -14,11 +13,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from rejeu.export import PRIMITIVES
 from rejeu.export.program import Operation, TracedProgram, Value, unsupported
 
 TEMPLATES = Path(__file__).parent / "templates"
-PRIMITIVES = tomllib.loads((Path(__file__).parent / "primitives.toml").read_text(encoding="utf-8"))
-"""Primitives of each element by itself, in each format."""
 REDUCTIONS = {
     "reduce_max": "{0} > {1} ? {0} : {1}",
     "reduce_min": "{0} < {1} ? {0} : {1}",

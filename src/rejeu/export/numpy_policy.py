@@ -1,87 +1,198 @@
-"""The deterministic policy of a model file in NumPy, for processes without JAX."""
+"""Exported policies in NumPy: the operations of a traced program, one after the other, in processes without JAX."""
 
 from __future__ import annotations
 
+import io
 import math
-from collections.abc import Callable, Mapping
+import zipfile
+from collections.abc import Callable, Mapping, Sequence
+from itertools import accumulate, pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from gymnasium.spaces import Box, Discrete, MultiBinary, MultiDiscrete
 
-from rejeu.algorithms.catalog import CATALOG
-from rejeu.checkpoints.run_folder import find_model
-from rejeu.core import checkpoint, spaces
+from rejeu.core import spaces
 from rejeu.core.errors import CheckpointError
-from rejeu.core.spaces import Leaf
-from rejeu.core.validation import LARGEST_VALUE, MOST_OUTPUTS, number, whole
+from rejeu.core.records import WRONG, brief, parse_json
+from rejeu.export import PRIMITIVES
 
-Function = Callable[[np.ndarray], np.ndarray]
-GELU = math.sqrt(2 / math.pi)
-ACTIVATIONS: dict[str, Function] = {
-    "relu": lambda x: np.maximum(x, 0.0),
-    "tanh": np.tanh,
-    "elu": lambda x: np.where(x > 0, x, np.expm1(np.minimum(x, 0.0))),
-    "gelu": lambda x: 0.5 * x * (1.0 + np.tanh(GELU * (x + 0.044715 * x * x * x))),
-    "silu": lambda x: x / (1.0 + np.exp(-x)),
-    "leaky_relu": lambda x: np.where(x >= 0, x, 0.01 * x),
-    "leakyrelu": lambda x: np.where(x >= 0, x, 0.01 * x),
-    "sigmoid": lambda x: 1.0 / (1.0 + np.exp(-x)),
+POLICY = "policy"
+"""Name of the array with everything but the constants: JSON in UTF-8."""
+MOST_NUMBERS = 2**26
+"""Upper limit on the numbers that a policy computes for one observation: a damaged file must not exhaust the memory."""
+Params = Mapping[str, Any]
+Function = Callable[..., Any]
+"""Of the number of observations, the primitive's parameters, and its inputs."""
+
+
+def broadcast(n: int, params: Params, x: np.ndarray) -> np.ndarray:
+    """An array that is repeated along axes."""
+    shape = [n if size == -1 else size for size in params["shape"]]
+    sizes = [1] * len(shape)
+    for axis, size in zip(params["broadcast_dimensions"], x.shape, strict=True):
+        sizes[axis] = size
+    return x.reshape(sizes) if sizes == shape else np.broadcast_to(x.reshape(sizes), shape)
+
+
+def product(n: int, params: Params, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """A product of matrices, with any axes."""
+    (left, right), (left_batch, right_batch) = params["dimension_numbers"]
+    if not left_batch and y.ndim == 2 and (left, right) == ([x.ndim - 1], [0]):
+        return (x.reshape(-1, len(y)) @ y).reshape(*x.shape[:-1], y.shape[1])
+    axes, other = [*range(x.ndim)], [*range(x.ndim, x.ndim + y.ndim)]
+    for i, k in zip((*left_batch, *left), (*right_batch, *right), strict=True):
+        other[k] = i
+    free = [i for i in axes if i not in (*left_batch, *left)], [k for k in other if k >= x.ndim]
+    return np.einsum(x, axes, y, other, [*left_batch, *free[0], *free[1]])
+
+
+def sliced(n: int, params: Params, x: np.ndarray) -> np.ndarray:
+    """A part of an array."""
+    ends = (None if end == -1 else end for end in params["limit_indices"])
+    strides = params.get("strides") or [1] * x.ndim
+    return x[tuple(map(slice, params["start_indices"], ends, strides))]
+
+
+def split(n: int, params: Params, x: np.ndarray) -> list[np.ndarray]:
+    """Parts along an axis."""
+    before, ends = (slice(None),) * params["axis"], accumulate(params["sizes"], initial=0)
+    return [x[*before, begin:end] for begin, end in pairwise(ends)]
+
+
+def selected(n: int, params: Params, which: np.ndarray, *cases: np.ndarray) -> np.ndarray:
+    """For each element one of several cases."""
+    return np.where(which, *reversed(cases)) if which.dtype == bool else np.choose(which, cases)
+
+
+def reduction(function: Function) -> Function:
+    """Returns a sum, or the like, over axes."""
+    return lambda n, params, x: function(x, axis=tuple(params["axes"])).astype(x.dtype)
+
+
+def elementwise(function: Function) -> Function:
+    """Returns an operation on each element by itself."""
+    return lambda n, params, *inputs: function(*inputs)
+
+
+def divided(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """A quotient, of integers towards zero."""
+    return x / y if x.dtype.kind == "f" else (x - np.fmod(x, y)) // y
+
+
+ELEMENTWISE: dict[str, Function] = {
+    **{name: elementwise(getattr(np, row["numpy"])) for name, row in PRIMITIVES.items() if "numpy" in row},
+    "div": elementwise(divided),
+    "erf": elementwise(np.vectorize(math.erf, otypes=[np.float32])),
+    "logistic": elementwise(lambda x: 1 / (1 + np.exp(-x))),
+    "select_n": selected,
 }
-WRONG = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
+FUNCTIONS: dict[str, Function] = {
+    **ELEMENTWISE,
+    "argmax": lambda n, params, x: x.argmax(params["axes"][0]).astype(params["index_dtype"]),
+    "broadcast_in_dim": broadcast,
+    "concatenate": lambda n, params, *parts: np.concatenate(parts, params["dimension"]),
+    "convert_element_type": lambda n, params, x: x.astype(params["new_dtype"]),
+    "dot_general": product,
+    **{f"reduce_{name}": reduction(getattr(np, name)) for name in ("max", "min", "sum")},
+    "reshape": lambda n, params, x: x.reshape(params["new_sizes"]),
+    "slice": sliced,
+    "split": split,
+    "squeeze": lambda n, params, x: x.squeeze(tuple(params["dimensions"])),
+    "transpose": lambda n, params, x: x.transpose(params["permutation"]),
+}
+"""Primitives of JAX in NumPy."""
+
+
+def count(name: str, params: Params, inputs: Sequence[np.ndarray]) -> int:
+    """Returns about how many numbers an operation computes, from the shapes of its inputs."""
+    if name == "broadcast_in_dim":
+        return math.prod(map(abs, params["shape"]))
+    if name == "dot_general":
+        (left, _), (batch, _) = params["dimension_numbers"]
+        shared = math.prod(inputs[0].shape[axis] for axis in (*left, *batch))
+        return inputs[0].size * inputs[1].size // max(shared, 1) // 256  # multiplications are cheap
+    if name in ELEMENTWISE:
+        return math.prod(np.broadcast_shapes(*(one.shape for one in inputs)))
+    return sum(one.size for one in inputs)
+
+
+class Step(NamedTuple):
+    """An operation on arrays, which are named by numbers."""
+
+    name: str
+    inputs: list[int]
+    outputs: list[int]
+    params: dict[str, Any]
+
+    def run(self, n: int, known: dict[int, np.ndarray]) -> None:
+        """Adds the outputs for ``n`` observations to the known arrays."""
+        result = FUNCTIONS[self.name](n, self.params, *[known[i] for i in self.inputs])
+        if self.name == "split":
+            known |= zip(self.outputs, result, strict=True)
+        else:
+            known[self.outputs[0]] = result
+
+
+class NumpyProgram:
+    """A traced program that NumPy computes."""
+
+    def __init__(
+        self, description: Mapping[str, Any], constants: Sequence[np.ndarray], examples: Sequence[np.ndarray]
+    ) -> None:
+        """Reads what :func:`rejeu.export.npz_file.described` returns, and computes what depends on constants alone.
+
+        ``examples`` are inputs for one observation.
+
+        Raises:
+            ValueError: if it computes too many numbers for one observation.
+        """
+        self._inputs, self._outputs = description["inputs"], description["outputs"]
+        self._constants, self._steps = dict(enumerate(constants)), []
+        known, left = self._known(examples), MOST_NUMBERS
+        for step in (Step(*one) for one in description["operations"]):
+            left -= count(step.name, step.params, [known[i] for i in step.inputs])
+            if left < 0:
+                raise ValueError(f"it computes more than {MOST_NUMBERS} numbers for one observation")
+            with np.errstate(all="ignore"):
+                step.run(1, known)
+            if self._constants.keys() >= {*step.inputs} and -1 not in step.params.get("shape", ()):
+                self._constants |= {i: known[i] for i in step.outputs}
+            else:
+                self._steps.append(step)
+
+    def __call__(self, n: int, arrays: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """Returns the outputs for ``n`` observations."""
+        known = self._known(arrays)
+        with np.errstate(all="ignore"):
+            for step in self._steps:
+                step.run(n, known)
+        return [known[i] for i in self._outputs]
+
+    def _known(self, arrays: Sequence[np.ndarray]) -> dict[int, np.ndarray]:
+        return self._constants | dict(zip(self._inputs, arrays, strict=True))
 
 
 class NumpyPolicy:
-    """The deterministic policy of an agent with fully connected layers."""
+    """The deterministic policy of an agent."""
 
-    def __init__(self, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray], largest: int) -> None:
-        """Builds the policy from the header and the arrays of a model file."""
-        config, name = header["config"], header["algorithm"]
-        self._name = name
-        self.observation_space = spaces.rebuild(header["observation_space"], largest)
-        self.action_space = spaces.rebuild(header["action_space"], largest)
-        self._leaves = spaces.leaves(self.observation_space)
-        is_normalized = config.get("normalize") is not None
-        self._arrays = {key.rpartition("learner.")[2]: array for key, array in arrays.items()}
-        scaled = self._normalizations(config["normalize"]) if is_normalized else [None] * len(self._leaves)
-        self._encoders = [encoder(leaf, scale) for leaf, scale in zip(self._leaves, scaled, strict=True)]
-        self._shape = config["policy_kwargs"]
-        n_outputs = _count(config, "n_quantiles") if name == "QRDQN" else None
-        prefix = CATALOG[name].actor
-        if config.get("distribution") == "categorical":
-            prefix, n_outputs = "network.outputs", _count(config, "n_atoms")
-        hidden = self._torso(f"{prefix}.torso")
-        if name == "IQN":
-            described = self._described(_count(config, "n_policy_quantiles"))
-            hidden += [lambda x: x[..., None, :] * described, *self._torso("network.reader.torso")]
-            prefix = "network.reader"
-        if f"{prefix}.value_head.weight" in self._arrays and f"{prefix}.advantage_head.weight" in self._arrays:
-            value, advantage = (
-                [*self._layers(f"{prefix}.{part}"), self._linear(f"{prefix}.{part}_head")]
-                for part in ("value", "advantage")
-            )
-            hidden.append(lambda x: joined(applied(value, x), applied(advantage, x), n_outputs or 1))
-        else:
-            hidden.append(self._linear(f"{prefix}.head"))
-        if n_outputs is not None:
-            mean = np.mean if name == "QRDQN" else categorical_mean(config, n_outputs)
-            hidden.append(lambda x: mean(x.reshape(*x.shape[:-1], -1, n_outputs), axis=-1))
-        if name == "IQN":
-            hidden.append(lambda x: x.mean(axis=-2))
-        self._steps = hidden
-        self.takes_masks = config.get("action_masks", name == "MaskablePPO")
-        is_squashed = CATALOG[name].is_squashed or (
-            len(hidden) > 1 if name == "ARS" else self._shape.get("squash_output", False)
+    def __init__(self, content: Mapping[str, Any], constants: Sequence[np.ndarray], largest: int) -> None:
+        """Builds the policy from its description and constants; ``largest`` limits the numbers of a space."""
+        self.card: dict[str, Any] = content["card"]
+        """Where it is from, and what it takes and returns; see ``docs/deployment.md``."""
+        self.observation_space, self.action_space = (
+            spaces.rebuild(content[key], largest) for key in ("observation_space", "action_space")
         )
-        self._choose = chooser(self.action_space, is_squashed)
-        self._scale = spaces.action_scaler(self.action_space)
-        zero = [np.zeros((1, *leaf.shape), leaf.dtype) for leaf in self._leaves]
-        n, width = self._outputs(zero).shape[-1], spaces.leaves(self.action_space)[0].n_features  # wrong shapes raise
-        if n < width if isinstance(self.action_space, Box) else n != width:
-            raise ValueError(f"its network has {n} outputs, expected {width}")
-        if not np.isfinite(self._act(zero, None)).all():
-            raise ValueError("its actions are not finite")
+        roles = [one["role"] for one in self.card["inputs"]]
+        self.takes_masks = "action_mask" in roles
+        self._leaves, self._n_states = spaces.leaves(self.observation_space), roles.count("state")
+        zeros = [np.zeros((1, *one["shape"]), one["dtype"]) for one in self.card["inputs"]]
+        n_leaves = len(self._leaves)
+        self._state = zeros[n_leaves + self.takes_masks :][: self._n_states]
+        self.program = NumpyProgram(content["program"], constants, zeros)
+        action = self.program(1, zeros)[0]
+        if action.shape != (1, *(self.action_space.shape or ())) or not np.isfinite(action).all():
+            raise ValueError("its actions have another shape, or are not finite")
 
     def predict(
         self,
@@ -91,12 +202,12 @@ class NumpyPolicy:
         deterministic: bool = True,
         action_masks: Any = None,
     ) -> tuple[np.ndarray, Any]:
-        """Returns the actions of the agent's ``predict(deterministic=True)``, and ``state``.
+        """Returns the actions of the agent's ``predict(deterministic=True)``, and the state for the next call.
 
         Args:
             observation: one observation, or a batch with a leading axis.
-            state: returned unchanged.
-            episode_start: ignored; there is no memory.
+            state: of a recurrent policy from the last call, None at first; returned unchanged by others.
+            episode_start: where an episode starts, ``bool (batch,)``, for recurrent policies; None: where ``state`` is None.
             deterministic: must be True.
             action_masks: which actions are allowed, ``bool (batch, n)`` or ``(n,)``, if the agent takes them; None allows all.
 
@@ -107,8 +218,23 @@ class NumpyPolicy:
             raise ValueError("a policy in NumPy is deterministic; leave out deterministic=False, or use rejeu.load")
         if action_masks is not None and not self.takes_masks:
             raise ValueError("this policy takes no action_masks")
-        given = spaces.parts(self.observation_space, observation)
-        arrays = [np.asarray(one, leaf.dtype) for one, leaf in zip(given, self._leaves, strict=True)]
+        arrays, is_single = self._batch(observation)
+        n = len(arrays[0])
+        if self.takes_masks:
+            shape = (n, *self.card["inputs"][len(arrays)]["shape"])
+            arrays.append(np.broadcast_to(np.asarray(True if action_masks is None else action_masks, bool), shape))
+        if self._n_states:
+            start = state is None if episode_start is None else episode_start
+            arrays += [np.repeat(one, n, axis=0) for one in self._state] if state is None else state
+            arrays.append(np.broadcast_to(np.asarray(start, bool), n))
+        action, *after = self.program(n, arrays)
+        action = action.astype(self.action_space.dtype)
+        return (action[0] if is_single else action), tuple(after) if self._n_states else state
+
+    def _batch(self, observation: Any) -> tuple[list[np.ndarray], bool]:
+        """Returns the arrays of a batch of observations, and whether it was a single one."""
+        parts = spaces.parts(self.observation_space, observation)
+        arrays = [np.asarray(one, leaf.dtype) for one, leaf in zip(parts, self._leaves, strict=True)]
         is_single = arrays[0].ndim == len(self._leaves[0].shape)
         for array, leaf in zip(arrays, self._leaves, strict=True):
             if array.shape[0 if is_single else 1 :] != leaf.shape:
@@ -116,209 +242,35 @@ class NumpyPolicy:
                 raise ValueError(
                     f"the observation{where} has shape {array.shape}, expected {leaf.shape}, or a batch of it"
                 )
-        action = self._act([one[None] for one in arrays] if is_single else arrays, action_masks)
-        return (action[0] if is_single else action), state
-
-    def _outputs(self, arrays: list[np.ndarray]) -> np.ndarray:
-        parts = [encode(array) for encode, array in zip(self._encoders, arrays, strict=True)]
-        return applied(self._steps, parts[0] if len(parts) == 1 else np.concatenate(parts, axis=-1))
-
-    def _act(self, arrays: list[np.ndarray], masks: Any) -> np.ndarray:
-        x = self._outputs(arrays)
-        if masks is not None:
-            x = np.where(np.asarray(masks, bool), x, np.float32(-1e9))
-        return self._scale(self._choose(x))
-
-    def _normalizations(self, settings: Mapping[str, Any]) -> list[Function | None]:
-        """Returns what normalizes each leaf; None for leaves that are not."""
-        found: list[Function | None] = []
-        for group in spaces.groups(self._leaves, settings["share_goals"]):
-            moments = [self._arrays.get(f"statistics.obs.{group}.{one}") for one in ("mean", "variance", "n_seen")]
-            if group is None or not settings["norm_obs"] or moments[2] is None or moments[2] == 0:
-                found.append(None)
-                continue
-            found.append(standardizer(moments[0], moments[1], settings["epsilon"], settings["clip_obs"]))
-        return found
-
-    def _torso(self, prefix: str) -> list[Function]:
-        """Returns the hidden layers: a stack, branches, SimBa, or FlashSAC's blocks."""
-        if f"{prefix}.embedding.weight" not in self._arrays:
-            parts = (prefix, f"{prefix}.state", f"{prefix}.common", f"{prefix}.last")
-            return [step for part in parts for step in self._layers(part)]
-        embedding, norm = self._linear(f"{prefix}.embedding"), self._norm(f"{prefix}.norm")
-        activation, blocks, i = ACTIVATIONS[self._shape["activation_fn"]], [], 0
-        while f"{prefix}.blocks.{i}.expand.weight" in self._arrays:
-            block = f"{prefix}.blocks.{i}"
-            expand, contract = self._linear(f"{block}.expand"), self._linear(f"{block}.contract")
-            if self._name == "FlashSAC":
-                inner, outer = self._norm(f"{block}.inner"), self._norm(f"{block}.outer")
-                blocks.append(residual([expand, inner, activation, contract, outer, activation]))
-            else:
-                blocks.append(residual([self._norm(f"{block}.norm"), expand, activation, contract]))
-            i += 1
-        if self._name == "FlashSAC":
-            return [norm, embedding, *blocks, self._norm(f"{prefix}.last")]
-        return [embedding, *blocks, norm]
-
-    def _layers(self, prefix: str) -> list[Function]:
-        """Returns a stack of layers; empty if there are none."""
-        steps: list[Function] = []
-        is_renormalized = f"{prefix}.norms.0.n_batches" in self._arrays
-        if is_renormalized:
-            steps.append(self._norm(f"{prefix}.norms.0"))
-        i = 0
-        while f"{prefix}.layers.{i}.weight" in self._arrays:
-            norm = (
-                [self._norm(f"{prefix}.norms.{i + is_renormalized}")]
-                if f"{prefix}.norms.0.scale" in self._arrays
-                else []
-            )
-            activation = [ACTIVATIONS[self._shape["activation_fn"]]]
-            steps += [self._linear(f"{prefix}.layers.{i}")]
-            steps += activation + norm if self._name == "CrossQ" else norm + activation
-            i += 1
-        return steps
-
-    def _described(self, n: int) -> np.ndarray:
-        """Returns what describes the fractions of ``n`` quantiles of IQN, ``(n, n_features)``."""
-        embed = self._linear("network.embedding")
-        frequencies = np.pi * np.arange(len(self._arrays["network.embedding.weight"]), dtype=np.float32)
-        fractions = (np.arange(n, dtype=np.float32) + 0.5) / n
-        return np.maximum(embed(np.cos(fractions[:, None] * frequencies.astype(np.float32))), 0.0).astype(np.float32)
-
-    def _linear(self, prefix: str) -> Function:
-        weight = self._arrays[f"{prefix}.weight"]
-        if CATALOG[self._name].is_projected and not prefix.endswith(".head"):
-            return lambda x: x @ weight
-        bias = self._arrays[f"{prefix}.bias"]
-        return lambda x: x @ weight + bias
-
-    def _norm(self, prefix: str) -> Function:
-        """Returns a layer norm, an RMS norm, or a batch renormalization by its running statistics."""
-        scale = self._arrays[f"{prefix}.scale"]
-        if self._name == "FlashSAC" and prefix.endswith(".last"):
-            return lambda x: x / np.sqrt(np.square(x).mean(axis=-1, keepdims=True) + np.float32(1e-6)) * scale
-        offset = self._arrays[f"{prefix}.offset"]
-        if f"{prefix}.n_batches" in self._arrays:
-            epsilon = np.float32(1e-5 if self._name == "FlashSAC" else 1e-3)
-            factor = scale / np.sqrt(self._arrays[f"{prefix}.variance"] + epsilon)
-            shift = offset - self._arrays[f"{prefix}.mean"] * factor
-            return lambda x: x * factor + shift
-
-        def normalized(x: np.ndarray) -> np.ndarray:
-            centered = x - x.mean(axis=-1, keepdims=True)
-            return (
-                centered / np.sqrt(np.square(centered).mean(axis=-1, keepdims=True) + np.float32(1e-5)) * scale + offset
-            )
-
-        return normalized
+        return [one[None] for one in arrays] if is_single else arrays, is_single
 
 
-def applied(steps: list[Function], x: np.ndarray) -> np.ndarray:
-    """Returns ``x`` after all steps."""
-    for step in steps:
-        x = step(x)
-    return x
+def parse(content: bytes) -> NumpyPolicy:
+    """Returns the policy of the content of a file.
+
+    Raises:
+        ValueError: if it is not valid, or others of :data:`rejeu.core.records.WRONG`.
+    """
+    with zipfile.ZipFile(io.BytesIO(content)) as file:
+        if any(one.compress_type != zipfile.ZIP_STORED for one in file.infolist()):
+            raise ValueError("it is compressed")
+    with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
+        description = parse_json(arrays[POLICY].tobytes())
+        constants = [arrays[f"c{i}"] for i in range(len(arrays.files) - 1)]
+    return NumpyPolicy(description, constants, max(spaces.MAX_NUMBERS, len(content)))
 
 
-def residual(steps: list[Function]) -> Function:
-    """Returns the function that adds the steps' output to its input."""
-    return lambda x: x + applied(steps, x)
-
-
-def joined(value: np.ndarray, advantage: np.ndarray, n: int) -> np.ndarray:
-    """Returns ``V + A - mean A``, for each action ``n`` numbers, ``(batch, n_actions * n)``."""
-    advantages = advantage.reshape(*advantage.shape[:-1], -1, n)
-    return (value[..., None, :] + advantages - advantages.mean(axis=-2, keepdims=True)).reshape(advantage.shape)
-
-
-def _count(config: Mapping[str, Any], key: str) -> int:
-    return whole(key, config[key], least=1, most=MOST_OUTPUTS)
-
-
-def categorical_mean(config: Mapping[str, Any], n: int) -> Callable[..., np.ndarray]:
-    """Returns the function from logits to the means of their distributions."""
-    low, high = (number(key, config[key], least=-LARGEST_VALUE, most=LARGEST_VALUE) for key in ("v_min", "v_max"))
-    atoms = np.linspace(low, high, n, dtype=np.float32)
-
-    def mean(logits: np.ndarray, axis: int) -> np.ndarray:
-        exponential = np.exp(logits - logits.max(axis=axis, keepdims=True))
-        return exponential @ atoms / exponential.sum(axis=axis)
-
-    return mean
-
-
-def standardizer(mean: Any, variance: Any, epsilon: float, limit: float) -> Function:
-    """Returns the function that standardizes observations and clips them to ``limit``."""
-    epsilon, limit = number("epsilon", epsilon, above=0), number("clip_obs", limit, above=0)
-    factor = (1.0 / np.sqrt(variance + np.float32(epsilon))).astype(np.float32)
-    low, high = np.float32(-limit), np.float32(limit)
-    return lambda x: np.minimum(np.maximum((x - mean) * factor, low), high)
-
-
-def encoder(leaf: Leaf, scale: Function | None) -> Function:
-    """Returns the function from a batch of a leaf to its features, ``(batch, leaf.n_features)``."""
-    if leaf.kind == "categorical":
-        pairs = [np.arange(start, start + n) for start, n in zip(leaf.starts, leaf.sizes, strict=True)]
-        hot = lambda x: [x.reshape(len(x), -1)[:, i : i + 1] == values for i, values in enumerate(pairs)]  # noqa: E731
-        return lambda x: np.concatenate(hot(x), axis=-1).astype(np.float32)
-    size = leaf.n_features
-    if leaf.kind == "image":
-        return lambda x: x.reshape(-1, size).astype(np.float32) / np.float32(255.0)
-    if scale is None:
-        return lambda x: x.reshape(-1, size).astype(np.float32)
-    return lambda x: scale(x.astype(np.float32)).reshape(-1, size)
-
-
-def chooser(space: Any, is_squashed: bool) -> Function:
-    """Returns the function from the network's outputs to an action in the range of algorithms."""
-    if isinstance(space, Box):
-        n = math.prod(space.shape)
-        return (lambda x: np.tanh(x[..., :n])) if is_squashed else (lambda x: x[..., :n])
-    if isinstance(space, MultiBinary):
-        return lambda x: x > 0
-    if isinstance(space, MultiDiscrete):
-        ends = np.cumsum(space.nvec.ravel())[:-1]
-        return lambda x: np.stack([part.argmax(axis=-1) for part in np.split(x, ends, axis=-1)], axis=-1)
-    if not isinstance(space, Discrete):
-        raise ValueError("Dict or Tuple actions")
-    return lambda x: x.argmax(axis=-1)
-
-
-def load_policy(path: str | Path) -> NumpyPolicy:
-    """Returns the deterministic policy of a model file, which acts with NumPy alone; JAX is not imported.
-
-    For fully connected networks of every algorithm but RecurrentPPO. No code from the file is run.
-
-    Args:
-        path: of a run folder or a model file; see :func:`rejeu.load`.
+def read(path: Path) -> NumpyPolicy:
+    """Returns the policy of a file that ``rejeu export --to npz`` has written. No code from the file is run.
 
     Raises:
         FileNotFoundError: if there is no such file.
-        CheckpointError: if the file is damaged, or its policy has images, memory or modules of the user's own.
-
-    >>> import rejeu
-    >>> agent = rejeu.SAC("MlpPolicy", "Pendulum-v1", seed=0)
-    >>> path = agent.save("pendulum")
-    >>> action, _ = rejeu.load_policy(path).predict(agent.observation_space.sample())
-    >>> action.shape
-    (1,)
+        CheckpointError: if the file is damaged.
     """
-    to_do = "export it with rejeu export --to onnx"
-    with checkpoint.opened(find_model(path), "agent") as file:
-        name = file.header.get("algorithm")
-        prefix = CATALOG[name].actor if isinstance(name, str) and name in CATALOG else ""
-        prefixes = [f"{before}{prefix}." for before in ("", "learner.", "learner.learner.")]
-        if not prefix or any(key.startswith(f"{one}encoder.") for one in prefixes for key in file.specs):
-            raise CheckpointError(
-                f"{file.path}: the policy of {str(name)[:40]} has images, memory or modules of your own, which NumPy cannot "
-                f"act with; {to_do}"
-            )
-        arrays = {key: array for one in (*prefixes, "statistics.obs.") for key, array in file.read(one).items()}
-        checkpoint.require_finite(arrays, file.path)
-        try:
-            return NumpyPolicy(file.header, arrays, max(spaces.MAX_NUMBERS, file.room))
-        except WRONG as error:
-            raise CheckpointError(
-                f"{file.path}: its policy is damaged, or has other than fully connected layers ({error}); {to_do}"
-            ) from None
+    content = path.read_bytes()
+    try:
+        return parse(content)
+    except (*WRONG, EOFError, zipfile.BadZipFile) as error:
+        raise CheckpointError(
+            f"{path} is damaged, or not written by rejeu export --to npz ({brief(error)}); export the model again"
+        ) from None

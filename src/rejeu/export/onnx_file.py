@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from rejeu.core.errors import MissingExtra
-from rejeu.export.contract import Policy
-from rejeu.export.loops import PRIMITIVES
+from rejeu.export import PRIMITIVES
+from rejeu.export.check import Run, one_by_one
+from rejeu.export.contract import Exportable, Policy
 from rejeu.export.program import Operation, Value, unsupported
 
 try:
@@ -182,6 +183,19 @@ STRUCTURAL: dict[str, Make] = {
 """Primitives that move or combine elements."""
 
 
+def onnx_run(policy: Policy, content: bytes) -> Run | None:
+    """Returns the run of an ONNX model; None without ONNX Runtime."""
+    try:
+        import onnxruntime
+    except ImportError:
+        return None
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+    names = [port.name for port in policy.outputs]
+    return one_by_one(policy, lambda inputs: dict(zip(names, session.run(names, inputs), strict=True)))
+
+
 def write(policy: Policy, card: dict[str, Any]) -> bytes:
     """Returns the model of a policy, with the card in its metadata."""
     graph, program = Graph(), policy.program
@@ -206,3 +220,9 @@ def write(policy: Policy, card: dict[str, Any]) -> bytes:
     helper.set_model_props(model, {"rejeu": json.dumps(card)})
     onnx.checker.check_model(model, full_check=True)
     return model.SerializeToString()
+
+
+def files(source: Exportable) -> tuple[tuple[bytes, ...], Run | None]:
+    """Returns the model, and its run for one observation at a time."""
+    content = write(source.policy, source.card)
+    return (content,), onnx_run(source.one, content if source.is_general else write(source.one, source.card))

@@ -12,7 +12,8 @@ import jax
 import numpy as np
 from jax import Array, ShapeDtypeStruct, export
 
-from rejeu.export.contract import Policy
+from rejeu.export.check import Run, one_by_one
+from rejeu.export.contract import Exportable, Policy
 
 MODULE, EXPORTED, CARD = "module.mlir.bc", "exported.jax", "card.json"
 """Names in the zip file: StableHLO as portable bytecode, the bytes for ``jax.export.deserialize``, the contract."""
@@ -52,3 +53,10 @@ def read(content: bytes) -> Callable[[dict[str, np.ndarray]], dict[str, Array]]:
     with zipfile.ZipFile(io.BytesIO(content)) as file:
         made = export.deserialize(bytearray(file.read(EXPORTED)))
     return jax.jit(made.call)
+
+
+def files(source: Exportable) -> tuple[tuple[bytes, ...], Run]:
+    """Returns the zip file, and its run for one observation at a time."""
+    content = write(source.policy, source.card)
+    single = content if source.is_general else write(source.one, source.card)
+    return (content,), one_by_one(source.one, read(single))

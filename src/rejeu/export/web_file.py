@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
+import subprocess
+import tempfile
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -14,7 +18,8 @@ from jax import Array, ShapeDtypeStruct
 from rejeu.core import spaces
 from rejeu.envs import functional
 from rejeu.envs.functional import FunctionalEnv
-from rejeu.export.contract import Policy
+from rejeu.export.check import Run
+from rejeu.export.contract import Exportable, Policy
 from rejeu.export.loops import TEMPLATES, Language, Printer, indented, memory
 from rejeu.export.program import TracedProgram, trace
 
@@ -90,6 +95,38 @@ def script(policy: Policy, env: FunctionalEnv, card: dict[str, Any]) -> str:
 def write(script: str) -> bytes:
     """Returns the page with a script."""
     return (TEMPLATES / "web.html").read_text(encoding="utf-8").replace("/* script */", script).encode()
+
+
+def files(source: Exportable) -> tuple[tuple[bytes, ...], Run | None]:
+    """Returns the page, and the run of its policy."""
+    code = script(source.one, environment(source.env_id, source.env_kwargs), source.card)
+    return (write(code),), node_run(source.one, code)
+
+
+def node_run(policy: Policy, script: str) -> Run | None:
+    """Returns the run of a policy in JavaScript; None without Node.js."""
+    if shutil.which("node") is None:
+        return None
+
+    def run(inputs: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        n = len(next(iter(inputs.values())))
+        given = [port.name for port in policy.inputs if port.role == "observation"]
+        starts = next((inputs[port.name] for port in policy.of("episode_start")), np.zeros(n, bool)).tolist()
+        rows = [([inputs[name][i].ravel().tolist() for name in given], starts[i]) for i in range(n)]
+        actions, seconds = node(script + (TEMPLATES / "node.js").read_text(encoding="utf-8"), rows)
+        action = policy.outputs[0]
+        return np.array(actions, action.dtype).reshape(n, *action.shape), np.array(seconds)
+
+    return run
+
+
+def node(script: str, given: Any) -> Any:
+    """Returns what a script writes as JSON, which reads JSON, both by standard input and output."""
+    with tempfile.TemporaryDirectory() as name:
+        path = Path(name) / "main.js"
+        path.write_text(script, encoding="utf-8")
+        found = subprocess.run(["node", path], input=json.dumps(given), capture_output=True, text=True, check=True)
+    return json.loads(found.stdout)
 
 
 def draws_of(program: TracedProgram) -> list[tuple[str, int]]:

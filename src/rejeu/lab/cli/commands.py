@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal
 from msgspec import Meta
 
 from rejeu.core.records import MAX_ENVS, Duration, Positive, Seed
+from rejeu.export import FORMATS
 from rejeu.lab.runs.config import MAX_EPISODES, EnvironmentOptions, RunConfig, Shown, Task, Topic
 
 WHICH = "Of a folder: the model that evaluated best in training, or the last."
@@ -270,13 +271,13 @@ class Evaluate(RunOptions):
 
 @dataclass(frozen=True)
 class Export(RunOptions):
-    """Writes the policy of a trained agent to a file that acts without rejeu: ONNX, C, StableHLO or a web page.
+    """Writes the policy of a trained agent to a file that acts without rejeu: ONNX, C, StableHLO, NumPy or a web page.
 
     The file is compared with predict on 1,000 observations before it is kept. Example: rejeu export runs/NAME --to onnx
     """
 
     run: ModelPath
-    to: Annotated[Literal["onnx", "c", "stablehlo", "web"] | None, Shown("{onnx,c,stablehlo,web}")] = None
+    to: Annotated[str | None, Shown(f"{{{','.join(FORMATS)}}}")] = None
     """Format; by default that of the suffix of --out, else onnx."""
     out: Annotated[Path | None, Shown("PATH")] = None
     """File to write, or an existing folder; by default policy.onnx, .c, .stablehlo or .html in the folder of the run, or

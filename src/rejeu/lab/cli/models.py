@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rejeu.agents import load
-from rejeu.agents.exporting import SUFFIXES, export, target_of
+from rejeu.agents.exporting import export
 from rejeu.checkpoints.run_folder import RunFolder, find_model
 from rejeu.core import devices
 from rejeu.core.errors import CheckpointError
+from rejeu.export import FORMATS, target_of
 from rejeu.lab.cli import environment
 from rejeu.lab.cli.commands import Evaluate, Export, Import, Play, Pull, Push, Record, Watch
 from rejeu.lab.cli.output import echo
@@ -60,7 +61,7 @@ def run_export(arguments: Export) -> tuple[int, dict[str, Any]]:
     if out is None or out.is_dir():
         to = to or "onnx"
         beside = model.parent / "policy" if arguments.run.is_dir() else model.with_suffix("")
-        out = (beside if out is None else out / beside.name).with_suffix(SUFFIXES[to])
+        out = (beside if out is None else out / beside.name).with_suffix(FORMATS[target_of(out or beside, to)].suffix)
     target_of(out, to)  # an error before the agent is loaded
     made = None
     try:

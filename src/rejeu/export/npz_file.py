@@ -1,0 +1,81 @@
+"""Programs as arrays of NumPy's ``.npz``, for :func:`rejeu.load_policy`: constants, and the operations in JSON."""
+
+from __future__ import annotations
+
+import io
+import json
+from typing import Any
+
+import numpy as np
+from jax.export import is_symbolic_dim
+
+from rejeu.core import spaces
+from rejeu.export.check import Run, one_by_one
+from rejeu.export.contract import Exportable
+from rejeu.export.numpy_policy import FUNCTIONS, POLICY, NumpyPolicy, parse
+from rejeu.export.program import Operation, TracedProgram, unsupported
+
+
+def described(program: TracedProgram) -> tuple[dict[str, Any], list[np.ndarray]]:
+    """Returns a program in JSON values, and its constants, which have the first numbers.
+
+    Raises:
+        ValueError: if NumPy has no function for one of its operations.
+    """
+    values = [*program.arguments, *(one for step in program.operations for one in (*step.inputs, *step.outputs))]
+    constants = [*dict.fromkeys(one for one in (*values, *program.outputs) if one.data is not None)]
+    numbers = {one: i for i, one in enumerate(dict.fromkeys([*constants, *values]))}
+
+    def listed(values: Any) -> list[int]:
+        return [numbers[one] for one in values]
+
+    steps = [[one.name, listed(one.inputs), listed(one.outputs), parameters(one)] for one in program.operations]
+    description = {"inputs": listed(program.arguments), "operations": steps, "outputs": listed(program.outputs)}
+    return description, [one.data for one in constants if one.data is not None]
+
+
+def parameters(operation: Operation) -> dict[str, Any]:
+    """Returns the parameters of an operation that are JSON values, with -1 for the free size of the batch."""
+    rounding = operation.params.get("rounding_method", 1)
+    if operation.name not in FUNCTIONS or int(rounding) != 1:
+        raise unsupported(operation, "npz")
+    return {key: value for key, one in operation.params.items() if (value := plain(one)) is not None}
+
+
+def plain(param: Any) -> Any:
+    """Returns a parameter as JSON values; None for others."""
+    if isinstance(param, tuple | list):
+        return [plain(one) for one in param]
+    if isinstance(param, np.dtype | type):
+        return np.dtype(param).name
+    if is_symbolic_dim(param):
+        return -1
+    return int(param) if isinstance(param, int | np.integer) else None
+
+
+def content_of(source: Exportable) -> tuple[dict[str, Any], list[np.ndarray]]:
+    """Returns what a file holds: JSON values and constants."""
+    program, constants = described(source.policy.program)
+    observations, actions = map(spaces.describe, (source.observation_space, source.action_space))
+    content = {"card": source.card, "observation_space": observations, "action_space": actions, "program": program}
+    return content, constants
+
+
+def policy_of(source: Exportable) -> NumpyPolicy:
+    """Returns the policy in NumPy, without a file."""
+    return NumpyPolicy(*content_of(source), spaces.MAX_NUMBERS)
+
+
+def files(source: Exportable) -> tuple[tuple[bytes, ...], Run]:
+    """Returns the file, and its run for one observation at a time."""
+    content, constants = content_of(source)
+    text = np.frombuffer(json.dumps(content, allow_nan=False).encode(), np.uint8)
+    file, ports = io.BytesIO(), source.policy.inputs
+    np.savez(file, **{POLICY: text}, **{f"c{i}": one for i, one in enumerate(constants)})  # type: ignore[arg-type]
+    policy = parse(file.getvalue())
+    names = [port.name for port in source.policy.outputs]
+
+    def call(inputs: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        return dict(zip(names, policy.program(1, [inputs[port.name] for port in ports]), strict=True))
+
+    return (file.getvalue(),), one_by_one(source.one, call)
