@@ -124,7 +124,7 @@ def closest(steps: HindsightSteps) -> Any:
     np = steps.np
     times = steps.integers(np.repeat(steps.time[:, None] + 1, N_CANDIDATES, axis=1), steps.last[:, None] + 1)
     difference = steps.achieved(times).astype("float32") - steps.desired().astype("float32")[:, None]
-    distance = np.square(difference).reshape(*times.shape, -1).sum(axis=-1)
+    distance = np.square(difference).sum(axis=tuple(range(2, difference.ndim)))
     return np.take_along_axis(times, distance.argmin(axis=1)[:, None], axis=1)[:, 0]
 
 
