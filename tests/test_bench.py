@@ -2,7 +2,6 @@
 
 import doctest
 import importlib
-import json
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +9,7 @@ import numpy as np
 import pytest
 
 import rejeu
-from benchmarks.bench import __main__ as command, machine, plan, report, runner, summary
+from benchmarks.bench import plan, runner, summary
 from benchmarks.bench.work import buffers
 from benchmarks.bench.work.flops import flops, off_policy, sac_by_hand
 from tests.tiers import exhaustive
@@ -88,78 +87,10 @@ def results():
     }
 
 
-def row_of(text, *cells):
-    """The cells of the first row of a table that begins with ``cells``."""
-    for line in text.splitlines():
-        found = [cell.strip() for cell in line.strip("|").split("|")]
-        if line.startswith("|") and found[: len(cells)] == list(cells):
-            return found
-    raise AssertionError(f"no row {cells} in\n{text}")
-
-
-@exhaustive
-def test_the_page_has_medians_spreads_ratios_of_rounds_and_limits(results, tmp_path):
-    page = tmp_path / "performance.md"
-    report.write(results, page)
-    text = page.read_text(encoding="utf-8")
-    # rejeu 0.10, 0.20, 0.15 ms; sb3 3, 2, 3 ms: its ratios are 30, 10, 20, not 3 / 0.15; sbx 0.3, 1.0, 0.6 ms.
-    # The limit is 10 us and 4 MFLOP at 100 GFLOP/s, 40 us: of 100, 200 and 150 us that is 50, 25 and 33 %.
-    assert row_of(text, "SAC") == [
-        "SAC", "0.15 (0.1 to 0.2)", "3 (2 to 3), 1 thread", "20.0 of 60.0", "0.6 (0.3 to 1), 1 thread", "4.00 of 12.0",
-        "0.05", "0.01", "0.04", "33 %",
-    ]  # fmt: skip
-    assert row_of(text, "QRDQN")[4:6] == ["", ""]  # SBX has none
-    # Of 150 us 20 % are the environment's, 20 us beyond the bare 10; 60 % the update's, 50 beyond the arithmetic's 40.
-    assert row_of(text, "SAC", "20 %") == ["SAC", "20 %", "10 %", "60 %", "10 %", "20", "15", "50", "15"]
-    on_pool = row_of(text, "16", "EnvPool")
-    assert on_pool[2:5] == ["6,667 (5,000 to 10,000)", "333 (333 to 500), 1 thread", "20.0 of 60.0"]
-    assert on_pool[-4:] == ["50", "10", "40", "33 %"]
-    assert row_of(text, "parking-v0: Dict of 3 times 6", "rejeu")[2:5] == ["85", "96", "1.13"]
-    assert row_of(text, "rejeu, EnvPool, 16 environments")[2] == "20.0"
-    assert "A Processor, 2 cores, 8 GiB of memory" in text
-    assert "None" not in text
-    assert "nan" not in text
-
-
-@exhaustive
-def test_the_page_names_what_failed_and_what_was_disturbed(results, tmp_path):
-    results["samples"][0]["others_busy"] = 1.5
-    failed = results["samples"][-1]
-    del failed["result"]
-    failed["error"] = "Traceback"
-    report.write(results, tmp_path / "page.md")
-    text = (tmp_path / "page.md").read_text(encoding="utf-8")
-    assert f"Failed: {failed['key']}" in text
-    assert "cores before 1 of the measurements" in text
-
-
 def test_later_rounds_measure_the_variant_that_was_the_fastest_in_the_first(results):
     of = {(s["round"], s["variant"]) for s in results["samples"] if s["key"] == "steps/TD3/sb3"}
     assert of == {(0, plan.ONE), (0, plan.ALL), (1, plan.ONE), (2, plan.ONE)}
     assert [s["variant"] for s in summary.best(results["samples"], "steps", "TD3", "sb3")] == [plan.ONE] * 3
-
-
-@exhaustive
-def test_samples_are_kept_at_once_and_resumed_and_errors_tried_again(tmp_path):
-    good = plan.Measurement("memory", "parking", "rejeu", "memory", {"library": "rejeu", "kind": "parking", "n": 1000})
-    bad = plan.Measurement("memory", "nonsense", "rejeu", "memory", {"library": "rejeu", "kind": "nonsense", "n": 1000})
-    header = {"settings": {"rounds": 1}, "versions": {}}
-    path = tmp_path / "samples.jsonl"
-    runner.run_all([bad, good], 1, {"rejeu": command.sys.executable}, runner.Samples(path, header, False), tmp_path)
-    kept, failed, measured = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
-    assert kept == header
-    assert "nonsense" in failed["error"]
-    assert measured["result"]["nbytes"] == 89 * 1000  # 85 necessary bytes, and 4 for the steps until the end
-    assert len(measured["calibration_ms"]) == 2
-    again = runner.Samples(path, header, resume=True)
-    assert again.has(good.key, "", 0)
-    assert not again.has(bad.key, "", 0)
-
-
-def test_a_busy_machine_is_refused(monkeypatch, capsys):
-    monkeypatch.setattr(machine, "others_busy", lambda seconds: 1.7)
-    assert command.main(["--cases", "memory", "--libraries", "rejeu"]) == 2
-    assert "other programs use 1.70" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -356,12 +356,6 @@ def test_a_hostile_dataset_is_refused_on_one_line_in_little_time_and_memory(name
     assert len(str(caught.value)) < 1000
 
 
-def test_a_number_of_episodes_asks_for_nothing(tmp_path: Path) -> None:
-    data = plain(tmp_path)
-    change_metadata(data, lambda metadata: metadata.update(total_episodes=10**9, total_steps=10**18))
-    assert len(demonstrations.read(data).episodes) == 2
-
-
 def test_a_dataset_without_spaces_runs_no_code_to_find_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Minari makes the environment of the spec, whose code the file names."""
     (tmp_path / "rejeu_test_evil.py").write_text("raise SystemExit('code of a file was run')")

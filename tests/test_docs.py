@@ -202,12 +202,6 @@ def test_the_plan_of_the_page_on_scaling_is_read(tmp_path):
     assert (len(plan.jobs), plan.resources.cpus) == (40, 2)
 
 
-def test_blocks_are_found_in_the_pages():
-    assert sum(block.language == "python" for page in PAGES for block in blocks(page)) > 20
-    assert len(COMMANDS) > 10
-    assert {*BY_DEFAULT} <= {*PYTHON_PAGES}
-
-
 def script(name):
     """Returns a module of the folder ``scripts``."""
     spec = importlib.util.spec_from_file_location(name, ROOT / "scripts" / f"{name}.py")
@@ -233,22 +227,6 @@ def test_links_to_the_source_name_definitions():
     for page in [*PAGES, ROOT / "CHANGELOG.md"]:
         source_links.resolved(page.read_text(encoding="utf-8"), page.parent, page.parent, errors.append)
     assert not errors
-
-
-def test_a_link_to_a_definition_that_does_not_exist_is_found():
-    source_links, errors = script("source_links"), []
-    link, docs = "[here](../src/rejeu/core/algorithm.py#{})", ROOT / "docs"
-    assert re.fullmatch(
-        r"\[here\]\(https://.*/blob/main/src/rejeu/core/algorithm.py#L\d+-L\d+\)",
-        source_links.resolved(link.format("Algorithm.update"), docs, docs, errors.append),
-    )
-    assert not errors
-    for name in ("Algoritm", "Algorithm.updates", "polyak.nothing"):
-        source_links.resolved(link.format(name), docs, docs, errors.append)
-    source_links.resolved("[here](nowhere.md)", docs, docs, errors.append)
-    code = f"```\n{link.format('nothing')}\n```\n"
-    assert source_links.resolved(code, docs, docs, errors.append) == code
-    assert len(errors) == 4
 
 
 def test_overviews_link_to_every_page():

@@ -51,14 +51,6 @@ def test_the_site_builds_without_warnings_and_needs_no_network(tmp_path):
             assert re.search(r"Copyright.*2026, the rejeu authors", text), page.name
 
 
-def test_the_first_page_names_five_pages_to_read_first():
-    text = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
-    assert "The first five\npages below suffice" in text
-    first = re.findall(r"\((\w[\w-]*)\.md\)", text.split("pages below suffice")[1])[:5]
-    assert first == ["quickstart", "choosing", "own-environment", "training", "troubleshooting"]
-    assert all((ROOT / "docs" / f"{name}.md").exists() for name in first)
-
-
 def documented_names():
     """Returns the names in the API reference."""
     pages = [page.read_text(encoding="utf-8") for page in (ROOT / "docs" / "api").glob("*.rst")]

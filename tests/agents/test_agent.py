@@ -87,14 +87,6 @@ def test_gradient_steps_follow_the_steps_after_learning_starts(n_envs, train_fre
     assert agent.n_updates == sum(calls)
 
 
-def test_learning_that_starts_within_a_step_of_many_environments_counts_only_what_is_beyond():
-    """With 8 environments and learning_starts 4, 4 of the first 8 steps are beyond: one update each."""
-    agent = small_sac(counters(8), learning_starts=4, batch_size=2)
-    calls = count_updates(agent)
-    agent.learn(8)
-    assert sum(calls) == 4
-
-
 @pytest.mark.parametrize(("gradient_steps", "updates"), [(-1, 20), (3, 6)])
 def test_learning_by_episodes_takes_as_many_gradient_steps_as_environment_steps_or_a_number_each(
     gradient_steps, updates
@@ -211,35 +203,6 @@ def test_best_weights_are_kept_from_the_20th_episode_on_whatever_the_window_of_s
     assert (agent.best.by, agent.best.step) == ("training", 50)
 
 
-def test_with_a_window_of_one_the_weights_of_the_best_single_episode_are_kept():
-    agent = small_sac("rejeu/Ball-v0", learning_starts=8, best_window=1)
-    kept = []
-    agent.learn(300, lambda agent, turn: kept.append(agent.best.step) if turn.episodes else None)
-    records = agent.history.records()
-    assert 1 < len(records) < len(agent.history)
-    assert sorted({*kept}) == [episode.step for episode in records]
-    assert agent.best.score == agent.history.best_return == records[-1].episode_return
-
-
-def test_of_episodes_that_end_together_the_best_counts():
-    """The first environment returns twice what the second does, and is booked before it."""
-
-    class Twice(gym.RewardWrapper):
-        def reward(self, reward):
-            return 2 * reward
-
-    agent = small_sac(InProcess([Twice(Counter((2,))), Counter((2,))], seed=0), learning_starts=NEVER, best_window=1)
-    agent.learn(4)
-    assert agent.history["return"].tolist() == [2.0, 1.0]
-    assert agent.best.score == 2.0
-
-
-def test_no_best_weights_yet_says_how_many_episodes_it_takes():
-    agent = small_sac(counters(1), best_window=3)
-    with pytest.raises(ValueError, match="kept after 3 episodes of training"):
-        agent.restore_best()
-
-
 def test_the_best_return_stands_in_every_row_and_records_can_be_printed(capsys):
     agent = small_sac(counters(1, (2,)), learning_starts=NEVER).learn(6, callbacks.print_records)
     assert capsys.readouterr().out.splitlines() == [
@@ -320,14 +283,6 @@ def test_an_observation_of_another_shape_is_refused(agent, obs, words):
         agent.predict(obs)
 
 
-def test_an_observation_without_a_key_is_refused():
-    agent = small_sac(Reach())
-    with pytest.raises(ValueError, match="observation has the structure"):
-        agent.predict({"observation": np.zeros(1), "achieved_goal": np.zeros(1)})
-    with pytest.raises(ValueError, match=r"observation of 'desired_goal' has shape \(2,\)"):
-        agent.predict({"observation": np.zeros(1), "achieved_goal": np.zeros(1), "desired_goal": np.zeros(2)})
-
-
 # Parameters.
 
 
@@ -376,12 +331,6 @@ def test_parameters_that_do_not_fit_leave_the_agent_unchanged(change, words):
 
 
 # Loading and going on.
-
-
-def test_load_on_an_instance_is_an_error_that_shows_the_right_call(agent, tmp_path):
-    path = agent.save(tmp_path / "model")
-    with pytest.raises(TypeError, match=r"agent = SAC.load\(path\).*agent.set_parameters\(path\)"):
-        agent.load(path)
 
 
 def test_another_number_of_environments_starts_an_empty_buffer_and_collects_learning_starts_steps_before_it_learns():
@@ -502,12 +451,3 @@ def test_a_loaded_agent_evaluates_where_it_was_trained(tmp_path):
 )
 def test_a_file_names_no_environment_that_is_imported(said):
     assert model_files.trained_on({"made_from": said}) is None
-
-
-def test_an_agent_of_an_environment_that_was_given_has_none_after_loading(tmp_path):
-    path = small_sac(gym.make("Pendulum-v1")).save(tmp_path / "agent")
-    with pytest.raises(ValueError, match="has no environment; give one"):
-        rejeu.load(path).evaluate(1)
-    (empty := tmp_path / "empty").mkdir()
-    with pytest.raises(FileNotFoundError, match="is a folder without a model"):
-        rejeu.load(empty)

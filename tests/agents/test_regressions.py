@@ -9,21 +9,15 @@ from types import SimpleNamespace
 
 import gymnasium as gym
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import rejeu
 from rejeu.agents import training
-from rejeu.core import algorithm as core, checkpoint, spaces
+from rejeu.core import checkpoint
 from rejeu.envs.make import InProcess
-from rejeu.logs.logging import Console, CsvFile
-from rejeu.replay.ring import Ring
-from rejeu.replay.uniform import ReplayBuffer
-from tests.algorithms.probes.environments import Probe
-from tests.environments import Counter, Sampled
-from tests.every_agent import env_of, every_kind
+from tests.environments import Counter
 from tests.helpers import small_sac
 from tests.tiers import exhaustive
 
@@ -127,84 +121,8 @@ def test_wrappers_change_final_observations_like_all_others(make):
 
 # Targets.
 
-PICTURE = gym.spaces.Box(0, 255, (8, 8, 1), np.uint8)
-
-
-def parameter_names(kind, observation_space):
-    """The names of everything in a state, by the part they belong to: ``{"critics": {...}, "target_critics": {...}}``."""
-    module = kind.agent.algorithm
-    config = module.Config(policy_kwargs={"net_arch": [4]})
-    init = module.make(config, observation_space, env_of(kind).action_space).init
-    found = {}
-    for name in core.names(jax.eval_shape(init, jax.ShapeDtypeStruct((2,), jnp.uint32))):
-        part, _, rest = name.partition(".")
-        found.setdefault(part, set()).add(rest)
-    return found
-
-
-@every_kind
-def test_networks_and_targets_encode_images_each_by_themselves(kind):
-    names = parameter_names(kind, PICTURE)
-    parts = {part for part in names if part.removeprefix("target_") in ("actor", "critic", "critics", "network")}
-    assert len(parts) > 1
-    for part in parts:
-        assert names[part] == names[part.removeprefix("target_")]
-        assert any("encoder.images" in name for name in names[part]), part
-
-
-@every_kind
-def test_optimizers_hold_the_networks_that_learn_and_no_targets(kind):
-    names = parameter_names(kind, Probe.observation_space)
-    optimizers = {part for part in names if part.endswith("optimizer")}
-    learning = {part for part in ("actor", "critic", "critics", "value", "network", "log_alpha") if part in names}
-    assert len(optimizers) == len(learning)
-    for part in learning:
-        optimizer = {"log_alpha": "alpha_optimizer", "network": "optimizer"}.get(part, f"{part}_optimizer")
-        moments = {f"{moment}.{name}".rstrip(".") for moment in ("mu", "nu") for name in names[part]}
-        assert names[optimizer] == moments | {"count"}
-
 
 # Dtypes.
-
-
-def test_every_part_of_a_dict_observation_keeps_its_dtype_and_value():
-    """All numbers are such that a detour through float32 or a narrower integer would change them."""
-    space = gym.spaces.Dict(
-        {
-            "pixels": gym.spaces.Box(0, 255, (2, 2, 1), np.uint8),
-            "small": gym.spaces.Box(-(2**15), 2**15 - 1, (1,), np.int16),
-            "large": gym.spaces.Box(-(2**31), 2**31 - 1, (1,), np.int64),
-            "real": gym.spaces.Box(-1.0, 1.0, (1,), np.float32),
-            "choice": gym.spaces.Discrete(2**24 + 3),
-        }
-    )
-    shown = {
-        "pixels": np.uint8([[[255], [254]], [[1], [0]]]),
-        "small": np.int16([-32767]),
-        "large": np.int64([2**24 + 1]),
-        "real": np.float32([1 / 3]),
-        "choice": np.int64(2**24 + 1),
-    }
-
-    class Exhibition(Sampled):
-        def reset(self, *, seed=None, options=None):
-            super().reset()
-            return shown, {}
-
-        def step(self, action):
-            return shown, *super().step(action)[1:]
-
-    vector = InProcess([Exhibition(space), Exhibition(space)])
-    replay = ReplayBuffer(Ring(20, 2, spaces.leaves(space), spaces.structure(space), (1,), np.float32), 0.9)
-    replay.begin(vector.reset())
-    step = vector.step(np.zeros((2, 1), np.float32))
-    replay.add(np.zeros((2, 1), np.float32), step.reward, step.terminated, step.obs)
-    batch = replay.sample(np.random.default_rng(0), (3,))
-    for obs in (batch.obs, batch.next_obs):
-        kept = {key: obs[key].dtype.name for key in sorted(shown)}
-        assert kept == {"choice": "int32", "large": "int32", "pixels": "uint8", "real": "float32", "small": "int16"}
-        for key, value in shown.items():
-            np.testing.assert_array_equal(obs[key], np.stack([value] * 3), err_msg=key)
 
 
 # Files.
@@ -255,19 +173,6 @@ def test_loading_a_hundred_times_keeps_no_memory(tmp_path):
 # Logging.
 
 
-def test_long_names_that_begin_alike_are_all_logged(tmp_path, capsys):
-    metrics = {f"train/{'very_' * 8}long_name_{i}": 0.25 * i for i in (1, 2, 3)}
-    table = CsvFile(tmp_path / "metrics.csv")
-    table.write(7, metrics)
-    table.close()
-    header, row = (tmp_path / "metrics.csv").read_text().splitlines()
-    assert header.split(",") == ["step", *metrics]
-    assert row.split(",") == ["7", "0.25", "0.5", "0.75"]
-    Console().write(7, metrics)
-    printed = capsys.readouterr().out
-    assert [line.split()[-1] for line in printed.splitlines() if "very" in line] == ["0.25", "0.5", "0.75"]
-
-
 def test_a_clock_that_stands_still_does_not_end_a_run(monkeypatch):
     agent = small_sac(Counter((5,)), learning_starts=NEVER)
     now = time.perf_counter()
@@ -291,10 +196,3 @@ def test_a_run_that_waits_for_one_environment_names_the_call_that_makes_eight(en
     run = SimpleNamespace(env=SimpleNamespace(env_id=env_id, n_envs=n_envs), seconds=seconds)
     training.hint_at_more_environments(SimpleNamespace(run=run, steps_per_second=37.0))
     assert ["rejeu.make_vector('CartPole-v1', n_envs=8)" in str(one.message) for one in recwarn] == [True] * hints
-
-
-def test_the_hint_comes_with_a_row_of_statistics(monkeypatch):
-    given = []
-    monkeypatch.setattr(training, "hint_at_more_environments", given.append)
-    agent = small_sac(Counter(lengths=(2,)), learning_starts=99, verbose=1).learn(9, log_interval=4)
-    assert given == [agent]

@@ -12,6 +12,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
+import tomllib
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -661,107 +662,10 @@ def test_a_schedule_is_its_value_at_the_progress_of_the_clock(pair: tuple[Case, 
     assert differ(followed, other)
 
 
-AGENT, EVERY = "tests/agents/test_agent.py", "tests/algorithms/test_every_algorithm.py"
-NETWORKS, ROLLOUT = "tests/networks/test_networks.py", "tests/replay/test_rollout.py"
-NORMALIZATION, HINDSIGHT = "tests/core/test_normalization.py", "tests/replay/test_hindsight.py"
-PRIORITIZED, PPO = "tests/replay/test_prioritized.py", "tests/algorithms/test_ppo.py"
-RAINBOW = "tests/algorithms/test_rainbow.py"
-FLASHSAC = "tests/algorithms/test_flashsac.py"
-RECURRENT = "tests/algorithms/test_recurrent_ppo.py"
-FORWARD = f"{NETWORKS}::test_forward_passes_equal_numpy"
-UPDATES, TRPO = "tests/algorithms/test_off_policy_updates.py::test_updates_equal_numpy", "tests/algorithms/test_trpo.py"
-A2C = "tests/algorithms/test_a2c.py::test_three_updates_equal_numpy"
 ELSEWHERE = {
-    # Whole updates that equal NumPy's.
-    **dict.fromkeys(("actor_bc", "critic_bc", "target_subset", "top_quantiles_to_drop_per_net", "ent_coef"), UPDATES),
-    **dict.fromkeys(("clip_range", "clip_range_vf"), f"{PPO}::test_two_updates_equal_numpy"),
-    **dict.fromkeys(("vf_coef", "normalize_advantage", "use_rms_prop", "rms_prop_eps"), A2C),
-    "cg_max_steps": f"{TRPO}::test_the_step_is_the_natural_gradient_scaled_to_the_bound",
-    "cg_damping": f"{TRPO}::test_a_step_that_does_not_improve_is_refused",
-    **dict.fromkeys(
-        ("line_search_shrinking_factor", "line_search_max_iter"),
-        f"{TRPO}::test_the_step_is_within_the_bound_and_the_attempt_before_it_was_not",
-    ),
-    "sub_sampling_factor": f"{TRPO}::test_every_so_many_steps_count_for_the_policy",
-    # Loops, buffers and networks.
-    "gamma": f"{AGENT}::test_a_time_limit_still_bootstraps_and_a_termination_does_not",
-    "normalize": f"{NORMALIZATION}::test_every_algorithm_learns_on_scaled_numbers_and_keeps_them_in_its_file",
-    "share_goals": f"{NORMALIZATION}::test_achieved_and_desired_goals_share_their_statistics_unless_told_otherwise",
-    "nonfinite": "tests/training/test_finite.py::test_skipping_an_update_is_as_if_its_batch_had_never_been_given",
-    "policy_kwargs": FORWARD,
-    "buffer_size": "tests/replay/test_uniform.py::test_capacity_is_shared_among_environments",
-    "learning_starts": f"{AGENT}::test_nothing_is_learnt_before_learning_starts",
-    "batch_size": "tests/replay/test_uniform.py::test_a_batch_has_the_shape_that_was_asked_for",
-    "train_freq": f"{AGENT}::test_gradient_steps_follow_the_steps_after_learning_starts",
-    "gradient_steps": f"{AGENT}::test_gradient_steps_follow_the_steps_after_learning_starts",
-    "action_noise": f"{AGENT}::test_action_noise_is_added_and_clipped",
-    "replay_buffer_class": "tests/algorithms/test_config.py::test_a_replay_buffer_is_given_by_class_or_name",
-    "replay_buffer_kwargs": f"{HINDSIGHT}::test_of_every_batch_the_share_k_over_k_plus_one_is_relabelled",
-    "n_steps": "tests/replay/test_uniform.py::test_samples_are_exactly_the_steps_that_are_kept",
-    "priorities": f"{PRIORITIZED}::test_steps_are_drawn_in_proportion_to_their_priorities",
-    "demonstrations": "tests/test_demonstrations.py::test_a_run_with_demonstrations_resumes_equal",
-    "offline": "tests/test_offline.py::test_an_offline_run_steps_no_environment_and_resumes_equal",
-    "demonstration_share": "tests/test_demonstrations.py::test_every_batch_has_its_share",
-    **dict.fromkeys(
-        ("distribution", "v_min", "v_max", "n_atoms"),
-        f"{RAINBOW}::test_the_target_of_c51_is_the_projection_of_the_best_actions_distribution",
-    ),
-    "noisy": f"{RAINBOW}::test_noise_acts_in_training_and_not_in_evaluation",
-    **dict.fromkeys(
-        ("munchausen_alpha", "munchausen_temperature", "munchausen_clip"),
-        f"{RAINBOW}::test_the_munchausen_target_equals_loops",
-    ),
-    **dict.fromkeys(("n_policy_quantiles", "n_cosines"), f"{RAINBOW}::test_the_network_of_iqn_equals_loops"),
-    "n_target_quantiles": f"{RAINBOW}::test_a_target_of_iqn_has_the_quantiles_of_the_best_action",
-    "rnd": "tests/algorithms/test_rnd.py::test_the_bonus_is_the_error_over_its_running_deviation",
-    "sequence_length": "tests/algorithms/test_memory.py::test_the_transitions_of_sequences_are_steps_with_their_successors",
-    "burn_in": "tests/algorithms/test_memory.py::test_burn_in_brings_no_gradient_and_the_rest_does",
-    "expectile": "tests/test_demonstrations.py::test_good_actions_of_iql_weigh_more",
-    "inverse_temperature": "tests/test_demonstrations.py::test_good_actions_of_iql_weigh_more",
-    "frame_stack": "tests/networks/test_images.py::test_sampled_stacks_are_those_that_the_agent_saw",
-    "action_masks": "tests/algorithms/test_action_masks.py::test_what_is_forbidden_is_never_done_and_nothing_becomes_infinite",
-    "overlap": "tests/agents/test_determinism.py::test_actions_follow_the_newest_update_unless_they_overlap_with_it",
-    "renorm_warmup_steps": "tests/networks/test_batch_renorm.py::test_training_equals_numpy_over_warm_up_and_after",
-    "n_episodes": "tests/agents/test_whole_episodes.py::test_every_environment_plays_its_episodes_and_waits_for_the_others",
-    # policy_kwargs
-    **dict.fromkeys(("net_arch", "pi", "qf", "layer_norm", "architecture", "n_blocks", "width"), FORWARD),
-    **dict.fromkeys(("state_layers", "action_layers", "common_layers", "critic_layers", "actor_layers"), FORWARD),
-    "dropout": "tests/algorithms/test_redq.py::test_every_pass_of_an_update_drops_units_of_the_critics",
-    **dict.fromkeys(
-        ("n_bins", "value_limit"), f"{FLASHSAC}::test_an_update_uses_the_equations_in_the_documented_order"
-    ),
-    "noise_repeat": "tests/exploration/test_held_noise.py::test_an_action_is_the_policy_with_noise_that_stays_for_a_spell",
-    "max_return": f"{FLASHSAC}::test_no_scaled_return_exceeds_its_limit",
-    "vf": f"{PPO}::test_policy_and_value_have_the_widths_asked_for",
-    "activation_fn": "tests/networks/test_layers.py::test_activations_equal_their_formulas",
-    **dict.fromkeys(
-        ("cnn_layer_norm", "cnn_features", "normalize_images"),
-        f"{NETWORKS}::test_the_convolutional_encoder_equals_loops",
-    ),
-    **dict.fromkeys(("encoder", "torso", "head"), f"{NETWORKS}::test_an_agent_with_own_modules_learns_and_loads"),
-    **dict.fromkeys(("share_features_extractor", "share_layers"), f"{PPO}::test_only_what_is_shared_is_moved_by_both"),
-    "ortho_init": f"{PPO}::test_without_orthogonal_initialisation_weights_are_uniform",
-    **dict.fromkeys(
-        ("log_std_init", "learn_std"),
-        f"{PPO}::test_a_standard_deviation_that_is_not_learnt_stays_exactly_where_it_began",
-    ),
-    "state_dependent_std": (
-        f"{PPO}::test_a_standard_deviation_by_observation_begins_near_its_initial_value_and_is_bounded"
-    ),
-    "use_expln": "tests/exploration/test_state_dependent.py::test_the_deviation_is_that_of_the_noise",
-    "squash_output": f"{PPO}::test_squashed_actions_lie_within_the_bounds_without_being_clipped",
-    **dict.fromkeys(("lstm_hidden_size", "cell"), f"{RECURRENT}::test_a_cell_follows_its_equations"),
-    "shared_lstm": f"{RECURRENT}::test_a_shared_memory_is_one",
-    # normalize, replay_buffer_kwargs, priorities
-    **dict.fromkeys(("norm_obs", "norm_reward"), f"{NORMALIZATION}::test_either_half_can_be_switched_off"),
-    "clip_obs": f"{NORMALIZATION}::test_observations_are_standardised_and_clipped",
-    "clip_reward": f"{NORMALIZATION}::test_each_reward_of_an_n_step_return_is_clipped_by_itself",
-    "n_sampled_goal": f"{HINDSIGHT}::test_of_every_batch_the_share_k_over_k_plus_one_is_relabelled",
-    "goal_selection_strategy": f"{HINDSIGHT}::test_every_allowed_goal_is_drawn_and_equally_often",
-    "copy_info_dict": f"{HINDSIGHT}::test_impossible_settings_are_refused",
-    "alpha": f"{PRIORITIZED}::test_steps_are_drawn_in_proportion_to_their_priorities",
-    "beta": f"{PRIORITIZED}::test_weights_are_those_of_the_paper_and_anneal",
-    "epsilon": f"{NORMALIZATION}::test_observations_are_standardised_and_clipped",
+    setting: test
+    for test, settings in tomllib.loads(Path(__file__).with_name("settings_elsewhere.toml").read_text("utf-8")).items()
+    for setting in settings
 }
 """By setting, the test of the loop, buffer or network that reads it."""
 

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from scipy import special
 
-import rejeu
 from rejeu.algorithms import trpo
 from rejeu.algorithms.actor_critic.steps import samples
 from tests.algorithms.test_ppo import ACTIONS, CLOCK, LAST_STEP_MISSING, OBS_SPACE, begin, random_rollout
@@ -159,14 +158,3 @@ def test_the_update_counts_its_gradient_steps_and_fits_the_value():
     best = np.linalg.lstsq(inputs, target, rcond=None)[0]
     fitted = np.asarray(after.network.value(data.obs))[keep]
     assert np.mean((fitted - target) ** 2) < 1.1 * np.mean((inputs @ best - target) ** 2) + 1e-3
-
-
-def test_settings_without_meaning_are_unknown():
-    with pytest.raises(TypeError, match="ent_coef"):
-        rejeu.TRPO("MlpPolicy", "CartPole-v1", ent_coef=0.1)
-
-
-def test_a_factor_that_leaves_environments_out_is_warned_of():
-    with pytest.warns(UserWarning, match="takes 2 of 4 environments only"):
-        trpo.warn_of_unused(2, 4)
-    trpo.warn_of_unused(3, 4)

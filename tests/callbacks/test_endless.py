@@ -63,12 +63,6 @@ def test_training_ends_although_no_episode_does(here, capsys, monkeypatch):
     assert read_run("run").state == "finished"
 
 
-def test_the_check_finds_it_however_slow_the_machine_is(here, capsys, monkeypatch):
-    monkeypatch.setattr(checker, "MOST_SECONDS", 0.0)
-    assert main(["check", "endless_env.py"]) == 0
-    assert "no episode ended in 2,000 steps; it declares no time limit" in capsys.readouterr().out
-
-
 class Interrupting(gym.Wrapper):
     """Asks the process to stop at its n-th step, once."""
 
@@ -100,3 +94,9 @@ def test_a_signal_ends_an_evaluation_and_the_resumed_run_repeats_it(tmp_path, at
             [one.evaluation.returns for one in whole.results], [one.evaluation.returns for one in resumed.results]
         )
     assert_same_parameters(agent, again)
+
+
+def test_the_check_finds_it_however_slow_the_machine_is(here, capsys, monkeypatch):
+    monkeypatch.setattr(checker, "MOST_SECONDS", 0.0)
+    assert main(["check", "endless_env.py"]) == 0
+    assert "no episode ended in 2,000 steps; it declares no time limit" in capsys.readouterr().out

@@ -39,15 +39,6 @@ def test_the_hash_gives_its_authors_known_answers():
     assert (hex(int(high)), hex(int(low))) == ("0x6b200159", "0x99ba4efe")
 
 
-def test_wide_numbers_are_those_of_jax():
-    """As in environments in JAX and algorithms that draw in the default dtype with ``jax_enable_x64``."""
-    with jax.enable_x64(True):
-        expected = jax.random.uniform(jax.random.fold_in(jax.random.key(3, impl="threefry2x32"), np.uint32(5)), (7,))
-        found = jax.random.uniform(nth(jax.random.PRNGKey(3), 5), (7,))
-        assert found.dtype == np.float64
-        np.testing.assert_array_equal(found, expected)
-
-
 @pytest.mark.skipif(jax.default_backend() != "cpu", reason="of XLA on CPUs")
 def test_numbers_that_several_kernels_read_are_hashed_once():
     """XLA repeats what is elementwise in each of them; repeated hashes once doubled the time to compile an update."""

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from rejeu.core.errors import CheckpointError
-from rejeu.core.records import Count, EnvCount, Malformed, Seed, convert, parse_json, shown
+from rejeu.core.records import Count, EnvCount, Malformed, Seed, convert, parse_json
 
 
 @pytest.mark.parametrize(
@@ -65,8 +65,3 @@ def test_an_error_says_what_was_received_and_expected(change, message):
     assert str(caught.value) == message
     with pytest.raises(CheckpointError, match=r"^object missing required field `inner`$"):
         convert({}, Record)
-
-
-def test_a_value_is_shown_on_one_short_line():
-    assert shown("a\nb") == "a\\nb"
-    assert len(shown("x" * 1000)) == 100

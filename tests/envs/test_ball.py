@@ -8,8 +8,6 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from scipy.stats import norm
 
-import rejeu
-from rejeu.core.errors import MissingExtra
 from rejeu.envs.functional.ball_drawing import BallDrawing
 from rejeu.teaching.ball import Ball
 from tests.tiers import only
@@ -63,16 +61,6 @@ def test_leaving_costs_in_the_step_that_leaves(start, n_steps, push, after, rest
     found, *others = placed(*start, n_steps=n_steps).step(np.array(push))
     np.testing.assert_array_equal(found, np.float32(after))
     assert tuple(others) == rest
-
-
-def test_holding_for_500_steps_is_a_time_limit_worth_50():
-    ball = Ball(2, sigma=0.0)
-    ball.reset(seed=0)
-    steps = [ball.step(NOTHING) for _ in range(500)]
-    assert [step[1] for step in steps] == [1.0] * 499 + [50.0]
-    assert not any(step[2] for step in steps)
-    assert [step[3] for step in steps] == [False] * 499 + [True]
-    assert steps[-1][4] == {"is_success": True}
 
 
 def over():
@@ -184,76 +172,3 @@ def test_picture_shows_the_ball_where_it_is(dimension):
         0.35 if dimension == 2 else 0.8
     )
     ball.close()
-
-
-def test_pictures_differ_once_the_ball_is_lost():
-    pytest.importorskip("pygame")
-    ball = placed(9.0, 0.0, render_mode="rgb_array")
-    before = ball.render()
-    ball.step(np.array([2.0, 0.0]))
-    after = ball.render()
-    reddish = lambda frame: ((frame[..., 0].astype(int) - frame[..., 2]) > 100).sum()  # noqa: E731
-    assert reddish(after) > reddish(before) + 200
-
-
-def test_window_opens_and_closes_without_a_display(monkeypatch):
-    pytest.importorskip("pygame")
-    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    ball = Ball(1, render_mode="human")
-    ball.reset(seed=0)
-    ball.step(np.zeros(1))
-    assert ball.render() is None
-    ball.close()
-    ball.close()
-
-
-def test_in_three_dimensions_the_third_coordinate_is_drawn_where_it_is():
-    """Only the third coordinate differs: the plane of the first two stays, pixel for pixel, and its own strip changes."""
-    pytest.importorskip("pygame")
-    balls = [placed(1.0, 2.0, third, render_mode="rgb_array") for third in (0.0, -5.0)]
-    middle, low = (ball.render().astype(int) for ball in balls)
-    assert middle.shape[0] % 2 == middle.shape[1] % 2 == 0  # for videos
-    drawing = BallDrawing(3, 500, "rgb_array")
-    plane, (_, second, third) = round(drawing.main.right), drawing.strips
-    assert (middle[:, :plane] == low[:, :plane]).all()
-    assert (middle[: int(second.bottom)] == low[: int(second.bottom)]).all()
-    for frame, height in ((middle, 0.0), (low, -5.0)):  # the strip shows 2.2 beyond the walls at 10
-        x, y = third.place(0.0, height)
-        assert y == pytest.approx(third.bottom - (height / 12.2 + 1) / 2 * (third.bottom - third.top))
-        red, _, blue = frame[round(y), round(x) + 1]
-        assert blue > red + 100
-
-
-def test_a_ball_lost_outside_the_plane_that_is_drawn_is_seen_and_named():
-    pytest.importorskip("pygame")
-    ball = placed(0.0, 0.0, 0.0, 9.5, render_mode="rgb_array")
-    ball.step(np.array([0.0, 0.0, 0.0, 2.0]))
-    assert ball.over
-    ball.render()
-    said = ball._drawing._caption(np.array(ball._trail), ball.n_steps, ball.over, True)
-    assert said == "lost in step 1 by x4"
-
-
-def test_many_dimensions_are_drawn_as_the_first_ten_beside_the_plane():
-    pytest.importorskip("pygame")
-    ball = placed(*[0.0] * 14, render_mode="rgb_array")
-    assert ball.render().shape == (666, 940, 3)
-    drawing = BallDrawing(14, 500, "rgb_array")
-    assert len(drawing.strips) == 10
-    assert drawing.strips[-1].bottom == pytest.approx(drawing.main.bottom)
-
-
-def test_drawing_without_pygame_names_the_extra(monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "pygame", None)
-    with pytest.raises(MissingExtra, match=r'pip install "rejeu\['):
-        placed(0.0, 0.0, render_mode="rgb_array").render()
-
-
-def test_several_balls_make_one_vector_environment():
-    vector = rejeu.make_vector("rejeu/Ball-v0", n_envs=3, backend="auto", seed=0, sigma=2.0)
-    obs = vector.reset()
-    assert vector.backend == "gymnasium"
-    assert vector.max_episode_steps == gym.spec("rejeu/Ball-v0").max_episode_steps == 500
-    assert obs.shape == (3, 2)
-    assert len(np.unique(obs)) == 6
-    vector.close()

@@ -1,6 +1,5 @@
 import numpy as np
 
-from rejeu.logs.evaluation import Evaluation
 from rejeu.logs.formatting import number
 
 
@@ -12,7 +11,3 @@ def test_large_numbers_have_thousands_separators_and_small_ones_four_digits():
         "-1,000",
     ]
     assert [number(x) for x in (999.96, -0.012345, 1e12, -1e30, np.nan)] == ["1000", "-0.01235", "1e+12", "-1e+30", "-"]
-
-
-def test_one_episode_is_not_called_episodes():
-    assert str(Evaluation(np.ones(1), np.ones(1), np.ones(1))).endswith("1 episode")

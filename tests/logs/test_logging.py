@@ -16,7 +16,7 @@ import pytest
 import rejeu
 from rejeu.callbacks import Evaluate
 from rejeu.logs import logging
-from rejeu.logs.logging import CsvFile, JsonLines, check_logs
+from rejeu.logs.logging import CsvFile, JsonLines
 from tests.helpers import small_sac
 from tests.tiers import exhaustive
 
@@ -83,15 +83,6 @@ def test_a_log_larger_than_any_is_not_read(tmp_path, log, monkeypatch):
     with pytest.raises(OSError, match="metrics has more than 0 GiB; move it to another folder, and a new one begins"):
         log(path, up_to=10)
     assert path.stat().st_size == 2**40
-
-
-def test_an_unknown_log_is_an_error_that_lists_the_known_ones():
-    with pytest.raises(
-        ValueError, match="log contains 'wandbb', expected any of 'csv', 'json', 'tensorboard', 'wandb'"
-    ):
-        small_sac(BALL, log=["csv", "wandbb"])
-    assert check_logs("log", "csv") == ("csv",)
-    assert check_logs("log", ["json", "csv", "json"]) == ("json", "csv")
 
 
 def test_each_learn_writes_the_logs_into_a_folder_of_its_own(tmp_path, monkeypatch):

@@ -157,20 +157,6 @@ def test_mlflow_holds_what_the_csv_file_holds():
     assert len(client.list_artifacts(run.info.run_id, "videos")) == 2
 
 
-def test_a_run_that_is_resumed_continues_the_run_in_mlflow():
-    mlflow = pytest.importorskip("mlflow")
-    pytest.importorskip("sqlalchemy")
-    agent, _ = learn("mlflow")
-    agent.learn(50, reset_num_timesteps=False, log_interval=1)
-    client = mlflow.MlflowClient()
-    (run,) = client.search_runs([client.get_experiment_by_name("rejeu").experiment_id])
-    steps = [one.step for one in client.get_metric_history(run.info.run_id, "time/total_timesteps")]
-    assert max(steps) > 100
-    assert steps == sorted(set(steps))
-    agent.learn(50, log_interval=1)  # counts from 0, which is another run
-    assert len(client.search_runs([client.get_experiment_by_name("rejeu").experiment_id])) == 2
-
-
 def test_trackio_holds_what_the_csv_file_holds(tmp_path):
     pytest.importorskip("trackio")
     from trackio.sqlite_storage import SQLiteStorage

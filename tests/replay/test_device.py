@@ -162,14 +162,6 @@ def test_batches_by_priority_equal_those_of_the_host(n_envs: int, n: int, n_step
     assert_same_batches(replay, buffer, False, False)
 
 
-def test_hindsight_batches_by_priority_equal_those_of_the_host() -> None:
-    ring, goals = filled(N_ENVS, 100), goal_functions(Reach(stops=True))
-    assert goals is not None
-    buffer = HerReplayBuffer(ring, 0.9, HindsightConfig(), goals, 1, prioritized(ring))
-    replay = device_replay(N_ENVS, strategy="future", priorities=buffer.priorities.config)
-    assert_same_batches(replay, buffer, True, False)
-
-
 @pytest.mark.parametrize("n", only([60], [5, 60]))
 def test_priorities_of_new_steps_equal_those_of_the_host(n: int) -> None:
     ring = ring_of(N_ENVS)

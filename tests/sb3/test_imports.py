@@ -10,24 +10,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-import rejeu
-from rejeu.logs.video import record_video
 from rejeu.sb3.common.vec_env import DummyVecEnv, VecVideoRecorder
-from rejeu.sb3.common.vec_env.base_vec_env import tile_images
 from tests.logs.test_video import Lamp, decode
-from tests.tiers import exhaustive
-
-
-@exhaustive
-def test_an_agent_is_recorded_on_an_environment_like_its_own(tmp_path):
-    """highway-env's observations are an OrderedDict; the agent was made with a configuration of its own."""
-    import highway_env  # noqa: F401
-
-    env = gym.make("parking-v0", config={"screen_width": 300, "screen_height": 200})
-    agent = rejeu.SAC("MultiInputPolicy", env, policy_kwargs={"net_arch": [8]}, seed=0)
-    frames = decode(record_video(agent, tmp_path / "own", max_steps=3, seed=0)).frames
-    assert frames.shape == (4, 200, 300, 3)
-    assert frames.std() > 10
 
 
 def test_the_core_does_not_import_rejeu_sb3_and_get_env_still_returns_a_vec_env():
@@ -171,29 +155,6 @@ def test_several_environments_are_shown_side_by_side(tmp_path):
     env.step(np.zeros((3, 1)))
     env.close()
     assert decode(tmp_path / "rl-video-step-0-to-step-1.mp4").frames.shape == (2, 66, 102, 3)
-
-
-def test_tiles_fill_row_by_row():
-    pictures = [np.full((1, 1, 3), value, np.uint8) for value in (1, 2, 3)]
-    assert tile_images(pictures)[..., 0].tolist() == [[1, 2], [3, 0]]
-
-
-def test_recorder_hands_on_what_it_does_not_do_itself(tmp_path):
-    env = VecVideoRecorder(lamps(2), tmp_path, lambda step: False)
-    assert env.num_envs == 2
-    assert env.get_attr("closed") == [False, False]
-    assert env.seed(3) == [3, 4]
-    env.reset()
-    assert env.render().shape == (66, 51, 3)
-    assert rejeu.make_vector(env).venv is env
-    env.close()
-    assert env.get_attr("closed") == [True, True]
-    assert os.listdir(tmp_path) == []
-
-
-def test_recorder_needs_environments_that_render(tmp_path):
-    with pytest.raises(ValueError, match="render_mode='rgb_array'"):
-        VecVideoRecorder(DummyVecEnv([Lamp]), tmp_path, lambda step: True)
 
 
 def test_an_error_while_recording_leaves_no_file(tmp_path):

@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from rejeu.sb3.common.monitor import Monitor, monitor_path
+from rejeu.sb3.common.monitor import Monitor
 
 
 class Stairs(gym.Env):
@@ -64,14 +64,6 @@ def test_totals_count_all_episodes():
     assert len(env.get_episode_times()) == 2
 
 
-def test_a_given_up_episode_is_not_counted():
-    env = Monitor(Stairs())
-    env.reset()
-    env.step(0)
-    assert play(env)[2]["episode"]["r"] == 6
-    assert env.get_episode_lengths() == [3]
-
-
 def test_file_has_stable_baselines3_layout(tmp_path):
     # the bytes of Stable-Baselines3 2.9.2's Monitor on this environment, but for the times
     env = Monitor(Stairs(), tmp_path / "run", info_keywords=("is_success", "note"))
@@ -101,22 +93,6 @@ def test_file_is_begun_anew_or_continued(tmp_path):
         assert "t_start" in header
 
 
-def test_missing_info_keyword_is_named():
-    with pytest.raises(ValueError, match="has no 'crash'"):
-        play(Monitor(Stairs(), info_keywords=("crash",)))
-
-
-def test_path_follows_stable_baselines3(tmp_path):
-    assert monitor_path(tmp_path / "a") == tmp_path / "a.monitor.csv"
-    assert monitor_path(tmp_path / "0.monitor.csv") == tmp_path / "0.monitor.csv"
-    assert monitor_path(tmp_path) == tmp_path / "monitor.csv"
-
-
-def test_folders_are_made(tmp_path):
-    Monitor(Stairs(), tmp_path / "x" / "y" / "run")
-    assert (tmp_path / "x" / "y" / "run.monitor.csv").is_file()
-
-
 def test_step_needs_a_running_episode():
     env = Monitor(Stairs())
     with pytest.raises(RuntimeError, match=r"call reset"):
@@ -124,14 +100,6 @@ def test_step_needs_a_running_episode():
     play(env)
     with pytest.raises(RuntimeError, match=r"call reset"):
         env.step(0)
-
-
-def test_early_reset_can_be_forbidden():
-    env = Monitor(Stairs(), allow_early_resets=False)
-    play(env)
-    env.reset()
-    with pytest.raises(RuntimeError, match="allow_early_resets=True"):
-        env.reset()
 
 
 def test_attributes_of_the_environment_stay_in_reach():

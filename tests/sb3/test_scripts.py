@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import os
-import random
 
 import gymnasium as gym
 import numpy as np
@@ -65,20 +63,6 @@ def test_names_stand_where_stable_baselines3_has_them(path):
     for name in PATHS[path]:
         assert hasattr(module, name), name
         assert name in module.__all__
-
-
-def test_seeds_and_schedules():
-    from rejeu.sb3.common.utils import LinearSchedule, get_linear_fn, get_schedule_fn, set_random_seed
-
-    set_random_seed(3)
-    first = random.random(), np.random.get_state()[1].tolist()  # noqa: NPY002
-    set_random_seed(3)
-    assert (random.random(), np.random.get_state()[1].tolist()) == first  # noqa: NPY002
-    agent = sb3.DQN("MlpPolicy", Walk(), learning_rate=get_linear_fn(1e-3, 1e-4, 0.5), policy_kwargs={"net_arch": [4]})
-    assert agent.config.learning_rate == rejeu.Linear(1e-3, 1e-4, 0.5)
-    assert get_linear_fn(1.0, 0.1, 0.5) == LinearSchedule(1.0, 0.1, 0.5)
-    assert [LinearSchedule(1.0, 0.0, 0.5)(x) for x in (1.0, 0.75, 0.5, 0.0)] == [1.0, 0.5, 0.0, 0.0]
-    assert get_schedule_fn(3e-4)(0.5) == 3e-4
 
 
 def count_down(x):
@@ -160,35 +144,3 @@ def test_schedules_of_every_algorithm_follow_the_remaining_progress_of_each_call
             if step % 4 == 0:
                 assert clip == pytest.approx(0.5 * (1 - step / 32), abs=1e-6)
         assert len(clips) >= 28 * is_clipped
-
-
-def test_files_contain_functions_given_as_schedules_as_tables(in_tmp_path):
-    from rejeu.sb3.common.utils import LinearSchedule
-
-    curved = lambda remaining: 1e-3 * float(np.sqrt(remaining)) if remaining > 0.5 else 1e-4  # noqa: E731 - not for JAX
-    sb3.DQN("MlpPolicy", Walk(), learning_rate=curved, policy_kwargs={"net_arch": [4]}).save("code")
-    loaded = sb3.DQN.load("code")
-    for remaining in (1.0, 0.9, 0.6, 0.3, 0.0):
-        assert loaded.learning_rate(remaining) == pytest.approx(curved(remaining))
-        assert float(at(rejeu.load("code").config.learning_rate, np.float32(1 - remaining))) == pytest.approx(
-            curved(remaining), rel=1e-5
-        )
-    assert sb3.DQN("MlpPolicy", Walk(), learning_rate=lambda _: 0.5).learning_rate == 0.5
-    sb3.DQN("MlpPolicy", Walk(), learning_rate=LinearSchedule(1e-3, 0, 1), policy_kwargs={"net_arch": [4]}).save("line")
-    assert rejeu.load("line").config.learning_rate == rejeu.Linear(1e-3, 0.0)
-
-
-def test_recording_goes_through_other_wrappers(in_tmp_path):
-    from rejeu.sb3 import A2C
-    from rejeu.sb3.common.vec_env import DummyVecEnv, VecNormalize, VecVideoRecorder
-
-    vec_env = DummyVecEnv([lambda: gym.make("CartPole-v1", render_mode="rgb_array")])
-    model = A2C("MlpPolicy", vec_env)
-    vec_env = VecVideoRecorder(
-        VecNormalize(vec_env), "logs/videos", record_video_trigger=lambda x: x == 0, video_length=4, name_prefix="agent"
-    )
-    obs = vec_env.reset()
-    for _ in range(5):
-        obs, _, _, _ = vec_env.step(model.predict(obs)[0])
-    vec_env.close()
-    assert os.listdir("logs/videos") == ["agent-step-0-to-step-4.mp4"]

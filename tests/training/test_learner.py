@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, strategies as st
+from hypothesis import given, settings, strategies as st
 
 from rejeu.training import learner
 from rejeu.training.learner import Packing, Readings
@@ -31,6 +31,7 @@ def assert_same(one, two):
         np.testing.assert_array_equal(a, b)
 
 
+@settings(max_examples=12)
 @given(trees(), st.sampled_from([3, 10, learner.LARGE]))
 def test_unpacking_gives_the_tree_back(tree, large):
     with pytest.MonkeyPatch.context() as patch:

@@ -87,21 +87,6 @@ def test_train_takes_the_preset_of_a_file(tmp_path):
     assert (config["hyperparameters"]["n_steps"], config["hyperparameters"]["gamma"]) == (16, 0.9)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--algo", "DQN"], "is for PPO, not for DQN"),
-        (["--preset", "missing.json"], "there is no preset file missing.json; rejeu tune writes one"),
-    ],
-)
-def test_mistakes_with_presets_are_one_line(tmp_path, capsys, options, message):
-    path = presets.write(SMALL, tmp_path / "preset.json")
-    given = [] if "--preset" in options else ["--preset", str(path)]
-    assert cli.main(["train", "CartPole-v1", *given, *options, "--out", str(tmp_path / "run")]) == 2
-    assert message in capsys.readouterr().err
-    assert not (tmp_path / "run").exists()
-
-
 @pytest.mark.usefixtures("untrained")
 @pytest.mark.filterwarnings("default")
 def test_a_preset_of_another_environment_is_used_with_a_warning(tmp_path, capsys):

@@ -1,16 +1,8 @@
-import contextlib
-import dataclasses
-
-import gymnasium as gym
-import numpy as np
 import pytest
 
-import rejeu
 from rejeu import AGENTS
 from rejeu.agents import find_preset, presets
 from rejeu.core import validation
-from rejeu.envs.registry import register
-from tests.tiers import exhaustive
 
 
 @pytest.mark.parametrize("preset", presets.ALL, ids=lambda preset: f"{preset.env_id}-{preset.algorithm}{preset.name}")
@@ -33,15 +25,6 @@ def test_find_returns_the_preset_of_an_environment_and_algorithm_or_none():
 
 def test_every_default_algorithm_exists():
     assert set(presets.ALGORITHM_FOR.values()) <= set(AGENTS)
-
-
-def test_a_preset_cannot_be_changed():
-    preset = presets.find("parking-v0")
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        preset.n_envs = 1
-    with pytest.raises(TypeError):
-        preset.hyperparameters["gamma"] = 0.5
-    assert hash(preset)
 
 
 def test_every_result_has_a_preset_and_every_preset_a_result_or_says_that_it_is_not_tuned():
@@ -72,32 +55,6 @@ def test_sizes_are_presets_of_each_algorithm_and_used_only_by_name():
     assert find_preset("Pendulum-v1", "FlashSAC", "full").hyperparameters == {}
     assert presets.find("HalfCheetah-v5") is None
     assert presets.find("Pendulum-v1", "FlashSAC") is None
-
-
-GOALS = [
-    preset.env_id
-    for preset in presets.ALL
-    if preset.hyperparameters.get("replay_buffer_class") == "HerReplayBuffer" and preset.algorithm == "SAC"
-]
-
-
-@exhaustive
-@pytest.mark.parametrize("env_id", GOALS)
-def test_a_preset_of_a_goal_task_learns_with_the_backend_it_names(env_id):
-    """2,000 steps with updates from step 1,800 on; every weight moves and stays finite."""
-    preset = presets.find(env_id)
-    if not (env_id in gym.registry or register(env_id)):
-        pytest.skip("needs gymnasium-robotics")
-    with contextlib.closing(rejeu.make_vector(env_id, 2, preset.backend, seed=0)) as env:
-        settings = {**preset.hyperparameters, "learning_starts": 1_800, "buffer_size": 2_000}
-        agent = AGENTS[preset.algorithm]("MultiInputPolicy", env, seed=0, **settings)
-        before = agent.get_parameters()
-        agent.learn(2_000)
-        assert agent.num_timesteps == 2_000
-        assert agent.n_updates > 0
-        after = agent.get_parameters()
-        assert all(np.isfinite(value).all() for value in after.values())
-        assert any((after[name] != before[name]).any() for name in before if name.startswith("actor."))
 
 
 def test_a_result_is_of_the_preset_as_it_is_or_of_the_named_one_and_shows_its_interval():

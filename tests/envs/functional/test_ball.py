@@ -58,9 +58,3 @@ def test_the_first_position_is_uniform_in_the_reach_of_a_push():
     assert obs.shape == (2_000, 2)
     assert -2 <= obs.min() < -1.98
     assert 1.98 < obs.max() <= 2
-
-
-@pytest.mark.parametrize("wrong", [{"dimension": 0}, {"sigma": -1.0}, {"sigma": float("inf")}])
-def test_impossible_balls_are_refused(wrong):
-    with pytest.raises(ValueError, match=next(iter(wrong))):
-        make("jax/Ball-v0", **wrong)

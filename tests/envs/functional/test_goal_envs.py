@@ -96,18 +96,6 @@ def test_the_point_never_enters_a_wall_and_reaches_every_cell(layout):
     assert steps < 0.5  # nothing is jumped over
 
 
-def test_every_cell_of_a_maze_can_be_reached_from_every_other():
-    for name in LAYOUTS:
-        free = {tuple(cell) for cell in np.argwhere(~PointMaze(layout=name).walls)}
-        found, border = set(), [min(free)]
-        while border:
-            row, column = border.pop()
-            found.add((row, column))
-            near = {(row + 1, column), (row - 1, column), (row, column + 1), (row, column - 1)}
-            border += (near & free) - found
-        assert found == free, name
-
-
 def test_a_wall_stops_the_point_and_lets_it_slide_along():
     env = PointMaze(layout="u")
     state, _ = env.reset(KEY)
@@ -120,18 +108,3 @@ def test_a_wall_stops_the_point_and_lets_it_slide_along():
     assert state.position[0] > 0.5  # still moving to the right
     assert (float(reward), bool(terminated)) == (-1.0, False)
     np.testing.assert_array_equal(obs["achieved_goal"], state.position)
-
-
-def test_the_goal_of_the_maze_ends_the_episode():
-    env = PointMaze()
-    state, _ = env.reset(KEY)
-    for distance, reached in ((0.44, True), (0.46, False)):
-        near = state._replace(position=state.goal + jnp.array([0.0, distance]), velocity=jnp.zeros(2))
-        near, _, reward, terminated, truncated = env.step(KEY, near, jnp.zeros(2))
-        assert (float(reward), bool(terminated), bool(truncated)) == (float(reached) - 1.0, reached, False)
-        assert bool(env.success(near)) == reached
-
-
-def test_an_unknown_layout_is_refused():
-    with pytest.raises(ValueError, match="layout='tiny' must be one of open, u, medium, large"):
-        PointMaze(layout="tiny")

@@ -1,19 +1,15 @@
 """``rejeu tune`` and ``rejeu resume`` of a study: output, exit status, and mistakes in one line."""
 
 import json
-import re
 import subprocess
 import sys
 
 import pytest
 
 from rejeu.lab import cli
-from rejeu.lab.cli import environment, tune as tune_command
-from rejeu.lab.experiments import process, study as studies, study_plan, sweep, tune as tuning
-from rejeu.lab.runs.config import RunConfig
+from rejeu.lab.experiments import process, sweep
 from tests.lab.experiments.fake_training import Pretended
 
-optuna = pytest.importorskip("optuna")
 SMALL = ["--steps", "40", "--evaluate-every", "10", "--only", "learning_rate", "--search", "learning_rate=1e-5..4e-3"]
 
 
@@ -38,14 +34,6 @@ def test_a_study_from_the_command_line(pretend, tmp_path, capsys):
     assert f"preset        {tmp_path / 'study' / 'preset.json'}" in printed
 
 
-def test_the_final_comparison_is_announced_with_its_length(tmp_path):
-    study = studies.open_study(studies.StudyFolder(tmp_path), study_plan.make("Pendulum-v1", "SAC", steps=40, trials=2))
-    found = "\n".join(tune_command.header(study, environment.Environment("Pendulum-v1", RunConfig(env="Pendulum-v1"))))
-    assert "at the end    the best trial and the default: 5 fresh seeds each, 10 trainings of 40 steps\n" in found
-    ended = studies.Trial(0, "complete", 1.0, {}, {}, 60.0, "")
-    assert tuning.announcement(study.plan, [ended] * 2, 2).endswith("10 trainings of 40 steps, about 5 min 0 s")
-
-
 def test_a_terminal_shows_the_trials_that_run(pretend, tmp_path, capsys, monkeypatch):
     from rich.console import Console
 
@@ -61,72 +49,6 @@ def test_a_terminal_shows_the_trials_that_run(pretend, tmp_path, capsys, monkeyp
     assert "trial   1  complete" in printed
 
 
-def test_result_as_json_and_continuation(pretend, tmp_path, capsys):
-    assert tune("--trials", "2", "--final-seeds", "0", "--json", out=tmp_path / "study") == 0
-    first = json.loads(capsys.readouterr().out)
-    assert [one["state"] for one in first["trials"]] == ["complete"] * 2
-    assert (first["complete"], first["signal"], first["verdict"]) == (True, None, None)
-    assert tune("--trials", "3", "--final-seeds", "0", "--json", out=tmp_path / "study") == 0
-    second = json.loads(capsys.readouterr().out)
-    assert second["trials"][:2] == first["trials"]
-    assert cli.main(["resume", str(tmp_path / "study"), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == second
-
-
-def test_a_study_without_a_complete_trial_exits_with_2(pretend, tmp_path, capsys):
-    words = ["--trials", "2", "--search", "learning_rate=6e-3..1e-2"]
-    assert tune(*words, out=tmp_path / "study") == 2
-    printed = capsys.readouterr().out
-    assert "trials        2 failed" in printed
-    assert "best trial    none: no trial is complete" in printed
-    assert "the loss is NaN" in printed
-
-
-def test_a_study_of_which_a_trial_cannot_be_started_goes_on_later(pretend, tmp_path, monkeypatch, capsys):
-    words, start, n_started = ["--trials", "2", "--final-seeds", "0", "--workers", "1"], process.LocalLauncher.start, 0
-
-    def full(self, task, log, lock):
-        nonlocal n_started
-        n_started += 1
-        if n_started > 1:
-            raise OSError(28, "No space left on device")
-        return start(self, task, log, lock)
-
-    monkeypatch.setattr(process.LocalLauncher, "start", full)
-    assert tune(*words, out=tmp_path / "study") == 1
-    printed = capsys.readouterr().out
-    assert "trials        1 complete, 1 running" in printed
-    assert re.search(r"note +trial 0001, seed \d+ could not be started: \[Errno 28\] No space left on device", printed)
-    monkeypatch.setattr(process.LocalLauncher, "start", start)
-    assert tune(*words, out=tmp_path / "study") == 0
-    assert "trials        2 complete" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["tune", "Pendulum-v1", "--algo", "SACK"], "no algorithm is called 'SACK'; did you mean SAC?"),
-        (["tune", "Blackjack-v1"], "Blackjack-v1 has no preset; name the algorithm to tune, such as --algo PPO"),
-        (["tune", "Pendulum-v9", "--algo", "SAC"], "Pendulum"),
-        (["tune", "Pendulum-v1", "--only", "gama"], "has no setting 'gama'; did you mean gamma?"),
-        (["tune", "Pendulum-v1", "--search", "gamma=0.9..0.8"], "--search gamma: the range from 0.9 to 0.8 is empty"),
-        (
-            ["tune", "Pendulum-v1", "--search", "tau=0.1..7.0"],
-            "tau=7.0 must be a finite number, at least 0 and at most 1",
-        ),
-        (["tune", "Pendulum-v1", "--pruner", "x"], "--pruner 'x' must be one of median, halving, none"),
-        (["tune", "Pendulum-v1", "--preset", "missing.json"], "there is no preset file missing.json"),
-    ],
-)
-def test_mistakes_are_one_line_and_make_no_folder(tmp_path, monkeypatch, capsys, words, message):
-    monkeypatch.chdir(tmp_path)
-    assert cli.main(words) == 2
-    error = capsys.readouterr().err
-    assert message in error
-    assert error.strip().count("\n") == 0
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_folders_of_other_studies_are_one_line(pretend, tmp_path, capsys):
     assert tune("--trials", "1", "--final-seeds", "0", out=tmp_path / "study") == 0
     assert cli.main(["tune", "MountainCarContinuous-v0", "--algo", "SAC", "--out", str(tmp_path / "study")]) == 2
@@ -138,13 +60,6 @@ def test_folders_of_other_studies_are_one_line(pretend, tmp_path, capsys):
     (tmp_path / "study" / "journal.log").write_bytes(b"\xff\xff\n" * 5)
     assert cli.main(["resume", str(tmp_path / "study")]) == 2
     assert "journal.log is damaged" in capsys.readouterr().err
-
-
-def test_a_missing_package_is_one_line(monkeypatch, tmp_path, capsys):
-    monkeypatch.setitem(sys.modules, "optuna", None)
-    assert tune(out=tmp_path / "study") == 2
-    assert 'rejeu tune needs optuna, which is not installed; run: pip install "rejeu[tune]"' in capsys.readouterr().err
-    assert not (tmp_path / "study").exists()
 
 
 REAL = ["tune", "CartPole-v1", "--algo", "PPO", "--envs", "4", "--backend", "gymnasium", "--evaluate-episodes", "5"]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import numpy as np
 import pytest
 
@@ -30,40 +28,6 @@ def test_one_coordinate_is_drawn_against_steps(shape):
     np.testing.assert_array_equal(y, points.ravel())
     walls = {line.get_ydata()[0] for line in panel.lines if len(line.get_xdata()) == 2}
     assert walls == {-20, 20}
-
-
-def test_long_names_of_coordinates_stay_next_to_their_panels():
-    names = ["cart position, m", "cart velocity, m/s", "pole angle, rad", "pole angular velocity, rad/s"]
-    figure = plots.trajectory(random_course(4), names=names)
-    figure.draw_without_rendering()
-    boxes = [panel.yaxis.label.get_window_extent() for panel in figure.axes[1:]]
-    assert all(above.y0 >= below.y1 for above, below in pairwise(boxes))
-
-
-def test_two_coordinates_are_drawn_as_a_plane_with_the_box():
-    points = random_course(2)
-    (panel,) = plots.trajectory(points, low=[-9, -8], high=[7, 6]).axes
-    x, y = course(panel)
-    np.testing.assert_array_equal(np.stack([x, y], axis=1), points)
-    (box,) = panel.patches
-    assert box.get_bbox().extents.tolist() == [-9, -8, 7, 6]
-
-
-@pytest.mark.parametrize(("dimension", "shown"), [(3, 3), (14, 10)])
-def test_more_coordinates_are_drawn_as_the_plane_of_the_first_two_beside_each_against_steps(dimension, shown):
-    points = random_course(dimension)
-    plane, *panels = plots.trajectory(points).axes
-    np.testing.assert_array_equal(np.stack(course(plane), axis=1), points[:, :2])
-    assert len(panels) == shown
-    for i, panel in enumerate(panels):
-        np.testing.assert_array_equal(course(panel)[1], points[:, i])
-    assert ("the first 10 of 14" in panels[-1].get_xlabel()) == (dimension == 14)
-
-
-def test_infinite_bounds_are_not_drawn():
-    (panel,) = plots.trajectory(random_course(2), low=-np.inf, high=np.inf).axes
-    assert not panel.patches
-    assert np.isfinite(panel.get_xlim()).all()
 
 
 def test_the_ball_draws_its_own_trajectory_where_it_left_included(tmp_path):

@@ -110,24 +110,6 @@ def test_zip_files_are_models_and_a_run_folder_is_one_entrant(entrants):
     assert model["name"] == "ben"
 
 
-def test_a_leaderboard_in_french_which_the_setting_asks_for(folder, tmp_path, monkeypatch, capsys):
-    monkeypatch.setenv("REJEU_LANGUAGE", "fr")
-    text = run(folder, tmp_path / "board.md")
-    out = capsys.readouterr().out
-    assert out.startswith("CartPole-v1, 3 épisodes pour chacun des 6 modèles\nanna : retour moyen ")
-    assert "\ncut : le fichier est endommagé" in out
-    assert "| place | modèle | algorithme | pas | graine | retour moyen |" in text
-    assert "| 1 à 2 | anna | DQN | 0 | 0 |" in text
-    assert "il a été entraîné sur MountainCar-v0, et non sur CartPole-v1" in text
-    broken = "le fichier est endommagé, ou ce n'est pas un modèle que rejeu peut évaluer"
-    assert [line.split(": ")[1] for line in text.splitlines() if line.startswith(("- cut", "- empty", "- flip"))] == (
-        [broken] * 3
-    )
-    monkeypatch.setenv("REJEU_LANGUAGE", "de")
-    assert main(["class", str(folder)]) == 2
-    assert "language 'de' must be one of en, fr" in capsys.readouterr().err
-
-
 def test_names_are_escaped_in_the_page_and_in_markdown(folder, tmp_path):
     pytest.importorskip("jinja2")
     html = run(folder, tmp_path / "board.html", "--language", "fr")
@@ -155,35 +137,6 @@ def test_success_is_not_what_the_author_of_a_file_calls_so(tmp_path):
     for options, rate in (((), 0.0), (("--success-threshold", "1"), 1.0)):
         (model,) = run(tmp_path, tmp_path / "board.json", *options)["models"]
         assert (model["success_rate"], model["seed"], model["steps"]) == (rate, 0, 0)
-
-
-def test_a_page_without_models_says_so(folder):
-    pytest.importorskip("jinja2")
-    page = leaderboard.page(leaderboard.Leaderboard("CartPole-v1", 1, (), (("anna", "damaged"),)))
-    assert "No model could be evaluated." in page
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (("--out", "board.txt"), "--out board.txt must end in .html, .md, .json"),
-        (("--episodes", "0"), "episodes"),
-        (("--minutes", "0"), "minutes"),
-        (("--env", "CartPol-v1"), "CartPole"),
-    ],
-)
-def test_invalid_options_give_one_line(folder, options, message, capsys):
-    assert main(["class", str(folder), *options]) == 2
-    err = capsys.readouterr().err
-    assert message in err
-    assert len(err.splitlines()) == 1
-
-
-def test_a_folder_without_models_gives_one_line(tmp_path, capsys):
-    assert main(["class", str(tmp_path)]) == 2
-    assert "holds no .safetensors or .zip files" in capsys.readouterr().err
-    assert main(["class", str(tmp_path / "missing")]) == 2
-    assert "there is no folder" in capsys.readouterr().err
 
 
 def test_large_files_and_symbolic_links_are_not_opened(tmp_path, monkeypatch, capsys):
