@@ -84,10 +84,10 @@ def follow(studio: Studio, show: Callable[[], object], every: float = EVERY) -> 
     ui.timer(every, look)
 
 
-def address(path: str, **query: str) -> str:
+def address(path: str, **query: str | Sequence[str]) -> str:
     """Returns the address of a page with query parameters, which may hold anything.
 
     >>> address("/run", run="a b/<c>")
     '/run?run=a+b%2F%3Cc%3E'
     """
-    return f"{path}?{urlencode(query)}" if query else path
+    return f"{path}?{urlencode(query, doseq=True)}" if query else path

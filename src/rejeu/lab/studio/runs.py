@@ -67,8 +67,10 @@ def build(studio: Studio, request: Request) -> None:
         order = ui.select([*ORDERS], value="newest first").props("dense outlined options-dense aria-label=order")
         ui.space()
         count = ui.label().classes("quiet")
-    table = ui.table(rows=[], columns=COLUMNS, row_key="key", pagination={"rowsPerPage": 50})
+        compare = ui.button("Compare", icon="stacked_line_chart").props("outline no-caps")
+    table = ui.table(rows=[], columns=COLUMNS, row_key="key", pagination={"rowsPerPage": 50}, selection="multiple")
     table.classes("w-full").props("flat bordered dense wrap-cells")
+    compare.bind_enabled_from(table, "selected", bool)
     for name, template in SLOTS.items():
         table.add_slot(f"body-cell-{name}", template)
 
@@ -79,10 +81,16 @@ def build(studio: Studio, request: Request) -> None:
         running = sum(row["state"] == "running" for row in rows)
         count.text = f"{counted(len(rows), 'run')}, {running} running" if studio.version else "reading the folder"
 
+    def picked() -> list[str]:
+        rows, keys = chosen(studio.rows, words.value or ""), {line["key"] for line in table.selected}
+        labels = labels_of(rows, studio.summaries, grouping.value)
+        return [row["run"] for row, label in zip(rows, labels, strict=True) if keys & {row["run"], label}]
+
     def fold(key: str) -> None:
         opened.symmetric_difference_update({key})
         show()
 
+    compare.on_click(lambda: ui.navigate.to(address("/compare", run=picked())))
     table.on("fold", lambda event: fold(str(event.args)))
     for control in (words, grouping, order):
         control.on_value_change(show)

@@ -1,0 +1,99 @@
+"""The page that compares groups of runs: final scores with intervals, curves and performance profiles."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from fastapi import Request
+from nicegui import ui
+
+from rejeu.lab.cli import expected_errors, one_line
+from rejeu.lab.reporting.comparison import MAX_LISTED, Comparison, compare
+from rejeu.lab.studio.figures import Figure
+from rejeu.lab.studio.state import Studio
+from rejeu.logs.charts import GROUP_COLORS, group_chart
+
+EVERY = 3.0
+"""Seconds between two looks whether a run that is compared has changed."""
+BY = {None: "groups: automatic", "algorithm": "by algorithm", "setting": "by setting", "env": "by environment"}
+AXES = {"steps": "over steps", "time": "over time"}
+SCORES = {"training": "end of training", "evaluation": "last evaluation"}
+STATISTICS = {"iqm": "interquartile mean", "mean": "mean", "median": "median"}
+SCALES = {None: "returns", "range": "scaled to the range"}
+BETTER = ("group", "better than", "environment", "probability (95 % interval)")
+
+
+def build(studio: Studio, request: Request) -> None:
+    """Makes the page of the runs that its address names as ``run``; of all that could be read, if it names none."""
+    for theme, colors in zip((":root", ".body--dark"), zip(*GROUP_COLORS, strict=True), strict=True):
+        ui.add_css(f"{theme} {{ {''.join(f'--group{i}: {color};' for i, color in enumerate(colors))} }}")
+    ui.add_css(
+        ".charts { display: grid; gap: 16px; grid-template-columns: repeat(auto-fit, minmax(min(100%, 480px), 1fr)); }"
+    )
+    named = request.query_params.getlist("run")
+    with ui.row().classes("items-center w-full gap-2"):
+        controls = {
+            "by": ui.select(BY, value=None),
+            "x": ui.select(AXES, value="steps"),
+            "score": ui.select(SCORES, value="training"),
+            "statistic": ui.select(STATISTICS, value="iqm"),
+            "normalize": ui.select(SCALES, value=None),
+        }
+    status = ui.label().classes("text")
+    place = ui.column().classes("w-full gap-4")
+    seen: Any = None
+
+    async def look() -> None:
+        nonlocal seen
+        rows = [
+            row for row in studio.rows if row["run"] in named or (not named and row["state"] not in ("damaged", "gone"))
+        ]
+        settings = {name: control.value for name, control in controls.items()}
+        state = [(row["run"], row["changed"]) for row in rows], settings
+        if state == seen or not (studio.version or named):
+            return
+        seen = state
+        status.text = f"comparing {len(rows)} runs ..."
+        try:
+            found = await asyncio.to_thread(compare, [Path(row["path"]) for row in rows], **settings)
+        except expected_errors() as error:
+            place.clear()
+            status.text = one_line(error)
+        else:
+            status.text = "\n".join(found.notes)
+            place.clear()
+            with place:
+                show(found)
+
+    for name, control in controls.items():
+        control.props(f"dense outlined options-dense aria-label={name}")
+        control.on_value_change(look)
+    ui.timer(EVERY, look)
+
+
+def show(comparison: Comparison) -> None:
+    """Shows tables and charts; they are those of the page of ``rejeu compare``."""
+    head, *rows = comparison.text_table()
+    table(head, rows)
+    ui.label(f"{comparison.definition.capitalize()}. Intervals are 95 % stratified bootstrap intervals.").classes(
+        "quiet"
+    )
+    with ui.element("div").classes("w-full charts"):
+        for env in dict.fromkeys(group.env_id for group in comparison.groups):
+            for kind, title in (("curve", "returns"), ("profile", "performance profile")):
+                with ui.column().classes("gap-0"):
+                    ui.label(f"{env or 'unknown environment'}: {title}")
+                    Figure(group_chart(kind, comparison, env), "300px")
+    if comparison.improvements:
+        ui.label("Probability that a run of the group has a higher final score than a run of the other")
+        table(BETTER, [one.cells for one in comparison.improvements[:MAX_LISTED]])
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Shows a table of texts."""
+    columns = [{"name": str(i), "label": text, "field": str(i), "align": "left"} for i, text in enumerate(head)]
+    cells = [{str(i): text for i, text in enumerate(row)} for row in rows]
+    ui.table(rows=cells, columns=columns).classes("w-full").props("flat bordered dense")
