@@ -323,6 +323,38 @@ def histogram(
     }
 
 
+def goal_chart(episodes: Table) -> Chart | None:
+    """Returns a map of goals, by their first two numbers: those that were reached, and those that were not; None without any.
+
+    Args:
+        episodes: with the columns ``goal_0``, ``goal_1`` and ``success``.
+    """
+    x, y, success = (episodes.column(name) for name in ("goal_0", "goal_1", "success"))
+    known = usable(x) & usable(y) & np.isfinite(success)
+    if not known.any():
+        return None
+    found = []
+    for name, color, at in (
+        ("reached", "good", known & (success > 0.5)),
+        ("not reached", "bad", known & (success <= 0.5)),
+    ):
+        if at.any():
+            where = {"x": plain(x[at]), "t": plain(x[at]), "y": plain(y[at])}
+            found.append({"kind": "points", "name": f"{name} ({at.sum():,})", "color": color, **where})
+    own = {"x": "first number of the goal", "y": "second number", "percent": False}
+    return {**own, "range": fit(y[:0], y[known]), "x_range": fit(x[:0], x[known]), "series": found, "note": ""}
+
+
+def value_chart(values: np.ndarray, to_go: np.ndarray) -> Chart:
+    """Returns what the critic expected along an episode, and the discounted return that followed; either may be empty."""
+    named = {"discounted return from here on": ("line", to_go), "what the critic expects": ("accent", values)}
+    found = []
+    for name, (color, line) in named.items():
+        at = thinned(len(line))
+        found += [series("line", name, color, at, at, line[at])] if len(at) else []
+    return {"x": "step of the episode", "y": "", "percent": False, "range": None, "series": found, "note": ""}
+
+
 GROUP_COLORS = (
     ("#1d4f91", "#8cc0f5"),
     ("#d9631e", "#f59a56"),

@@ -4,6 +4,7 @@ import shutil
 
 import pytest
 
+from rejeu.lab.reporting import run_list
 from tests.lab.reporting.report.folders import CONFIG, write, write_hostile
 from tests.lab.studio.conftest import opened, serving
 
@@ -44,3 +45,33 @@ def test_a_run_that_changes_and_one_that_disappears_are_followed(browser, served
         row.locator("text=3,500").wait_for()
         shutil.rmtree(folder)
         row.locator("text=its folder is no longer there").wait_for()
+
+
+def test_a_run_is_started_from_the_form_watched_stopped_and_resumed(browser, served):
+    with opened(browser, served, "/new?env=CartPole-v1") as page:
+        settings = {"steps": "400000", "folder": "mine", "hyperparameters": "learning_starts=200"}
+        for label, text in settings.items():
+            page.get_by_label(label, exact=True).fill(text)
+        page.get_by_label("seed", exact=True).fill("x")
+        page.get_by_text("--seed 'x' must be a whole number").wait_for()
+        page.get_by_label("seed", exact=True).fill("3")
+        page.get_by_text("Output").click()
+        page.get_by_role("switch", name="no report").click()
+        page.get_by_role("switch", name="no video").click()
+        page.get_by_role("button", name="Start").click()
+        page.wait_for_url("**/run?run=mine", timeout=60_000)
+        page.locator(".q-badge", has_text="running").wait_for()
+        live = page.locator("figcaption", has_text="the policy at step")
+        live.wait_for(timeout=60_000)
+        seen = live.inner_text()
+        page.wait_for_function("seen => document.querySelector('figcaption').innerText !== seen", arg=seen)
+        page.get_by_text("of 400,000").first.wait_for()
+        page.get_by_role("button", name="Stop").click()
+        page.locator(".q-badge", has_text="interrupted").wait_for(timeout=60_000)
+        steps = run_list.read(served.folder / "mine").steps
+        assert 0 < steps < 400_000
+        page.get_by_role("button", name="Resume").click()
+        page.locator(".q-badge", has_text="running").wait_for(timeout=60_000)
+        page.get_by_role("button", name="Stop").click()
+        page.locator(".q-badge", has_text="interrupted").wait_for(timeout=60_000)
+        assert run_list.read(served.folder / "mine").steps > steps

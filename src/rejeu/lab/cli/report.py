@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import webbrowser
+from collections.abc import Mapping
 from contextlib import closing
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from rejeu.checkpoints.run_folder import RunFolder, find_model
 from rejeu.core import atomic
@@ -49,9 +53,18 @@ def replay(path: Path, arguments: Report) -> None:
     assert arguments.replay is not None
     model = find_model(path)
     agent = load(model)
-    rows = ["seed,return,length,success"]
+    rows: list[list[Any]] = []
     with closing(environment_of(model, arguments).make()) as env:
         for seed in range(whole("--replay", arguments.replay, least=1)):
             played = agent.evaluate(1, env=env, seed=seed)
-            rows.append(f"{seed},{played.mean_return},{played.mean_length:.0f},{played.success_rate}")
-    atomic.write(RunFolder(path).replays, "\n".join(rows) + "\n")
+            goal = goal_of(env.reset(seed=seed)[0])
+            rows.append([seed, played.mean_return, f"{played.mean_length:.0f}", played.success_rate, *goal])
+    head = ["seed", "return", "length", "success", *(f"goal_{i}" for i in range(len(rows[0]) - 4))]
+    atomic.write(RunFolder(path).replays, "".join(",".join(str(one) for one in row) + "\n" for row in [head, *rows]))
+
+
+def goal_of(obs: Any) -> list[float]:
+    """Returns the first two numbers of the goal in an observation, empty if there is none."""
+    goal = obs.get("desired_goal") if isinstance(obs, Mapping) else None
+    values = [] if goal is None else np.ravel(goal)[:2].astype(float).tolist()
+    return values if len(values) == 2 else []

@@ -6,7 +6,7 @@ export default {
     this.draw();
     this.colors = new MutationObserver(() => this.draw());
     this.colors.observe(document.body, { attributes: true, attributeFilter: ["class"] });
-    this.sizes = new ResizeObserver(() => this.$refs.plot.classList.contains("js-plotly-plot") || this.draw());
+    this.sizes = new ResizeObserver(() => this.fit());
     this.sizes.observe(this.$refs.plot); // a chart in a folded part is drawn when that opens
   },
   beforeUnmount() {
@@ -15,6 +15,11 @@ export default {
   },
   watch: { chart: "draw", axis: "draw", chosen: "draw" },
   methods: {
+    fit() {
+      const { plot } = this.$refs;
+      if (!plot.classList.contains("js-plotly-plot")) this.draw();
+      else if (plot.offsetWidth) Plotly.Plots.resize(plot);
+    },
     draw() {
       const { plot, legend } = this.$refs;
       if (!this.chart || !plot || !plot.offsetWidth) return;

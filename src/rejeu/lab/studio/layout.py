@@ -18,7 +18,6 @@ from rejeu.lab.studio.state import Studio
 EVERY = 1.0
 """Seconds between two looks whether what a page shows has changed."""
 STYLE = """
-:root { --q-primary: #1d4f91; }
 body { font-family: system-ui, sans-serif; }
 .nicegui-content { padding: 0; }
 .page { width: 100%; max-width: 1400px; margin: 0 auto; padding: 16px; gap: 12px; }
@@ -29,6 +28,11 @@ body { font-family: system-ui, sans-serif; }
 .picture { width: 84px; height: 48px; object-fit: cover; border-radius: 4px; display: block; }
 .notes { max-width: 16rem; white-space: normal; }
 a.run { color: var(--line); overflow-wrap: anywhere; }
+.card { background: var(--card); border-color: var(--rule); padding: 10px 12px; gap: 4px; min-width: 0; box-shadow: none; }
+.tile { flex: 1 1 200px; gap: 0; }
+.charts { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 420px), 1fr)); gap: 12px; }
+.mono { font-family: ui-monospace, monospace; font-size: 12px; }
+.warning { background: var(--mark); color: var(--mark-ink); border-radius: 8px; padding: 4px 10px; width: 100%; }
 .text { white-space: pre-wrap; overflow-wrap: anywhere; }
 .body--dark { --bar: #16263d; }
 @media (max-width: 600px) { .page { padding: 8px; } }
@@ -48,6 +52,7 @@ def frame(title: str, path: str, links: Sequence[tuple[str, str]]) -> Iterator[N
     """
     figures.add_scripts()
     ui.add_css(STYLE)
+    ui.colors(primary="#2f6db5")
     dark = ui.dark_mode(None)
     with ui.header().classes("header items-center gap-1 no-wrap"):
         ui.label("rejeu").classes("text-subtitle1 text-weight-bold q-mr-sm gt-xs")

@@ -14,7 +14,7 @@ from fastapi import FastAPI, Request, Response
 from fastapi.responses import FileResponse
 from nicegui import app, ui
 
-from rejeu.lab.studio import compare, figures, play, runs
+from rejeu.lab.studio import compare, figures, new, play, run, runs
 from rejeu.lab.studio.guard import HOST, Guard
 from rejeu.lab.studio.layout import frame
 from rejeu.lab.studio.state import Studio
@@ -37,7 +37,13 @@ class Page(NamedTuple):
     """Whether the navigation leads to it."""
 
 
-PAGES = (Page("/", "Runs", runs.build), Page("/play", "Play", play.build), Page("/compare", "Compare", compare.build))
+PAGES = (
+    Page("/", "Runs", runs.build),
+    Page("/new", "New run", new.build),
+    Page("/play", "Play", play.build),
+    Page("/compare", "Compare", compare.build),
+    Page("/run", "Run", run.build, is_listed=False),
+)
 
 
 def serve(

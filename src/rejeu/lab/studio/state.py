@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Mapping
+from dataclasses import fields
 from pathlib import Path
 from types import TracebackType
 
+from rejeu.lab.cli.commands import RunOptions
 from rejeu.lab.cli.environment import Environment
 from rejeu.lab.reporting.rows import Row, Rows
 from rejeu.lab.reporting.runs import RunSummary, is_file
+from rejeu.lab.runs.config import EnvironmentOptions, RunConfig
 
 EVERY = 1.0
 """Seconds between two looks at the folder, and longest look, after which rows are shown though some runs are not read yet."""
@@ -29,6 +32,7 @@ class Studio:
         self.version = 0
         """Rises when the rows change."""
         self._reader = Rows(folder)
+        self._trusted: dict[str, RunOptions] = {}
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._follow, daemon=True)
 
@@ -42,6 +46,20 @@ class Studio:
     def row(self, run: str) -> Row | None:
         """Returns the row of a run by its path below the folder, as pages have it in their address; None if there is none."""
         return next((row for row in self.rows if row["run"] == run), None)
+
+    def given(self, run: str) -> RunOptions:
+        """Returns what people have typed about the environment of a run, which no file may let import code."""
+        known = self.summaries.get(run)
+        return self._trusted.get("" if known is None or known.config is None else known.config.typed, RunOptions())
+
+    def trust(self, run: RunConfig) -> None:
+        """Lets runs on an environment that somebody has typed be shown, though it is imported."""
+        made = {one.name: getattr(run, one.name) for one in fields(EnvironmentOptions)}
+        self._trusted[run.typed] = RunOptions(env=run.typed, **made)
+
+    def holds(self, run: str) -> bool:
+        """Returns whether a run has begun, by its path below the folder."""
+        return self.row(run) is not None or any(row["run"].startswith(f"{run}/") for row in self.rows)
 
     def file(self, run: str, name: str) -> Path | None:
         """Returns a regular file in the folder of a run; None if there is none, or it is a symbolic link."""

@@ -201,3 +201,25 @@ def test_page_of_an_agent_without_a_run_folder(tmp_path):
     assert "default 0.99" in text
     assert sum(data_of(text)["histograms"]["run0-episodes"]["counts"]) == 2
     assert "rejeu train" not in text  # the run is not repeated by a command
+
+
+def test_goals_of_replayed_episodes_are_a_map(tmp_path):
+    folder = write(tmp_path / "run")
+    rows = "0,5,5,1,1.0,2.0\n1,5,5,0,3.0,4.0\n2,5,5,1,-1.0,0.5\n3,5,5,nan,9,9\n4,5,5,1,nan,9\n"
+    (folder / "replays.csv").write_text(f"seed,return,length,success,goal_0,goal_1\n{rows}", encoding="utf-8")
+    chart = data_of(text_of(folder))["charts"]["run0-goals"]
+    assert [(one["name"], one["color"], one["x"], one["y"]) for one in chart["series"]] == [
+        ("reached (2)", "good", [1, -1], [2, 0.5]),
+        ("not reached (1)", "bad", [3], [4]),
+    ]
+
+
+def test_value_of_an_episode_is_drawn_beside_what_followed():
+    values, to_go = np.array([3.0, 2.0]), np.array([1.75, 1.0])
+    both = charts.value_chart(values, to_go)["series"]
+    assert [(one["name"], one["x"], one["y"]) for one in both] == [
+        ("discounted return from here on", [0, 1], [1.75, 1]),
+        ("what the critic expects", [0, 1], [3, 2]),
+    ]
+    (one,) = charts.value_chart(values, np.zeros(0))["series"]
+    assert one["name"] == "what the critic expects"

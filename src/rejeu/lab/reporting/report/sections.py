@@ -24,7 +24,7 @@ LAST = 100
 MAX_EVALUATIONS = 200
 """Most rows of the table of evaluations."""
 MAX_SETTINGS = 300
-CURVES, TIME = "Learning curves", "Time"
+CURVES, GOALS, TIME = "Learning curves", "Goals", "Time"
 """Headings."""
 TITLES = {"return": "Return", "success": "Success rate", "length": "Episode length"}
 """Titles of the learning curves by the column that they show."""
@@ -81,9 +81,10 @@ def charts_of(run: RunSummary, prefix: str) -> tuple[dict[str, Any], list[dict[s
     ]
     for i, (name, chart) in enumerate(chart_data.metric_charts(run.metrics).items()):
         curves.append((chart_data.group_of(name), f"metric{i}", shown(name), chart))
+    curves.append((GOALS, "goals", "Goals of the trained agent", chart_data.goal_chart(run.replays)))
     curves.append((TIME, "time", "Shares of the time", chart_data.time_chart(run.metrics)))
     charts: dict[str, Any] = {}
-    groups: dict[str, list[dict[str, str]]] = {heading: [] for heading in (CURVES, *chart_data.GROUPS, TIME)}
+    groups: dict[str, list[dict[str, str]]] = {heading: [] for heading in (CURVES, GOALS, *chart_data.GROUPS, TIME)}
     for heading, key, title, chart in curves:
         if chart is not None:
             charts[f"{prefix}-{key}"] = chart

@@ -1,0 +1,166 @@
+"""The page on which a run is started: a form made from the options of ``rejeu train``."""
+
+from __future__ import annotations
+
+import asyncio
+import shlex
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Literal, get_args, get_origin
+
+from fastapi import Request
+from nicegui import ui
+
+from rejeu.agents import AGENTS, presets
+from rejeu.checkpoints.run_folder import dated
+from rejeu.core.validation import field_docs
+from rejeu.lab.cli import parsing
+from rejeu.lab.cli.commands import COMMANDS, TASKS, Train, check_options
+from rejeu.lab.runs.config import Option, Topic, options
+from rejeu.lab.studio import processes
+from rejeu.lab.studio.layout import address
+from rejeu.lab.studio.state import Studio
+
+LEFT_OUT = {"assist", "json", "fps"}
+"""Options that need a window, or are for programs."""
+LABELS = {"hyperparameters": "hyperparameters", "n_envs": "environments at once", "out": "folder"}
+"""Of fields, where the option is called otherwise."""
+LOOK = 0.5
+"""Seconds between two looks whether the run has begun."""
+Texts = Mapping[str, Any]
+"""What stands in the form: texts, and of flags whether they are set, by field."""
+
+
+def build(studio: Studio, request: Request) -> None:
+    """Makes the form."""
+    docs, lists = field_docs(Train), {topic: [] for topic in Topic}  # type: dict[str, str], dict[Topic, list[Option]]
+    for one in options(Train):
+        if one.field not in LEFT_OUT:
+            lists[one.group].append(one)
+    fields: dict[str, Any] = {}
+    for topic, listed in lists.items():
+        place = ui.element("div") if topic is Topic.FIRST else ui.expansion(topic.capitalize()).classes("w-full")
+        with place.classes("w-full"), ui.element("div").classes("charts"):
+            fields |= {one.field: make_field(one, docs.get(one.field, one.shown.help)) for one in listed}
+    fields["env"].value = request.query_params.get("env") or None
+    with ui.row().classes("items-center"):
+        button = ui.button("Start", icon="play_arrow").props("no-caps")
+        spinner = ui.spinner()
+        spinner.set_visibility(False)
+    said = ui.label().classes("text mono")
+
+    async def begin() -> None:
+        button.disable()
+        spinner.set_visibility(True)
+        said.text = ""
+        try:
+            said.text = await start(studio, {name: one.value for name, one in fields.items()}, said.set_text)
+        except (ValueError, OSError) as error:
+            said.text = str(error)
+        button.enable()
+        spinner.set_visibility(False)
+
+    button.on_click(begin)
+
+
+def make_field(option: Option, about: str) -> Any:
+    """Returns the element in which an option is entered."""
+    label = LABELS.get(option.field, option.name.removeprefix("--").replace("-", " ").lower())
+    if option.kind is bool:
+        made: Any = ui.switch(label)
+    elif option.field == "env":
+        names = sorted({preset.env_id for preset in presets.every()})
+        made = ui.select(names, label="environment", with_input=True, new_value_mode="add-unique")
+    elif option.field == "algorithm":
+        made = ui.select(sorted(AGENTS), label="algorithm", with_input=True, clearable=True)
+    elif get_origin(option.kind) is Literal:
+        made = ui.select([*get_args(option.kind)], label=label, clearable=True)
+    else:
+        made = ui.input(label, validation=lambda text: problem_of(option, text))
+    if option.kind is not bool:
+        made.props("dense outlined stack-label bottom-slots").props.update(hint=about)
+    return made
+
+
+def problem_of(option: Option, text: str | None) -> str | None:
+    """Returns what is wrong with a text, None if nothing is."""
+    try:
+        words_of(option, text)
+    except ValueError as error:
+        return str(error)
+    return None
+
+
+def words_of(option: Option, given: Any) -> list[str]:
+    """Returns an option as words of a command line, none if nothing was entered.
+
+    Raises:
+        ValueError: if it is not what the option takes.
+    """
+    if given in (None, "", False):
+        return []
+    name = [] if option.shown.is_positional else [option.name]
+    if option.kind is bool:
+        return name
+    words = shlex.split(str(given)) if option.kind in (dict, tuple) else [str(given).strip()]
+    if option.kind not in (dict, tuple):
+        parsing.read(option, words[0])
+    if option.takes_many or option.kind is dict:
+        return [*name, *words]
+    return [part for word in words for part in (*name, word)]
+
+
+def command(texts: Texts, folder: Path) -> tuple[list[str], Train]:
+    """Returns the words of the command that starts a run below a folder, and its arguments.
+
+    Raises:
+        ValueError: for a mistake, as the command line says it, or a folder elsewhere.
+    """
+    if not texts.get("env"):
+        raise ValueError("choose an environment")
+    named = str(texts.get("out") or dated(texts["env"], texts.get("algorithm")).name)
+    if Path(named).is_absolute() or ".." in Path(named).parts:
+        raise ValueError(f"out {named!r} must be a name of a folder below {folder}")
+    given = {**texts, "out": str(folder / named)}
+    words = [word for one in options(Train) for word in words_of(one, given.get(one.field))]
+    _, arguments = parsing.parse(["train", *words], COMMANDS, TASKS, "")
+    check_options(arguments)
+    return ["train", *words], arguments
+
+
+async def start(studio: Studio, texts: Texts, say: Callable[[str], object]) -> str:
+    """Checks the environment and starts the run, and leads to its page; returns what went wrong, if anything did.
+
+    An environment with a preset is not checked: the tests of rejeu do that.
+    """
+    words, arguments = command(texts, studio.folder)
+    if presets.find(arguments.env, None) is None:
+        say("rejeu check tries the environment for a few seconds ...")
+        status, printed = await check(arguments)
+        if status:
+            return printed
+        say(printed)
+    studio.trust(arguments)
+    path = Path(arguments.out or "")
+    process = processes.start(words, path)
+    name = path.relative_to(studio.folder).as_posix()
+    while process.poll() is None and not studio.holds(name):
+        await asyncio.sleep(LOOK)
+    if not studio.holds(name):
+        return processes.read_log(path) or f"rejeu train ended with exit status {process.returncode}"
+    ui.navigate.to(address("/run", run=name))
+    return ""
+
+
+async def check(arguments: Train) -> tuple[int, str]:
+    """Returns exit status and output of ``rejeu check`` for the environment of a run."""
+    words = ["check", *arguments.environment_words()]
+    process = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-m", "rejeu", *words),
+        stdin=asyncio.subprocess.DEVNULL,
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.STDOUT,
+    )
+    printed, _ = await process.communicate()
+    return process.returncode or 0, processes.plain(printed.decode("utf-8", "replace"))

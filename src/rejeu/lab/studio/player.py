@@ -1,0 +1,217 @@
+"""An agent that acts for those who watch, by a copy of the weights and in an environment of its own, in a thread."""
+
+from __future__ import annotations
+
+import math
+import os
+import sys
+import threading
+import time
+from collections.abc import Callable
+from contextlib import closing, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from rejeu.agents import Agent, OnPolicyAgent, load
+from rejeu.checkpoints.model_files import Counters
+from rejeu.checkpoints.run_folder import RunFolder
+from rejeu.core import checkpoint
+from rejeu.core.records import convert
+from rejeu.envs.base import success_of
+from rejeu.envs.masks import for_agent
+from rejeu.envs.rendering import rgb_frame
+from rejeu.lab.cli import expected_errors, one_line
+from rejeu.lab.cli.commands import RunOptions
+from rejeu.lab.cli.environment import from_run
+from rejeu.lab.reporting.runs import has_process
+from rejeu.lab.runs import requests
+from rejeu.lab.runs.config import read_folder
+from rejeu.logs.video import playback_fps
+
+LEAST_FPS = 20.0
+"""Frames a second of environments that are slower."""
+RENEW = 2.0
+"""Seconds between two looks for new weights, and two requests for them."""
+REST = 0.8
+"""Seconds for which the end of an episode is shown."""
+NICE = 10
+CURRENT, BEST = "current", "best"
+"""The policy that is being trained, or the last one; and the one that evaluated best."""
+
+
+@dataclass
+class Episode:
+    """An episode that was watched. Mutable until it ends."""
+
+    model: str
+    """Which policy acts."""
+    seed: int
+    step: int
+    """Of the training, at which the policy was saved."""
+    rewards: list[float] = field(default_factory=list)
+    values: list[float] = field(default_factory=list)
+    """What the critic expects at each step; empty without a critic."""
+    success: float = math.nan
+    is_over: bool = False
+
+    def to_go(self, gamma: float) -> np.ndarray:
+        """Returns the discounted return from each step on."""
+        result, total = np.zeros(len(self.rewards)), 0.0
+        for i in range(len(self.rewards) - 1, -1, -1):
+            result[i] = total = self.rewards[i] + gamma * total
+        return result
+
+
+class Player:
+    """A thread in which an agent acts until ``close``. Mutable: ``choose`` changes who acts.
+
+    Args:
+        folder: of the run.
+        given: what the command line says of environments.
+        show: called with the pictures and captions of each step.
+    """
+
+    def __init__(self, folder: Path, given: RunOptions, show: Callable[..., object]) -> None:
+        self.folder, self.given, self.show = RunFolder(folder), given, show
+        self.episode: Episode | None = None
+        """The episode that is played, or was played last."""
+        self.gamma = 1.0
+        self.problem = ""
+        """Why nothing is shown."""
+        self.is_seen = True
+        """Whether anybody looks; else the agent rests."""
+        self.model, self._next_seed = CURRENT, 0
+        self.seed: int | None = None
+        """From which its episodes begin; None for new ones."""
+        self._changed, self._closed = threading.Event(), threading.Event()
+        self._renew_at, self._step = 0.0, 0
+        self._stamp: Any = None
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def choose(self, model: str, seed: int | None = None) -> None:
+        """Ends the episode; then a policy acts: "current", "best" or the name of a model; from a seed, or from a new one."""
+        self.model, self.seed = model, seed
+        self._changed.set()
+
+    def close(self) -> None:
+        """Ends the thread."""
+        self._closed.set()
+        self._changed.set()
+
+    def _run(self) -> None:
+        lower_priority()
+        while not self._closed.is_set():
+            try:
+                made = from_run(read_folder(self.folder), self.folder.path, self.given)
+                with closing(made.rendering()) as env:
+                    self._act(env)
+            except expected_errors() as error:
+                self.problem = one_line(error)
+                self._changed.wait(RENEW)
+        with suppress(OSError):
+            self.folder.watch.unlink(missing_ok=True)
+
+    def _act(self, env: gym.Env) -> None:
+        agent: Agent | None = None
+        while not self._closed.is_set():
+            self._changed.clear()
+            self.problem = ""
+            agent, name = self._load(agent), self.model
+            playing = for_agent(agent, env)
+            self.gamma = float(getattr(agent.config, "gamma", 1.0))
+            self.episode = Episode(name, self._next_seed if self.seed is None else self.seed, self._step)
+            self._next_seed += self.seed is None
+            self._play(agent, playing, self.episode)
+            self._changed.wait(REST)
+
+    def _play(self, agent: Agent, env: gym.Env, episode: Episode) -> None:
+        """Plays one episode, with new weights as they come; another choice ends it."""
+        obs, _ = env.reset(seed=episode.seed)
+        memory, period, due = None, 1 / max(playback_fps(env), LEAST_FPS), time.perf_counter()
+        self._show(env, episode)
+        while not (episode.is_over or self._changed.is_set()):
+            if not self.is_seen:
+                time.sleep(0.1)
+                continue
+            if episode.model == CURRENT and time.monotonic() >= self._renew_at:
+                self._load(agent)
+                episode.step = self._step
+            action, following = agent.predict(obs, memory, deterministic=True)
+            episode.values += value_of(agent, obs, memory, action)
+            memory = following
+            obs, reward, terminated, truncated, info = env.step(action)
+            episode.rewards.append(float(reward))
+            episode.is_over = bool(terminated or truncated)
+            episode.success = success_of(info) if episode.is_over else math.nan
+            self._show(env, episode)
+            due = max(due + period, time.perf_counter() - period)
+            self._changed.wait(max(due - time.perf_counter(), 0.0))
+
+    def _show(self, env: gym.Env, episode: Episode) -> None:
+        self.show([rgb_frame(env)], [caption(episode)])
+
+    def _load(self, agent: Agent | None) -> Agent:
+        """Returns the agent with the weights that are asked for; an older agent is given them if they have changed."""
+        if self.model == CURRENT and has_process(self.folder.path) is not False:
+            requests.ask(self.folder.watch)
+        self._renew_at = time.monotonic() + RENEW
+        path = self._path()
+        status = path.stat()
+        stamp = path, status.st_mtime_ns, status.st_size
+        if agent is None:
+            agent = load(path, device="cpu")
+        elif stamp != self._stamp:
+            agent.set_parameters(path)
+        if stamp != self._stamp:
+            counters = convert(checkpoint.read_header(path, "agent").get("counters"), Counters)
+            self._step = counters.step - counters.steps_before
+        self._stamp = stamp
+        return agent
+
+    def _path(self) -> Path:
+        """Returns the file of the model that is asked for.
+
+        Raises:
+            FileNotFoundError: if there is none yet.
+        """
+        folder = self.folder
+        kept = requests.models(folder.models)
+        named = [path for path in kept if path.stem == self.model]
+        chosen = {CURRENT: (folder.live, folder.agent, *kept[-1:], folder.best), BEST: (folder.best, folder.agent)}
+        for path in chosen.get(self.model, named):
+            if path.is_file():
+                return path
+        raise FileNotFoundError(
+            "there is no model yet; the first is written within seconds, or at the first evaluation"
+        )
+
+
+def value_of(agent: Agent, obs: Any, memory: Any, action: Any) -> list[float]:
+    """Returns the value that the critic gives to what the agent does, as a list that is empty without a critic."""
+    algorithm = agent.learner.algorithm
+    if isinstance(agent, OnPolicyAgent):
+        return [float(agent.value(obs, memory))] if algorithm.state_value is not None else []
+    return [float(agent.q_values(obs, action, "mean"))] if algorithm.action_values is not None else []
+
+
+def caption(episode: Episode) -> dict[str, Any]:
+    """Returns the texts of the picture."""
+    ends = {1.0: "reached", 0.0: "not reached"}
+    return {
+        "name": f"the policy at step {episode.step:,}",
+        "score": f"return {sum(episode.rewards):,.2f} · step {len(episode.rewards):,}",
+        "about": f"seed {episode.seed}",
+        "message": ends.get(episode.success, "the episode has ended") if episode.is_over else "",
+        "won": episode.success == 1.0,
+    }
+
+
+def lower_priority() -> None:
+    """Lets training go first, where a system has priorities of threads."""
+    if sys.platform == "linux":
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICE)

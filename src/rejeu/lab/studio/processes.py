@@ -1,0 +1,70 @@
+"""Commands that the studio starts. They are processes of their own, which go on when the studio ends."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+HIDDEN = ".studio"
+"""Folder of the logs, beside the run folders."""
+TAIL = 2**16
+"""Most bytes of a log that are shown."""
+running: list[subprocess.Popen[bytes]] = []
+"""Those that have not ended, as far as is known."""
+
+
+def start(words: Sequence[str], run: Path) -> subprocess.Popen[bytes]:
+    """Starts the command ``rejeu`` with these words, detached from this process; what it prints is added to the log of a run.
+
+    Raises:
+        OSError: if that is impossible.
+    """
+    running[:] = [one for one in running if one.poll() is None]
+    log = log_of(run)
+    log.parent.mkdir(parents=True, exist_ok=True)
+    with log.open("ab") as out:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "rejeu", *words], stdin=subprocess.DEVNULL, stdout=out, stderr=out, **apart()
+        )
+    running.append(process)
+    return process
+
+
+def apart() -> dict[str, Any]:
+    """Returns the options of a process that no signal to this one reaches."""
+    if sys.platform == "win32":
+        return {"creationflags": subprocess.DETACHED_PROCESS | subprocess.CREATE_NEW_PROCESS_GROUP}
+    return {"start_new_session": True}
+
+
+def log_of(run: Path) -> Path:
+    """Returns where the log of a run is that the studio started."""
+    return run.parent / HIDDEN / f"{run.name}.log"
+
+
+def read_log(run: Path) -> str:
+    """Returns the end of what a run has printed, of one that a sweep or the studio started; else nothing."""
+    for path in (log_of(run), run.parent / f"{run.name}.log"):
+        try:
+            handle = os.open(path, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0))
+        except OSError:
+            continue
+        with os.fdopen(handle, "rb") as file:
+            file.seek(max(os.fstat(handle).st_size - TAIL, 0))
+            return plain(file.read(TAIL).decode("utf-8", "replace"))
+    return ""
+
+
+def plain(text: str) -> str:
+    r"""Returns text of a terminal without colors, and of lines that were written over the last state.
+
+    >>> plain("\x1b[1m10 %\r20 %\nend\n")
+    '20 %\nend\n'
+    """
+    lines = re.sub(r"\x1b\[[\d;?]*[A-Za-z]", "", text).replace("\r\n", "\n").split("\n")
+    return "\n".join(line.rstrip("\r").rpartition("\r")[2] for line in lines)

@@ -1,0 +1,336 @@
+"""The page of a run: the agent live, curves that grow, episodes that are shown again, settings, warnings and the log."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from fastapi import Request
+from nicegui import run as threads, ui
+
+from rejeu.checkpoints.run_folder import RunFolder
+from rejeu.lab.experiments.work import HIDDEN
+from rejeu.lab.reporting import run_list
+from rejeu.lab.reporting.report import sections
+from rejeu.lab.reporting.rows import SHARE, Row
+from rejeu.lab.runs import requests
+from rejeu.lab.studio import processes
+from rejeu.lab.studio.figures import Figure
+from rejeu.lab.studio.layout import EVERY
+from rejeu.lab.studio.player import BEST, CURRENT, Episode, Player
+from rejeu.lab.studio.runs import COLORS
+from rejeu.lab.studio.screen import CSS, Screen
+from rejeu.lab.studio.state import Studio
+from rejeu.logs import charts
+
+FIRST = (sections.CURVES, sections.GOALS)
+"""Headings of the charts that are open; the others are folded."""
+REPLAYS = 100
+SEEN = """<script>document.addEventListener("visibilitychange", () => emitEvent("seen", !document.hidden));</script>"""
+TITLE = "Returns of the trained agent: choose a bar, then an episode, which is shown again"
+EPISODES = [
+    {"name": name, "label": name, "field": name, "align": "right", "sortable": True}
+    for name in ("seed", "return", "length", "success")
+]
+
+
+def build(studio: Studio, request: Request) -> None:
+    """Makes the page of the run that the address names."""
+    name = request.query_params.get("run", "")
+    row = studio.row(name)
+    if row is None:
+        text = "there is no run of this name below the folder" if studio.version else "reading the folder"
+        ui.label(f"{text}: {name}").classes("text")
+        ui.timer(EVERY, lambda: ui.navigate.reload() if studio.row(name) is not None else None)
+        return
+    ui.add_css(CSS)
+    RunPage(studio, name, Path(row["path"]))
+
+
+class RunPage:
+    """The page of one run. Mutable: it follows the run."""
+
+    def __init__(self, studio: Studio, name: str, path: Path) -> None:
+        self.studio, self.name, self.path = studio, name, path
+        self.figures: dict[str, Figure] = {}
+        self.seen: Row | None = None
+        self.due = 0.0
+        self.is_ours = RunFolder(path).config.is_file()
+        self.head = Head(self)
+        with ui.row().classes("w-full items-start gap-4"):
+            with ui.column().classes("col-grow gap-2").style("flex-basis: 320px; max-width: 720px"):
+                self.live = Live(self) if self.is_ours else None
+            with ui.column().classes("gap-2").style("flex: 1 1 300px"):
+                self.tiles = ui.row().classes("gap-2 w-full")
+                self.values = Values() if self.is_ours else None
+        with ui.row().classes("items-center w-full"):
+            self.axis = ui.toggle({"x": "steps", "t": "time"}, value="x", on_change=self.turn).props("dense no-caps")
+        self.groups = ui.column().classes("w-full gap-2")
+        self.episodes = Episodes(self)
+        with ui.expansion("Settings").classes("w-full"):
+            self.settings = ui.column().classes("w-full")
+        with ui.expansion("Log").classes("w-full") as log:
+            self.log = ui.label().classes("text mono quiet")
+        log.on_value_change(self.show_log)
+        ui.timer(EVERY, self.look)
+
+    async def look(self) -> None:
+        """Shows the run again if it has changed."""
+        row = self.studio.row(self.name)
+        if row is None or row == self.seen or time.monotonic() < self.due:
+            return
+        began = time.monotonic()
+        try:
+            parts = await threads.io_bound(read, self.path)
+        except (OSError, ValueError, ImportError) as error:
+            parts, row = None, {**row, "notes": (*row["notes"], str(error))}
+        self.seen, self.due = row, time.monotonic() + SHARE * (time.monotonic() - began) / 4
+        self.show(row, parts)
+
+    def show(self, row: Row, parts: sections.Parts | None) -> None:
+        """Shows what was read."""
+        about = parts.runs[0] if parts is not None else {"warnings": row["warnings"], "notes": row["notes"]}
+        self.head.show(row, about)
+        if parts is None:
+            return
+        self.tiles.clear()
+        with self.tiles:
+            for tile in about["tiles"]:
+                show_tile(tile)
+        self.show_charts(about["groups"], parts.data["charts"])
+        histograms = parts.data["histograms"]
+        self.episodes.show(
+            histograms.get("run0-replays"), histograms.get("run0-episodes"), bool(about["replay_command"])
+        )
+        if not self.settings.default_slot.children:
+            with self.settings:
+                show_settings(about)
+        self.show_log()
+
+    def show_charts(self, groups: list[dict[str, Any]], data: dict[str, Any]) -> None:
+        """Draws charts, and adds those that are new."""
+        for group in groups:
+            new = [one for one in group["charts"] if one["id"] not in self.figures]
+            if new:
+                with self.groups, ui.expansion(group["title"], value=group["title"] in FIRST).classes("w-full"):
+                    place = ui.element("div").classes("charts w-full")
+            for one in new:
+                with place, ui.card().classes("card").props("flat bordered"):
+                    ui.label(one["title"]).classes("text-weight-medium text")
+                    self.figures[one["id"]] = Figure()
+            for one in group["charts"]:
+                self.figures[one["id"]].show(data[one["id"]], axis=self.axis.value)
+
+    def turn(self) -> None:
+        """Draws all charts over another axis."""
+        for figure in self.figures.values():
+            figure.show(axis=self.axis.value)
+
+    def show_log(self) -> None:
+        """Shows the end of the log."""
+        self.log.text = (
+            processes.read_log(self.path) or "There is none: the studio did not start this run, nor a sweep."
+        )
+
+
+def read(path: Path) -> sections.Parts:
+    """Returns the content of the report on a run."""
+    return sections.build([run_list.read(path)], None)
+
+
+def show_actions(page: RunPage, row: Row) -> None:
+    """Shows buttons for what the state of a run allows."""
+    folder = RunFolder(page.path)
+    is_alone = not (page.path.parent / HIDDEN).is_dir()  # a sweep would continue a run that stops
+    if row["state"] == "running" and page.is_ours and is_alone:
+        ui.button("Stop", icon="stop", on_click=lambda: stop(folder)).props("outline dense no-caps padding='2px 10px'")
+    if row["state"] in ("interrupted", "crashed") and page.is_ours:
+        ui.button("Resume", icon="play_arrow", on_click=lambda: resume(page)).props(
+            "outline dense no-caps padding='2px 10px'"
+        )
+
+
+def stop(folder: RunFolder) -> None:
+    """Asks the run to stop with a checkpoint, as Ctrl-C does."""
+    requests.ask(folder.stop)
+    ui.notify("The run stops after this step, and saves everything.")
+
+
+def resume(page: RunPage) -> None:
+    """Continues the run in a process of its own."""
+    processes.start(["resume", str(page.path)], page.path)
+    ui.notify("The run continues from its newest checkpoint.")
+
+
+def show_tile(tile: sections.Tile) -> None:
+    """Shows a figure of the headline."""
+    with ui.card().classes("card tile").props("flat bordered"):
+        ui.label(tile.title).classes("text-caption quiet")
+        ui.label(tile.value).classes("text-h6")
+        for text in filter(None, (tile.note, tile.more)):
+            ui.label(text).classes("text-caption quiet")
+
+
+def show_settings(about: dict[str, Any]) -> None:
+    """Shows the settings, first those that differ from the defaults."""
+    changed = [{**one, "default": f"default {one['default']}"} for one in about["changed"]]
+    usual = [{"name": name, "value": value, "default": ""} for name, value in about["settings"]]
+    for title, rows in (("Different from the defaults", changed), ("Run", usual), ("Others", about["unchanged"])):
+        if rows:
+            ui.label(title).classes("text-weight-medium")
+            columns = [
+                {"name": one, "label": "", "field": one, "align": "left"} for one in ("name", "value", "default")
+            ]
+            ui.table(rows=rows, columns=columns).props("flat dense hide-header wrap-cells").classes("w-full text")
+    if about["command"]:
+        ui.label(about["command"]).classes("text mono quiet")
+
+
+class Head:
+    """What the run is, what may be done with it, and what is wrong with it. Mutable."""
+
+    def __init__(self, page: RunPage) -> None:
+        self.page = page
+        self.state, self.problems = "", ()  # type: str, tuple[str, ...]
+        with ui.row().classes("items-center gap-2 w-full"):
+            self.env, self.algorithm = ui.label().classes("text-h6 text"), ui.label().classes("text-h6 quiet")
+            self.badge = ui.badge()
+            ui.space()
+            self.actions = ui.row().classes("gap-2")
+        self.facts = ui.label().classes("quiet text")
+        self.notes = ui.column().classes("w-full gap-1")
+
+    def show(self, row: Row, about: dict[str, Any]) -> None:
+        """Shows the row of the run, and what the report says about it. Buttons stay while the state does."""
+        self.env.text, self.algorithm.text = row["env"] or row["name"], row["algorithm"]
+        self.facts.text = " · ".join([row["run"], *about.get("facts", ())])
+        if row["state"] != self.state:
+            self.state = self.badge.text = row["state"]
+            self.badge.props(f"color={COLORS.get(self.state, 'grey-7')}")
+            self.actions.clear()
+            with self.actions:
+                show_actions(self.page, row)
+        if (problems := (*about["warnings"], *about["notes"])) != self.problems:
+            self.problems = problems
+            self.notes.clear()
+            with self.notes:
+                for text in problems:
+                    ui.label(text).classes("warning text")
+
+
+class Live:
+    """The agent that acts, and who of the course of training it is. Mutable."""
+
+    def __init__(self, page: RunPage) -> None:
+        self.page, self.steps = page, [CURRENT]
+        self.screen = Screen()
+        self.status = ui.label("the agent is loaded").classes("quiet text")
+        with ui.row().classes("items-center w-full no-wrap gap-2"):
+            self.slider = ui.slider(min=0, max=0, value=0, on_change=self.chosen).props("label-always=false")
+            self.label = ui.label().classes("quiet").style("min-width: 9em")
+            ui.button("best", on_click=lambda: self.choose(BEST)).props("outline dense no-caps padding='2px 10px'")
+        self.player = Player(page.path, page.studio.given(page.name), self.screen.show)
+        self.screen.on_leave = self.player.close
+        ui.add_body_html(SEEN)
+        ui.on("seen", lambda event: setattr(self.player, "is_seen", bool(event.args)))
+        ui.timer(EVERY, self.look)
+
+    def look(self) -> None:
+        """Offers policies that are new, and shows what the critic expected."""
+        kept = [path.stem for path in requests.models(RunFolder(self.page.path).models)]
+        steps = [*kept, CURRENT]
+        if steps != self.steps:
+            value = steps.index(self.steps[self.slider.value]) if self.steps[self.slider.value] in steps else len(kept)
+            self.steps = steps
+            self.slider.props(f"max={len(kept)}")
+            self.slider.value = value
+        self.name()
+        self.status.text = self.player.problem
+        if self.page.values is not None and self.player.episode is not None:
+            self.page.values.show(self.player.episode, self.player.gamma)
+
+    def name(self) -> None:
+        """Says which policy the slider is at."""
+        model = self.player.model
+        known = {CURRENT: "current policy", BEST: "best policy"}
+        self.label.text = known.get(model) or f"at {int(model.removeprefix('step_')):,} steps"
+
+    def chosen(self) -> None:
+        """Lets the policy at the slider act."""
+        self.choose(self.steps[min(int(self.slider.value), len(self.steps) - 1)])
+        self.name()
+
+    def choose(self, model: str, seed: int | None = None) -> None:
+        """Lets a policy act, from a seed if one is given."""
+        if (model, seed) != (self.player.model, self.player.seed):
+            self.player.choose(model, seed)
+
+
+class Values:
+    """What the critic expected along an episode, and what followed. Mutable."""
+
+    def __init__(self) -> None:
+        with ui.card().classes("card w-full").props("flat bordered"):
+            self.title = ui.label().classes("text-weight-medium text")
+            self.figure = Figure()
+
+    def show(self, episode: Episode, gamma: float) -> None:
+        """Draws an episode, as far as it is."""
+        self.title.text = f"Value of each step, seed {episode.seed}"
+        to_go = episode.to_go(gamma) if episode.is_over else np.zeros(0)
+        if episode.rewards:
+            self.figure.show(charts.value_chart(np.array(episode.values), to_go))
+
+
+class Episodes:
+    """Histograms of returns, and the episodes behind a bar. Mutable."""
+
+    def __init__(self, page: RunPage) -> None:
+        self.page = page
+        self.histogram: dict[str, Any] | None = None
+        with ui.expansion("Episodes", value=True).classes("w-full"):
+            self.title = ui.label().classes("text")
+            self.figure = Figure(height="200px", choose=self.choose)
+            self.play = ui.button(f"Play {REPLAYS} episodes", icon="replay", on_click=self.replay)
+            self.play.props("outline dense no-caps padding='2px 10px'").set_visibility(False)
+            self.table = ui.table(rows=[], columns=EPISODES, row_key="seed", pagination=10).props("flat dense")
+            self.table.on("rowClick", lambda event: self.watch(event.args[1]))
+            self.table.set_visibility(False)
+            self.training_title = ui.label("Returns of the training episodes").classes("text")
+            self.training = Figure(height="200px")
+
+    def show(self, replays: dict[str, Any] | None, training: dict[str, Any] | None, has_model: bool) -> None:
+        """Draws the histograms."""
+        self.histogram = replays
+        self.title.text = TITLE if replays else ""
+        self.figure.set_visibility(replays is not None)
+        self.play.set_visibility(has_model)
+        self.training_title.set_visibility(training is not None)
+        if replays is not None:
+            self.figure.show(replays)
+        if training is not None:
+            self.training.show(training)
+
+    def choose(self, bar: int) -> None:
+        """Lists the episodes of a bar."""
+        h = self.histogram
+        if h is None or not 0 <= bar < len(h["rows"]):
+            return
+        self.figure.show(chosen=bar)
+        self.table.rows = [dict(zip(h["columns"], row, strict=True)) for row in h["rows"][bar]]
+        self.table.set_visibility(True)
+        self.table.update()
+
+    def watch(self, episode: dict[str, Any]) -> None:
+        """Shows an episode again: the best policy acts from its seed."""
+        if self.page.live is not None and isinstance(seed := episode.get("seed"), int):
+            self.page.live.choose(BEST, seed)
+            ui.notify(f"The best policy acts from the seed {seed}.")
+
+    def replay(self) -> None:
+        """Lets the best policy play episodes from known seeds, in a process of its own."""
+        path = self.page.path
+        processes.start(["report", str(path), "--replay", str(REPLAYS)], path)
+        ui.notify(f"The best policy plays {REPLAYS} episodes; they are listed here when it has finished.")
