@@ -41,14 +41,13 @@ def train(task: dict, say: Callable[[str], object] = print) -> Iterator[None]:
     with (path.parent / "commands.txt").open("a") as file:
         print("train" if is_new else "resume", path.name, file=file)
     steps, every = preset["total_steps"], preset["evaluate_every"]
-    end = steps if task["pause"] is None else min(state["step"] + task["pause"], steps)
     config = {"env": preset["env_id"], "algorithm": preset["algorithm"], "seed": state["seed"], "steps": steps}
     (path / "config.json").write_text(json.dumps({**config, "hyperparameters": preset["hyperparameters"]}))
     table = path / "evaluations.csv"
     rows = table.read_text().splitlines()[1:] if table.exists() else []
     rows = [row for row in rows if int(row.split(",")[0]) <= state["step"]]
     table.write_text("\n".join([HEADER, *rows]) + "\n")
-    while state["step"] < end:
+    while state["step"] < steps:
         if state["rate"] > 5e-3:
             say("rejeu: error: at step 20: the loss is NaN")
             return 2

@@ -99,14 +99,14 @@ def test_a_run_is_the_same_as_words_of_the_command_line_and_as_data(run, tmp_pat
     command, arguments = parsing.parse(run.words(), commands.COMMANDS, {}, "")
     assert command == "train"
     assert {one.name: getattr(arguments, one.name) for one in dataclasses.fields(run)} == dataclasses.asdict(run)
-    write_task(tmp_path / "task.json", Task(folder="runs/1", run=run, pause=7))
+    write_task(tmp_path / "task.json", Task(folder="runs/1", run=run))
     command, arguments = commands.of_task(read_task(tmp_path / "task.json"))
     assert {one.name: getattr(arguments, one.name) for one in dataclasses.fields(run)} == dataclasses.asdict(run)
-    assert (command, str(arguments.out), arguments.pause) == ("train", "runs/1", 7)
-    task = Task(folder="runs/1", run=run, pause=7, resume=True, no_report=True, changes={"gamma": 0.5})
+    assert (command, str(arguments.out), arguments.pause) == ("train", "runs/1", None)
+    task = Task(folder="runs/1", run=run, resume=True, no_report=True)
     command, arguments = commands.of_task(task)
-    assert (command, str(arguments.run), arguments.steps, arguments.finish) == ("resume", "runs/1", 7, True)
-    assert (arguments.hyperparameters, arguments.no_report, arguments.no_video) == ({"gamma": 0.5}, True, False)
+    assert (command, str(arguments.run), arguments.steps, arguments.finish) == ("resume", "runs/1", None, True)
+    assert (arguments.hyperparameters, arguments.no_report, arguments.no_video) == ({}, True, False)
     assert (arguments.imports, arguments.env_kwargs) == (run.imports, run.env_kwargs if run.names_code else {})
     assert (arguments.env, arguments.wrappers) == (run.env if run.names_code else None, run.wrappers)
 
@@ -121,12 +121,14 @@ def test_a_process_trains_and_continues_what_its_file_says(tmp_path):
     run = RunConfig(
         env="Pendulum-v1", algorithm="SAC", seed=3, steps=120, evaluate_episodes=1, hyperparameters=settings
     )
-    one = Task(folder=str(tmp_path / "data"), run=run, pause=70, no_report=True, no_video=True)
-    for part in (one, dataclasses.replace(one, resume=True, pause=None)):
-        write_task(tmp_path / "task.json", part)
-        assert main(["--task", str(tmp_path / "task.json")]) == 0
     words = ["train", "Pendulum-v1", "--algo", "SAC", "--seed", "3", "--steps", "120", "--evaluate-episodes", "1"]
-    assert main([*words, "--out", str(tmp_path / "words"), *FEWER_FILES, "--set", *TINY]) == 0
-    first, second = (rejeu.load(tmp_path / name / "agent.safetensors") for name in ("data", "words"))
-    for name, value in first.get_parameters().items():
-        np.testing.assert_array_equal(value, second.get_parameters()[name])
+    for folder, pause in (("words", []), ("continued", ["--pause", "70"])):
+        assert main([*words, "--out", str(tmp_path / folder), *pause, *FEWER_FILES, "--set", *TINY]) == 0
+    for folder, resume in (("begun", False), ("continued", True)):
+        one = Task(folder=str(tmp_path / folder), run=run, resume=resume, no_report=True, no_video=True)
+        write_task(tmp_path / "task.json", one)
+        assert main(["--task", str(tmp_path / "task.json")]) == 0
+    expected = rejeu.load(tmp_path / "words" / "agent.safetensors").get_parameters()
+    for folder in ("begun", "continued"):
+        for name, value in rejeu.load(tmp_path / folder / "agent.safetensors").get_parameters().items():
+            np.testing.assert_array_equal(value, expected[name], err_msg=f"{folder}, {name}")

@@ -573,14 +573,11 @@ def of_task(task: Task) -> tuple[str, Any]:
     run = {one.name: getattr(task.run, one.name) for one in fields(task.run)}
     shared: dict[str, Any] = {"no_report": task.no_report, "no_video": task.no_video}
     if not task.resume:
-        return "train", Train(**run, **shared, out=Path(task.folder), pause=task.pause)
+        return "train", Train(**run, **shared, out=Path(task.folder))
     again = {name: run[name] for name in ("imports", "restart_workers", "ray", "env_cpus")}
     if task.run.names_code:
         again |= {"env": task.run.typed, "env_kwargs": task.run.env_kwargs, "wrappers": task.run.wrappers}
-    resume = Resume(
-        run=Path(task.folder), finish=True, steps=task.pause, hyperparameters=task.changes, **again, **shared
-    )
-    return "resume", resume
+    return "resume", Resume(run=Path(task.folder), finish=True, **again, **shared)
 
 
 def check_options(arguments: Any) -> None:

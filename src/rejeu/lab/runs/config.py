@@ -355,10 +355,6 @@ class Task:
     run: RunConfig
     resume: bool = False
     """Whether it is continued from its newest checkpoint, or its files are completed; else it begins."""
-    changes: dict[Key, Any] = field(default_factory=dict)
-    """Hyperparameters to change where it is continued, by dotted name."""
-    pause: Positive | None = None
-    """Pause after so many environment steps."""
     no_report: bool = False
     no_video: bool = False
 
