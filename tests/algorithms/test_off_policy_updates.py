@@ -179,7 +179,7 @@ def test_the_target_is_the_reward_where_the_mdp_terminated_and_dtypes_are_not_mi
         ),
         "DDPG, Discrete": lambda: (
             ddpg_discrete.critic_loss(state.critic, batch, target),
-            ddpg_discrete.actor_loss(state.actor, state.critic(batch.obs), batch.obs),
+            ddpg_discrete.actor_loss(state.actor, state.critic, batch.obs),
         ),
         "TD3": lambda: td3.critics_loss(state.critics, batch, target),
         "SAC": lambda: (

@@ -57,7 +57,6 @@ class Config(EntropyConfig):
 
     learning_rate: float | Schedule = 1e-3
     policy_delay: int = 3
-    """Gradient steps of the critics per step of actor and temperature. A larger number computes less."""
     renorm_warmup_steps: int = 100_000
     """Training passes through each layer that are normalized by the batch alone, before its renormalization begins; the
     actor's count is ``policy_delay`` times slower."""
@@ -77,7 +76,6 @@ class Config(EntropyConfig):
 
     def __post_init__(self) -> None:
         EntropyConfig.__post_init__(self)
-        coerce(self, "policy_delay", whole, least=1)
         coerce(self, "renorm_warmup_steps", whole, least=0)
         check_shape(self.policy_kwargs, self.name)
 

@@ -69,7 +69,6 @@ class Config(EntropyConfig):
     value_limit: float = 5.0
     """Largest value of a critic, and minus the smallest. Scaled returns must fit: it is ``max_return`` of ``normalize``."""
     policy_delay: int = 2
-    """Gradient steps of the critics per step of actor and temperature. A larger number computes less."""
 
     name: ClassVar[str] = "FlashSAC"
     target_update_interval: ClassVar[int] = 1
@@ -87,7 +86,6 @@ class Config(EntropyConfig):
 
     def __post_init__(self) -> None:
         EntropyConfig.__post_init__(self)
-        coerce(self, "policy_delay", whole, least=1)
         coerce(self, "n_bins", whole, least=2, most=MOST_OUTPUTS)
         coerce(self, "value_limit", number, above=0, most=LARGEST_VALUE)
         check_shape(self.policy_kwargs, self.name)

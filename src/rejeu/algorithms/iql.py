@@ -37,7 +37,6 @@ from rejeu.core.algorithm import (
     PyTree,
     Transition,
     copy,
-    ensemble,
     minimize,
     polyak,
     weighted_mean,
@@ -46,10 +45,8 @@ from rejeu.core.distributions import Normal
 from rejeu.core.schedules import at
 from rejeu.core.spaces import action_dimension, check_box_action
 from rejeu.core.validation import coerce, number, whole
-from rejeu.networks import Network, QNetwork, action_values, values_by_critics
+from rejeu.networks import Network, QNetwork, action_values, actor_and_critics, values_by_critics
 
-HIDDEN_LAYERS = (256, 256)
-"""Default widths of all networks but on images, those of the paper."""
 LOG_STD_RANGE = (-5.0, 2.0)
 """Limits of the policy's log standard deviation; those of the authors' code."""
 MOST_WEIGHT = 100.0
@@ -115,16 +112,14 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         TypeError: if the observation space holds something that is not an array.
     """
     action_dim = action_dimension(check_box_action(action_space, config.name))
-    obs_leaves, shape = network_inputs(config, observation_space)
+    obs_leaves, shape = inputs = network_inputs(config, observation_space)
     optimizer = optimizers.make(config.optimizer, config.max_grad_norm)
-    widths = shape.critic_widths(HIDDEN_LAYERS)
+    network, make_critics = actor_and_critics(inputs, action_dim, config.n_critics, QNetwork, action_dim)
 
     def init(key: Array) -> State:
         actor_key, critics_key, value_key = jax.random.split(key, 3)
-        network = Network(actor_key, obs_leaves, action_dim, shape.actor_widths(HIDDEN_LAYERS), shape)
-        actor = Actor(network, jnp.zeros((action_dim,), jnp.float32))
-        critics = ensemble(lambda k: QNetwork(k, obs_leaves, action_dim, widths, shape), critics_key, config.n_critics)
-        value = Network(value_key, obs_leaves, 1, widths, shape)
+        actor, critics = Actor(network(actor_key), jnp.zeros((action_dim,), jnp.float32)), make_critics(critics_key)
+        value = Network(value_key, obs_leaves, 1, shape.critic_widths(), shape)
         return State(actor, critics, value, copy(critics), *map(optimizer.init, (actor, critics, value)))
 
     def update(state: State, batch: Transition, clock: Clock) -> tuple[State, Metrics]:

@@ -63,6 +63,8 @@ class EntropyConfig(OffPolicyConfig):
     distributions with this standard deviation, the range of an action being [-1, 1]."""
     n_critics: int = 2
     """Number of critics."""
+    policy_delay: int = 1
+    """Gradient steps of the critics per step of actor and temperature. A larger number computes less."""
     noise_repeat: int = 1
     """Most steps for which the noise of an action stays the same; most spells are short (FlashSAC). A larger number explores
     further from where the policy is. Box actions only, without ``action_noise``. 1: fresh noise in every step."""
@@ -75,7 +77,7 @@ class EntropyConfig(OffPolicyConfig):
         for key, given in (("action_noise", self.action_noise is not None), ("lstm_hidden_size", self.has_memory)):
             if self.noise_repeat > 1 and given:
                 raise ValueError(f"noise_repeat={self.noise_repeat} is not available with {key}; leave one of them out")
-        coerce(self, "n_critics", whole, least=1)
+        coerce(self, ("n_critics", "policy_delay"), whole, least=1)
 
     def entropy_target(self, automatic: float, action_dim: int = 0) -> float:
         """Returns the target entropy in nats, ``automatic`` for ``"auto"``.

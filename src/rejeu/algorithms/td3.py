@@ -27,14 +27,7 @@ from jax import Array
 
 from rejeu.algorithms import optimizers
 from rejeu.algorithms.config import network_inputs
-from rejeu.algorithms.ddpg.continuous import (
-    HIDDEN_LAYERS,
-    DeterministicPolicyConfig,
-    actor_loss,
-    explore,
-    metrics_of,
-    policy,
-)
+from rejeu.algorithms.ddpg.continuous import DeterministicPolicyConfig, actor_loss, explore, metrics_of, policy
 from rejeu.algorithms.memory import remembering
 from rejeu.core.algorithm import (
     AVERAGED,
@@ -45,7 +38,6 @@ from rejeu.core.algorithm import (
     Transition,
     copy,
     descend,
-    ensemble,
     minimize,
     polyak,
     value_and_grad,
@@ -56,7 +48,7 @@ from rejeu.core.prng import nth
 from rejeu.core.schedules import at
 from rejeu.core.spaces import action_dimension, check_box_action
 from rejeu.core.validation import coerce, number, whole
-from rejeu.networks import Network, QNetwork, action_values, first, values_by_critics, with_memory
+from rejeu.networks import Network, QNetwork, action_values, actor_and_critics, first, values_by_critics
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,30 +120,17 @@ def make_with(
         critic_layer_norm: whether the hidden layers of critics are normalized, whatever those of the actor are.
     """
     action_dim = action_dimension(check_box_action(action_space, config.name))
-    obs_leaves, shape = network_inputs(config, observation_space)
+    inputs = network_inputs(config, observation_space)
     optimizer = optimizers.make(config.optimizer, config.max_grad_norm)
-    critic_shape = shape
+    shape = critic_shape = inputs[1]
     if critic_layer_norm and shape.architecture == "mlp" and shape.torso is None and not shape.has_branches:
         critic_shape = dataclasses.replace(shape, layer_norm=True)
+    settings = config.n_critics, QNetwork, action_dim
+    make_actor, make_critics = actor_and_critics(inputs, action_dim, *settings, critic_shape=critic_shape)
 
     def init(key: Array) -> State:
         actor_key, critics_key, update_key = jax.random.split(key, 3)
-        widths = shape.critic_widths(HIDDEN_LAYERS)
-        actor = with_memory(
-            actor_key,
-            obs_leaves,
-            shape,
-            lambda leaves, shape: Network(actor_key, leaves, action_dim, shape.actor_widths(HIDDEN_LAYERS), shape),
-        )
-        critics = with_memory(
-            critics_key,
-            obs_leaves,
-            critic_shape,
-            lambda leaves, shape: ensemble(
-                lambda k: QNetwork(k, leaves, action_dim, widths, shape), critics_key, config.n_critics
-            ),
-            slot=1,
-        )
+        actor, critics = make_actor(actor_key), make_critics(critics_key)
         return State(
             actor=actor,
             critics=critics,
@@ -197,7 +176,7 @@ def make_with(
 
 def policy_loss(actor: Network, critics: QNetwork, batch: Transition) -> Array:
     """Returns the loss of the actor by the first of the critics."""
-    return actor_loss(actor, first(critics), batch.obs)
+    return actor_loss(actor, first(critics), batch.obs)[0]
 
 
 def smoothed_action(target_actor: Network, next_obs: PyTree, key: Array, sigma: float, clip: float) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -10,11 +10,11 @@ import jax
 import jax.numpy as jnp
 from jax import Array, ShapeDtypeStruct
 
-from rejeu.core.algorithm import PyTree
+from rejeu.core.algorithm import PyTree, ensemble
 from rejeu.core.spaces import Leaf
 from rejeu.networks.encoder import make_encoder
 from rejeu.networks.layers import ACTIVATIONS, MLP, LayerNorm, Linear, own_module
-from rejeu.networks.memory import each
+from rejeu.networks.memory import each, with_memory
 from rejeu.networks.shape import PolicyConfig
 
 
@@ -209,3 +209,36 @@ def action_values(critics: Any, obs: PyTree, action: Array) -> Array:
 def values_by_critics(state: Any, obs: PyTree, action: Array) -> Array:
     """Returns the same of the critics in the state of an algorithm; for ``Algorithm.action_values``."""
     return action_values(state.critics, obs, action)
+
+
+def actor_and_critics(
+    inputs: tuple[tuple[Leaf, ...], PolicyConfig],
+    n_outputs: int,
+    n_critics: int,
+    kind: Any,
+    *sizes: int,
+    critic_shape: PolicyConfig | None = None,
+) -> tuple[Callable[[Array], Any], Callable[[Array], Any]]:
+    """Returns functions of a key that build an actor of ``n_outputs``, and ``n_critics`` stacked critics.
+
+    Args:
+        inputs: the leaves of observations, and the shape of the networks with its widths.
+        n_outputs: of the actor.
+        n_critics: number of critics.
+        kind: class of a critic.
+        sizes: its numbers of actions and outputs, as it takes them.
+        critic_shape: of the critics, if it is another.
+    """
+    leaves, shape = inputs
+
+    def actor(key: Array) -> Any:
+        build = lambda leaves, shape: Network(key, leaves, n_outputs, shape.actor_widths(), shape)  # noqa: E731
+        return with_memory(key, leaves, shape, build)
+
+    def critics(key: Array) -> Any:
+        size, *more = sizes
+        one = lambda leaves, shape: lambda key: kind(key, leaves, size, shape.critic_widths(), shape, *more)  # noqa: E731
+        build = lambda leaves, shape: ensemble(one(leaves, shape), key, n_critics)  # noqa: E731
+        return with_memory(key, leaves, critic_shape or shape, build, slot=1)
+
+    return actor, critics

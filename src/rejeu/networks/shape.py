@@ -118,11 +118,11 @@ class PolicyConfig:
         """Whether the networks are nets of branches."""
         return any(getattr(self, key) for key in BRANCHES)
 
-    def actor_widths(self, default: tuple[int, ...]) -> tuple[int, ...]:
+    def actor_widths(self, default: tuple[int, ...] = ()) -> tuple[int, ...]:
         """Returns the widths of the actor's hidden layers: of its last part with branches, of each block with SimBa."""
         return self._chosen(self.pi, self.actor_layers, default)
 
-    def critic_widths(self, default: tuple[int, ...]) -> tuple[int, ...]:
+    def critic_widths(self, default: tuple[int, ...] = ()) -> tuple[int, ...]:
         """Returns the widths of each critic's hidden layers, likewise."""
         return self._chosen(self.qf, self.critic_layers, default)
 

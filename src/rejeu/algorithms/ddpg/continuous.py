@@ -15,6 +15,7 @@ For Discrete actions see :mod:`rejeu.algorithms.ddpg.discrete`.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -33,15 +34,12 @@ from rejeu.core.algorithm import (
     Algorithm,
     Clock,
     Metrics,
-    Optimizer,
     PyTree,
     Transition,
     copy,
-    descend,
     minimize,
     polyak,
     tau_at,
-    value_and_grad,
     weighted_mean,
     without_gradient,
 )
@@ -96,49 +94,49 @@ class State(eqx.Module):
 def make(config: Config, observation_space: spaces.Space, action_space: spaces.Space) -> Algorithm:
     """Returns DDPG for Box actions."""
     action_dim = action_dimension(check_box_action(action_space, config.name))
+    values = lambda state, obs, action: action_value(state.critic, obs, action)[None]  # noqa: E731
+    parts = make_with(config, observation_space, action_dim, QNetwork, td_target, critic_loss, actor_loss)
+    return Algorithm(*parts[:2], explore, policy, parts[2], action_values=values)
+
+
+def make_with(
+    config: Config,
+    observation_space: spaces.Space,
+    n_outputs: int,
+    kind: Any,
+    td_target: Callable[[Any, Any, Transition], Array],
+    critic_loss: Callable[[Any, Transition, Array], tuple[Array, Array]],
+    actor_loss: Callable[[Any, Any, PyTree], tuple[Array, Metrics]],
+) -> tuple[Any, Any, Any]:
+    """Returns ``init``, ``actor`` and ``update`` of DDPG with losses as those of this module.
+
+    The actor has ``n_outputs``, which the critic, of the class ``kind``, takes or gives. With the actor's loss come metrics.
+    """
     obs_leaves, shape = network_inputs(config, observation_space)
     optimizer = optimizers.make(config.optimizer, config.max_grad_norm)
 
     def init(key: Array) -> State:
         actor_key, critic_key = jax.random.split(key)
-        actor = Network(actor_key, obs_leaves, action_dim, shape.actor_widths(HIDDEN_LAYERS), shape)
-        critic = QNetwork(critic_key, obs_leaves, action_dim, shape.critic_widths(HIDDEN_LAYERS), shape)
-        return initial_state(actor, critic, optimizer)
+        actor = Network(actor_key, obs_leaves, n_outputs, shape.actor_widths(), shape)
+        critic = kind(critic_key, obs_leaves, n_outputs, shape.critic_widths(), shape)
+        targets = copy(actor), copy(critic)
+        return State(actor, critic, *targets, optimizer.init(actor), optimizer.init(critic), jnp.int32(0))
 
     def update(state: State, batch: Transition, clock: Clock) -> tuple[State, Metrics]:
-        rate = at(config.learning_rate, clock.progress)
+        rate, n_updates = at(config.learning_rate, clock.progress), state.n_updates + 1
         target = without_gradient(td_target)(state.target_actor, state.target_critic, batch)
         critic, critic_optimizer, loss, values = minimize(
             critic_loss, state.critic, state.critic_optimizer, optimizer, rate, batch, target
         )
-        policy_loss, gradients = value_and_grad(actor_loss)(state.actor, critic, batch.obs)
-        actor, actor_optimizer = descend(state.actor, gradients, state.actor_optimizer, optimizer, rate)
-        metrics = metrics_of(loss, policy_loss, values, jnp.abs(values - target))
-        return next_state(state, config, (actor, actor_optimizer), (critic, critic_optimizer)), metrics
+        actor, actor_optimizer, policy_loss, more = minimize(
+            actor_loss, state.actor, state.actor_optimizer, optimizer, rate, critic, batch.obs
+        )
+        tau = tau_at(n_updates, config.tau, config.target_update_interval)
+        targets = polyak(state.target_actor, actor, tau), polyak(state.target_critic, critic, tau)
+        metrics = metrics_of(loss, policy_loss, values, jnp.abs(values - target)) | more
+        return State(actor, critic, *targets, actor_optimizer, critic_optimizer, n_updates), metrics
 
-    values = lambda state, obs, action: action_value(state.critic, obs, action)[None]  # noqa: E731
-    return Algorithm(init, lambda state: state.actor, explore, policy, update, action_values=values)
-
-
-def initial_state(actor: Network, critic: Any, optimizer: Optimizer) -> State:
-    """Returns the state before the first update."""
-    targets = copy(actor), copy(critic)
-    return State(actor, critic, *targets, optimizer.init(actor), optimizer.init(critic), jnp.int32(0))
-
-
-def next_state(state: State, config: Config, actor: tuple[Network, PyTree], critic: tuple[Any, PyTree]) -> State:
-    """Returns the state after an update, from the new networks with their optimizer states; both targets are updated."""
-    n_updates = state.n_updates + 1
-    tau = tau_at(n_updates, config.tau, config.target_update_interval)
-    return State(
-        actor=actor[0],
-        critic=critic[0],
-        target_actor=polyak(state.target_actor, actor[0], tau),
-        target_critic=polyak(state.target_critic, critic[0], tau),
-        actor_optimizer=actor[1],
-        critic_optimizer=critic[1],
-        n_updates=n_updates,
-    )
+    return init, lambda state: state.actor, update
 
 
 def metrics_of(critic_loss: Array, actor_loss: Array, values: Array, td_error: Array) -> Metrics:
@@ -173,6 +171,6 @@ def critic_loss(critic: QNetwork, batch: Transition, target: Array) -> tuple[Arr
     return weighted_mean(jnp.square(values - target), batch.weight), values
 
 
-def actor_loss(actor: Network, critic: QNetwork, obs: PyTree) -> Array:
-    """Returns minus the mean value of the actor's own actions."""
-    return -jnp.mean(action_value(critic, obs, policy(actor, obs)))
+def actor_loss(actor: Network, critic: QNetwork, obs: PyTree) -> tuple[Array, Metrics]:
+    """Returns minus the mean value of the actor's own actions, and no metrics."""
+    return -jnp.mean(action_value(critic, obs, policy(actor, obs))), {}

@@ -19,21 +19,9 @@ import jax.numpy as jnp
 from gymnasium import spaces
 from jax import Array
 
-from rejeu.algorithms import optimizers
-from rejeu.algorithms.config import network_inputs
-from rejeu.algorithms.ddpg.continuous import HIDDEN_LAYERS, Config, State, initial_state, metrics_of, next_state
+from rejeu.algorithms.ddpg.continuous import Config, make_with
 from rejeu.algorithms.sac.discrete import exploit, explore, imitation
-from rejeu.core.algorithm import (
-    Algorithm,
-    Clock,
-    Metrics,
-    PyTree,
-    Transition,
-    minimize,
-    weighted_mean,
-    without_gradient,
-)
-from rejeu.core.schedules import at
+from rejeu.core.algorithm import Algorithm, Metrics, PyTree, Transition, weighted_mean
 from rejeu.networks import Network
 
 ENTROPY_COEFFICIENT = 0.01
@@ -42,31 +30,9 @@ ENTROPY_COEFFICIENT = 0.01
 
 def make(config: Config, observation_space: spaces.Space, action_space: spaces.Discrete) -> Algorithm:
     """Returns DDPG for Discrete actions."""
-    obs_leaves, shape = network_inputs(config, observation_space)
-    n_actions, optimizer = int(action_space.n), optimizers.make(config.optimizer, config.max_grad_norm)
-
-    def init(key: Array) -> State:
-        actor_key, critic_key = jax.random.split(key)
-        actor = Network(actor_key, obs_leaves, n_actions, shape.actor_widths(HIDDEN_LAYERS), shape)
-        critic = Network(critic_key, obs_leaves, n_actions, shape.critic_widths(HIDDEN_LAYERS), shape)
-        return initial_state(actor, critic, optimizer)
-
-    def update(state: State, batch: Transition, clock: Clock) -> tuple[State, Metrics]:
-        rate = at(config.learning_rate, clock.progress)
-        target = without_gradient(td_target)(state.target_actor, state.target_critic, batch)
-        critic, critic_optimizer, loss, values = minimize(
-            critic_loss, state.critic, state.critic_optimizer, optimizer, rate, batch, target
-        )
-        actor, actor_optimizer, policy_loss, entropy = minimize(
-            actor_loss, state.actor, state.actor_optimizer, optimizer, rate, critic(batch.obs), batch.obs
-        )
-        metrics = metrics_of(loss, policy_loss, values, jnp.abs(values - target)) | {"entropy": entropy}
-        return next_state(state, config, (actor, actor_optimizer), (critic, critic_optimizer)), metrics
-
     values = lambda state, obs, action: state.critic(obs)[None]  # noqa: E731
-    return Algorithm(
-        init, lambda state: state.actor, explore, exploit, update, action_values=values, imitation=imitation
-    )
+    parts = make_with(config, observation_space, int(action_space.n), Network, td_target, critic_loss, actor_loss)
+    return Algorithm(*parts[:2], explore, exploit, parts[2], action_values=values, imitation=imitation)
 
 
 def td_target(target_actor: Network, target_critic: Network, batch: Transition) -> Array:
@@ -81,12 +47,11 @@ def critic_loss(critic: Network, batch: Transition, target: Array) -> tuple[Arra
     return weighted_mean(jnp.square(values - target), batch.weight), values
 
 
-def actor_loss(actor: Network, values: Array, obs: PyTree) -> tuple[Array, Array]:
-    """Returns minus the expected value less the entropy bonus, and the mean entropy in nats.
-
-    ``values`` are those of all actions, ``(batch, n_actions)``.
-    """
+def actor_loss(actor: Network, critic: Network, obs: PyTree) -> tuple[Array, Metrics]:
+    """Returns minus the expected value less the entropy bonus, and the mean entropy in nats."""
+    values = critic(obs)
     log_probabilities = jax.nn.log_softmax(actor(obs))
     probabilities = jnp.exp(log_probabilities)
     entropy = jnp.mean(-jnp.sum(probabilities * log_probabilities, axis=-1))
-    return -jnp.mean(jnp.sum(probabilities * values, axis=-1)) - ENTROPY_COEFFICIENT * entropy, entropy
+    loss = -jnp.mean(jnp.sum(probabilities * values, axis=-1)) - ENTROPY_COEFFICIENT * entropy
+    return loss, {"entropy": entropy}

@@ -34,31 +34,30 @@ from jax import Array
 
 from rejeu.algorithms import optimizers
 from rejeu.algorithms.actor_critic.network import sde_explorer, sde_log_std
+from rejeu.algorithms.config import network_inputs
 from rejeu.algorithms.memory import remembering
 from rejeu.algorithms.soft import EntropyConfig, SoftCritic, soft_actor_critic
-from rejeu.core.algorithm import Algorithm, Clock, Explorer, PyTree, Transition, ensemble, weighted_mean
+from rejeu.core.algorithm import Algorithm, Clock, Explorer, PyTree, Transition, weighted_mean
 from rejeu.core.distributions import TanhNormal
-from rejeu.core.spaces import Leaf, action_dimension, check_box_action, leaves
+from rejeu.core.spaces import Leaf, action_dimension, check_box_action
 from rejeu.core.validation import coerce, flag, number, whole
 from rejeu.exploration.held_noise import held_explorer
 from rejeu.networks import (
     Network,
     QNetwork,
     action_values,
+    actor_and_critics,
     make_encoder,
     make_head,
     make_torso,
     some,
     with_dropout,
-    with_memory,
 )
 
 LOG_STD_RANGE = (-20.0, 2.0)
 """Bounds of the policy's log standard deviation, in nats, as in the authors' code."""
 SDE_MEAN = 2.0
 """Largest mean of a policy with gSDE before squashing."""
-HIDDEN_LAYERS = (256, 256)
-"""Default widths of actor and critics."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,8 +69,6 @@ class Config(EntropyConfig):
     target_subset: int | None = None
     """Number of critics, drawn anew for each update, of which the target takes the smallest value; the actor then follows
     the mean of all (REDQ, arXiv 2101.05982). A larger number is more pessimistic. None: the smallest of all, for both."""
-    policy_delay: int = 1
-    """Gradient steps of the critics per step of actor and temperature. A larger number computes less."""
     use_sde: bool = False
     """Explore by state-dependent noise (gSDE, arXiv 2005.05719), which is kept for many steps and gives smooth motion. Box
     actions only, without ``action_noise``."""
@@ -87,7 +84,7 @@ class Config(EntropyConfig):
 
     def __post_init__(self) -> None:
         EntropyConfig.__post_init__(self)
-        coerce(self, ("target_update_interval", "policy_delay"), whole, least=1)
+        coerce(self, "target_update_interval", whole, least=1)
         coerce(self, "target_subset", whole, least=1, optional=True)
         if (self.target_subset or 0) > self.n_critics:
             raise ValueError(f"target_subset={self.target_subset} is more than n_critics={self.n_critics}")
@@ -128,12 +125,11 @@ class SdeActor(eqx.Module):
     """``(width, action_dim)``."""
     use_expln: bool = eqx.field(static=True, default=False)
 
-    def __init__(self, key: Array, obs_leaves: tuple[Leaf, ...], action_dim: int, config: Config) -> None:
-        shape = config.policy_kwargs
+    def __init__(self, key: Array, inputs: tuple[tuple[Leaf, ...], Any], action_dim: int, config: Config) -> None:
+        obs_leaves, shape = inputs
         encoder_key, torso_key, head_key = jax.random.split(key, 3)
         self.encoder = make_encoder(encoder_key, obs_leaves, shape)
-        widths = shape.actor_widths(HIDDEN_LAYERS)
-        self.torso, width = make_torso(torso_key, self.encoder.n_features, None, widths, shape)
+        self.torso, width = make_torso(torso_key, self.encoder.n_features, None, shape.actor_widths(), shape)
         self.head = make_head(head_key, width, action_dim, shape)
         self.log_std = jnp.full((width, action_dim), config.sde_log_std_init, jnp.float32)
 
@@ -216,21 +212,11 @@ def networks(
     A critic is of the class ``kind``, with ``sizes`` where it takes numbers of actions and outputs. With gSDE the actor has
     half as many outputs, the means.
     """
-    obs_leaves, shape = leaves(observation_space), config.policy_kwargs
-
-    def actor(key: Array) -> Any:
-        if config.use_sde:
-            return SdeActor(key, obs_leaves, n_outputs // 2, config)
-        build = lambda leaves, shape: Network(key, leaves, n_outputs, shape.actor_widths(HIDDEN_LAYERS), shape)  # noqa: E731
-        return with_memory(key, obs_leaves, shape, build)
-
-    def critics(key: Array) -> Any:
-        widths, (size, *more) = shape.critic_widths(HIDDEN_LAYERS), sizes
-        critic = lambda leaves, shape: lambda key: kind(key, leaves, size, widths, shape, *more)  # noqa: E731
-        build = lambda leaves, shape: ensemble(critic(leaves, shape), key, config.n_critics)  # noqa: E731
-        return with_memory(key, obs_leaves, shape, build, slot=1)
-
-    return actor, critics
+    inputs = network_inputs(config, observation_space)
+    actor, critics = actor_and_critics(inputs, n_outputs, config.n_critics, kind, *sizes)
+    return (
+        partial(SdeActor, inputs=inputs, action_dim=n_outputs // 2, config=config) if config.use_sde else actor
+    ), critics
 
 
 def explorer_of(config: Config, action_dim: int) -> Explorer | None:
