@@ -53,11 +53,6 @@ def test_an_impossible_number_of_steps_is_refused(agent, total):
         agent.learn(total)
 
 
-def test_minutes_end_a_run():
-    agent = small_sac(counters(1), learning_starts=NEVER).learn(minutes=0.2 / 60)
-    assert 1 < agent.num_timesteps < 10**6
-
-
 # Updates.
 
 
@@ -123,13 +118,6 @@ def test_training_actions_respect_asymmetrical_bounds_and_reach_both_ends():
     assert actions.dtype == np.float32
 
 
-def test_what_is_stored_is_the_action_before_scaling():
-    env = Counter((5,), low=[2.0], high=[6.0])
-    agent = small_sac(env, learning_starts=NEVER).learn(5)
-    stored = agent.replay_buffer.ring.action[:5, 0]
-    np.testing.assert_allclose(np.stack(env.actions)[:, 0], 4.0 + 2.0 * stored, rtol=1e-6)
-
-
 def test_the_first_actions_are_random_and_later_ones_the_policys():
     """The policy's actions hardly vary when its standard deviation is e^-20."""
     env = Counter((50,))
@@ -168,29 +156,6 @@ def test_stored_transitions_are_consecutive_moments_of_one_episode(n_envs):
 
 
 # Episodes.
-
-
-def test_episodes_are_recorded_with_return_and_length():
-    agent = small_sac(counters(2, (3, 5)), learning_starts=NEVER).learn(32)
-    assert agent.history["length"].tolist() == [3, 3, 5, 5, 3, 3, 5, 5]
-    assert agent.history["return"].tolist() == [3, 3, 510, 510, 603, 603, 1510, 1510]
-    assert agent.history["env"].tolist() == [0, 1] * 4
-    assert agent.history["step"].tolist() == [6, 6, 16, 16, 22, 22, 32, 32]
-
-
-def test_the_window_of_statistics_keeps_the_last_episodes():
-    agent = small_sac(counters(1, (2,)), learning_starts=NEVER, stats_window_size=3).learn(20)
-    assert [(e["r"], e["l"]) for e in agent.ep_info_buffer] == [(100 * 2 * k + 1, 2) for k in (7, 8, 9)]
-    assert agent.ep_info_buffer.maxlen == 3
-    assert agent.statistics()["rollout/ep_rew_mean"] == pytest.approx(1601.0)
-    assert agent.statistics()["rollout/ep_len_mean"] == 2.0
-    assert "rollout/success_rate" not in agent.statistics()
-    reaching = small_sac(Reach()).learn(40)
-    assert len(reaching.ep_success_buffer) == 4
-    row = reaching.statistics()
-    assert row["rollout/success_rate"] == np.mean(reaching.ep_success_buffer)
-    assert {"train/critic_loss", "train/actor_loss", "train/ent_coef", "train/n_updates"} <= set(row)
-    assert all(isinstance(value, int | float) for value in row.values())
 
 
 @pytest.mark.parametrize("window", [1, 200])

@@ -63,13 +63,6 @@ def test_callbacks_of_every_step_train_on_the_host_and_are_named(callback: Any) 
         agent.learn(30, callback())
 
 
-def test_an_agent_that_must_train_on_the_device_says_why_it_cannot() -> None:
-    agent = rejeu.DQN("MlpPolicy", rejeu.make_vector("CartPole-v1"), policy_kwargs={"net_arch": [8]})
-    agent.on_device = True
-    with pytest.raises(ValueError, match="the backend of CartPole-v1 is 'gymnasium', not 'jax'"):
-        agent.learn(30)
-
-
 def test_more_steps_than_32_bits_count_are_refused() -> None:
     with pytest.raises(ValueError, match=r"would end at step 5,000,000,000, and steps are counted up to 4,294,967,294"):
         make(rejeu.DQN, "jax/CartPole-v1").learn(5_000_000_000)

@@ -9,7 +9,7 @@ import pytest
 
 import rejeu
 from rejeu.callbacks import Checkpoint
-from rejeu.envs.make import InProcess, make_vector
+from rejeu.envs.make import make_vector
 from rejeu.sb3.common.evaluation import evaluate_policy
 from rejeu.sb3.common.vec_env import DummyVecEnv
 from tests.environments import Counter
@@ -152,60 +152,7 @@ def test_other_environments_are_refused_while_the_agent_learns_and_the_fix_is_sa
 # Between two calls of learn.
 
 
-@every_way
-def test_training_goes_on_in_new_episodes_after_its_environment_was_played_in(how):
-    env = Counter((5,))
-    agent = small_sac(env, learning_starts=NEVER).learn(7)
-    OWN[how](agent, env)
-    agent.learn(6, reset_num_timesteps=False)
-    assert [e.length for e in agent.history.episodes] == [5, 5]
-
-
 # Action masks.
-
-
-class One(gym.Env):
-    """Allows one of ten actions at a time and counts the others; episodes of 6 steps."""
-
-    observation_space = gym.spaces.Box(0.0, 1.0, (1,), np.float32)
-    action_space = gym.spaces.Discrete(10)
-
-    def __init__(self):
-        self.taken = self.illegal = 0
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.time = 0
-        return self._see()
-
-    def step(self, action):
-        self.taken += 1
-        legal = action == self.allowed
-        self.illegal += not legal
-        self.time += 1
-        obs, info = self._see()
-        return obs, float(legal), False, self.time == 6, info
-
-    def _see(self):
-        self.allowed = int(self.np_random.integers(10))
-        return np.zeros(1, np.float32), {"action_mask": np.arange(10) == self.allowed}
-
-
-@pytest.fixture(scope="module")
-def masked():
-    """An agent that takes masks; tests may train it."""
-    return rejeu.MaskablePPO("MlpPolicy", One(), n_steps=12, batch_size=12, policy_kwargs={"net_arch": [4]}, seed=0)
-
-
-@pytest.mark.parametrize("deterministic", [True, False])
-@pytest.mark.parametrize(
-    "wrap", [lambda env: env, lambda env: DummyVecEnv([lambda: env]), lambda env: InProcess([env])]
-)
-def test_evaluate_policy_keeps_to_the_masks(masked, wrap, deterministic):
-    env = One()
-    mean, _ = evaluate_policy(masked, wrap(env), 3, deterministic)
-    assert (env.taken, env.illegal) == (18, 0)
-    assert mean == 6.0
 
 
 def test_training_does_not_go_on_from_the_seed_of_an_evaluation():

@@ -164,14 +164,6 @@ def test_success_is_that_of_the_environments_stepped(mode):
     assert set(outcomes) == {True, False}
 
 
-def test_a_vector_that_overwrites_its_observations_keeps_those_left_out():
-    vector = GymnasiumVector(SyncVectorEnv(counters(), copy=False, autoreset_mode=AutoresetMode.DISABLED), seed=7)
-    vector.reset()
-    vector.step(no_action(vector))
-    step = vector.step(no_action(vector), np.array([True, False, True]))
-    np.testing.assert_array_equal(step.obs[:, 1], [2, 1, 2])
-
-
 @pytest.mark.parametrize(
     ("active", "words"),
     [

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import time
 import tracemalloc
 from types import SimpleNamespace
 
@@ -171,15 +170,6 @@ def test_loading_a_hundred_times_keeps_no_memory(tmp_path):
 
 
 # Logging.
-
-
-def test_a_clock_that_stands_still_does_not_end_a_run(monkeypatch):
-    agent = small_sac(Counter((5,)), learning_starts=NEVER)
-    now = time.perf_counter()
-    monkeypatch.setattr(time, "perf_counter", lambda: now)
-    agent.learn(12)
-    assert agent.num_timesteps == 12
-    assert len(agent.history) == 2
 
 
 @pytest.mark.parametrize(

@@ -100,22 +100,6 @@ def test_the_steps_asked_for_are_taken_exactly_and_an_incomplete_rollout_waits()
     assert agent.history["length"].tolist() == [2, 4, 7]
 
 
-def test_a_run_that_stopped_within_an_episode_goes_on_with_it():
-    env = counters(((6,), (6,)))
-    agent = small(env, n_episodes=1, n_steps=6).learn(4).learn(8)
-    assert [(e.length, e.episode_return) for e in agent.history.episodes] == [(6, 15.0)] * 2
-    assert agent.n_updates == 1
-
-
-def test_a_rollout_of_whole_episodes_begins_again_where_new_episodes_must_begin():
-    env = counters(((6,), (6,)))
-    agent = small(env, n_episodes=1, n_steps=6).learn(4)
-    agent.evaluate(1)  # in the same environments
-    (_, rollout), *_ = rollouts_of(agent, 12)
-    assert rollout.valid.sum(axis=0).tolist() == [6, 6]
-    assert rollout.ended[:, 0].tolist() == [False] * 5 + [True]
-
-
 def test_normalisation_does_not_see_who_waits():
     env = counters()
     agent = small(env, n_episodes=1, n_steps=7, normalize=True).learn(2 + 4 + 7)

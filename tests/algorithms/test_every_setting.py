@@ -15,7 +15,6 @@ import math
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -395,27 +394,6 @@ def the_targets_noise_is_scaled_and_then_clipped(case: Case) -> None:
 
 
 # Values.
-
-
-@shows("double_q", by="DQN")
-def double_q_learning_lets_the_network_choose_and_the_target_rate(case: Case) -> None:
-    far = lambda batch: batch._replace(obs=9 * batch.obs, next_obs=9 * batch.next_obs)  # noqa: E731
-    batch = far(discrete_batch(0, SIZE))
-    for double_q in (False, True):
-        settings = {"double_q": double_q, "target_update_interval": 1000}
-        made = case.make(**settings)
-        state = case.state(made)
-        rated = lambda network, obs: made.action_values(SimpleNamespace(network=network), obs, None)[0]  # noqa: E731, B023
-        values, theirs = (rated(network, batch.next_obs) for network in (state.network, state.target_network))
-        chosen = np.asarray(values if double_q else theirs).argmax(axis=1)
-        taken = np.asarray(rated(state.network, batch.obs))[np.arange(SIZE), batch.action]
-        assert (np.argmax(values, axis=1) != np.argmax(theirs, axis=1)).any()
-        target = batch.reward + batch.discount * np.asarray(theirs)[np.arange(SIZE), chosen]
-        found = case.update(far, **settings).metrics[TD_ERROR]
-        if case.kind == "IQN":  # whose quantiles are at random fractions
-            assert np.corrcoef(found, np.abs(taken - target))[0, 1] > 0.9
-        else:
-            np.testing.assert_allclose(found, np.abs(taken - target), atol=1e-5)
 
 
 @shows("loss", by="DQN")

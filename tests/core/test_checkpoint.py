@@ -6,7 +6,6 @@ import errno
 import os
 from pathlib import Path
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings, strategies as st
@@ -17,7 +16,7 @@ import rejeu
 from rejeu.core import atomic, checkpoint
 from rejeu.core.errors import CheckpointError
 from tests import hostile_files
-from tests.environments import Counter, Reach, Sampled
+from tests.environments import Counter, Reach
 from tests.helpers import assert_same_parameters, small_sac
 
 
@@ -26,12 +25,6 @@ def trained(tmp_path_factory):
     """An agent after a few updates, and its file."""
     agent = small_sac(Counter((5,)), ent_coef="auto_0.5", learning_rate=rejeu.Linear(1e-2, 1e-3)).learn(20)
     return agent, agent.save(tmp_path_factory.mktemp("saved") / "model")
-
-
-@pytest.fixture(scope="module")
-def buffer_file(tmp_path_factory):
-    agent = small_sac(Counter((5,)), learning_starts=10**6).learn(20)
-    return agent, agent.save_replay_buffer(tmp_path_factory.mktemp("saved") / "buffer")
 
 
 def observations(n=6):
@@ -73,16 +66,6 @@ def test_a_suffix_is_added_where_there_is_none_and_that_of_stable_baselines3_sta
         assert_same_parameters(rejeu.SAC.load(str(tmp_path / name)), agent)
     with pytest.raises(FileNotFoundError, match=r"third\.zip"):
         rejeu.SAC.load(tmp_path / "third.zip")
-
-
-def test_a_replay_buffer_survives(buffer_file, tmp_path):
-    agent, path = buffer_file
-    other = small_sac(Counter((5,)), learning_starts=10**6)
-    other.load_replay_buffer(path)
-    assert other.replay_buffer.size() == agent.replay_buffer.size() == 20
-    one, two = (a.replay_buffer.sample(np.random.default_rng(0), (64,)) for a in (agent, other))
-    for left, right in zip(one[:5], two[:5], strict=True):
-        np.testing.assert_array_equal(left, right)
 
 
 def test_a_hindsight_buffer_survives_with_its_episodes(tmp_path):
@@ -178,25 +161,6 @@ def test_numbers_beyond_reason_are_refused_as_such(trained, tmp_path, change, wo
     path = rewrite(trained[1], tmp_path / "other.safetensors", change)
     with pytest.raises((CheckpointError, MemoryError), match=words):
         rejeu.SAC.load(path, env=Counter())
-
-
-def test_another_environment_or_another_kind_of_file_is_refused_when_loading(trained, buffer_file):
-    with pytest.raises(ValueError, match=r"given environment has the observation space .* this agent was made for"):
-        rejeu.SAC.load(trained[1], env=Reach())
-    with pytest.raises(ValueError, match="given environment has the action space"):
-        rejeu.SAC.load(trained[1], env=Counter(low=[-2.0], high=[2.0]))
-    agent, path = buffer_file
-    with pytest.raises(CheckpointError, match="holds 'replay', expected 'agent'"):
-        rejeu.SAC.load(path)
-    with pytest.raises(CheckpointError, match="holds 'agent', expected 'replay'"):
-        agent.load_replay_buffer(trained[1])
-
-
-def test_a_replay_buffer_of_another_environment_is_refused_and_nothing_changes(buffer_file):
-    other = small_sac(Sampled(gym.spaces.Box(-1.0, 1.0, (2,))), learning_starts=10**6).learn(7)
-    with pytest.raises(CheckpointError, match=r"it is of the observation space .*, and this agent was made for Box"):
-        other.load_replay_buffer(buffer_file[1])
-    assert other.replay_buffer.size() == 7
 
 
 # Damage.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import jax
-import numpy as np
 import pytest
 
 import rejeu
@@ -18,15 +17,6 @@ def test_a_missing_device_is_one_line_with_what_there_is_and_how_to_get_it():
     with pytest.raises(ValueError, match=r"device='gpu'.* only 1 CPU device.*pip install .jax\[cuda") as raised:
         rejeu.DQN("MlpPolicy", "CartPole-v1", device="cuda", **SMALL)
     assert "\n" not in str(raised.value)
-
-
-def test_a_saved_agent_is_loaded_on_any_device(tmp_path):
-    agent = rejeu.DQN("MlpPolicy", "CartPole-v1", seed=0, device="cpu", **SMALL)
-    loaded = rejeu.load(agent.save(tmp_path / "agent"))
-    assert (agent.device, loaded.device) == ("cpu", "auto")
-    assert rejeu.load(tmp_path / "agent", device="cpu").device == "cpu"
-    observation = np.zeros(4, np.float32)
-    assert agent.predict(observation, deterministic=True)[0] == loaded.predict(observation, deterministic=True)[0]
 
 
 def test_a_device_with_too_little_memory_is_refused_before_training(monkeypatch):

@@ -37,18 +37,3 @@ def test_the_hash_gives_its_authors_known_answers():
     """From the file of known answers of Random123: threefry2x32, 20 rounds, key and counter 0."""
     high, low = threefry(jnp.zeros(2, jnp.uint32), jnp.zeros((), jnp.uint32))
     assert (hex(int(high)), hex(int(low))) == ("0x6b200159", "0x99ba4efe")
-
-
-@pytest.mark.skipif(jax.default_backend() != "cpu", reason="of XLA on CPUs")
-def test_numbers_that_several_kernels_read_are_hashed_once():
-    """XLA repeats what is elementwise in each of them; repeated hashes once doubled the time to compile an update."""
-
-    def rotations(n_readers):
-        def readers(key, scales):
-            noise = jax.random.normal(nth(key, 0), (64, 2))
-            return [jnp.sum(jnp.exp(scales[i] * noise), axis=i % 2) for i in range(n_readers)]
-
-        lowered = jax.jit(readers).lower(jax.random.PRNGKey(0), jnp.arange(1.0, 6.0))
-        return lowered.compile().as_text().count(" shift-left(")
-
-    assert 0 < rotations(5) <= rotations(1)

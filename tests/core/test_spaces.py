@@ -51,17 +51,6 @@ def test_only_what_has_64_bits_is_narrowed(dtype, kept):
     assert spaces.narrow(np.dtype(dtype)) == kept
 
 
-def test_features_count_one_hot_places():
-    features = {leaf.path: (leaf.kind, leaf.n_features) for leaf in spaces.leaves(NESTED)}
-    assert features == {
-        "a": ("continuous", 2),
-        "m.bits": ("binary", 4),
-        "m.many": ("categorical", 5),
-        "z.0": ("categorical", 3),
-        "z.1": ("image", 48),
-    }
-
-
 # Actions.
 
 ASYMMETRIC = gym_spaces.Box(np.float32([-1.0, 0.0, -3.0]), np.float32([3.0, 0.5, -1.0]))
@@ -162,11 +151,3 @@ GOALS = dict(GOAL_OBSERVATION.spaces)
 def test_a_space_that_does_not_fit_is_refused(check, space, error, words):
     with pytest.raises(error, match=words):
         check(space, *(["SAC"] if check in (spaces.check_action, spaces.check_box_action) else []))
-
-
-def test_observation_bounds_do_not_tell_spaces_apart_and_action_bounds_do():
-    one, two = gym_spaces.Box(-1.0, 1.0, (2,)), gym_spaces.Box(-2.0, 2.0, (2,))
-    assert spaces.same(one, two, bounds=False)
-    assert not spaces.same(one, two, bounds=True)
-    assert not spaces.same(one, gym_spaces.Box(-1.0, 1.0, (3,)), bounds=False)
-    assert not spaces.same(gym_spaces.Dict({"a": BOX}), gym_spaces.Dict({"b": BOX}), bounds=False)

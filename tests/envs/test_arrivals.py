@@ -39,21 +39,6 @@ def test_the_others_do_not_wait_for_a_slow_step(tmp_path):
             vector.send(ZERO)
 
 
-def test_episodes_end_with_the_true_successor_and_begin_by_themselves():
-    with opened(Paced, 1) as vector, contextlib.closing(make_vector(Paced, 1, "gymnasium", seed=0)) as other:
-        np.testing.assert_array_equal(vector.reset(), other.reset())
-        for _ in range(30):
-            vector.send(ZERO)
-            ours, theirs = vector.receive(), other.step(ZERO)
-            np.testing.assert_array_equal(ours.obs, theirs.obs)
-            np.testing.assert_array_equal(ours.reward, theirs.reward)
-            np.testing.assert_array_equal((ours.terminated, ours.truncated), (theirs.terminated, theirs.truncated))
-            done = ours.terminated | ours.truncated
-            if done.any():
-                assert vector.success(ours, 0) == other.success(theirs, 0)
-                np.testing.assert_array_equal(vector.reset_done(done), other.reset_done(done))
-
-
 def test_a_slow_reset_does_not_keep_the_others_waiting(tmp_path):
     slow = tmp_path / "gate.reset"
 

@@ -8,7 +8,6 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from scipy.stats import norm
 
-from rejeu.envs.functional.ball_drawing import BallDrawing
 from rejeu.teaching.ball import Ball
 from tests.tiers import only
 
@@ -147,28 +146,3 @@ def test_pushing_to_the_middle_holds_as_many_episodes_as_its_markov_chain_does(s
     expected = survival(sigma) ** 2
     assert expected == pytest.approx({1.0: 1.0, 2.0: 0.9}[sigma], abs=0.015)
     assert abs(held / n_episodes - expected) <= 4 * np.sqrt(expected * (1 - expected) / n_episodes) + 1e-9
-
-
-@pytest.mark.parametrize("dimension", [1, 2])
-def test_picture_shows_the_ball_where_it_is(dimension):
-    """Counts pixels of the ball's blue around where the position is to be drawn, by the drawing's own scales."""
-    pytest.importorskip("pygame")
-    ball = placed(*[6.0, -3.0][:dimension], render_mode="rgb_array")
-    frame = ball.render()
-    assert frame.dtype == np.uint8
-    height, width, channels = frame.shape
-    assert channels == 3
-    assert height % 2 == width % 2 == 0  # for videos
-    drawing = BallDrawing(dimension, 500, "rgb_array")
-    place = drawing.main.place
-    x, y = drawing.main.points(np.array([ball.position]), 0)[0]
-    patch = frame[round(y) - 5 : round(y) + 6, max(round(x) - 5, 0) : round(x) + 6].astype(int)
-    assert (patch[..., 2] > patch[..., 0] + 40).mean() > 0.7
-    inside = [(place(-10, 0)[0], place(10, 0)[0])] if dimension == 2 else []
-    for left, right in inside:
-        assert left < x < right
-        assert (x - left) / (right - left) == pytest.approx(0.8)
-    assert (place(0, -10)[1] - y) / (place(0, -10)[1] - place(0, 10)[1]) == pytest.approx(
-        0.35 if dimension == 2 else 0.8
-    )
-    ball.close()

@@ -23,16 +23,6 @@ def test_seeds_are_checked_up_to_their_bounds():
             base.checked_seed(wrong, 2)
 
 
-def test_infos_of_a_vector_are_those_of_its_environments():
-    final = {"x": np.array([7, 0]), "_x": np.array([True, False])}
-    info = {"x": np.array([1, 2]), "y": np.array([3, 4]), "_y": np.array([False, True]), "size": 5}
-    assert base.each_info(info, 2) == [{"x": 1}, {"x": 2, "y": 4}]
-    info |= {"final_info": final, "_final_info": np.array([True, False])}
-    assert base.each_info(info, 2) == [{"x": 7}, {"x": 2, "y": 4}]
-    assert base.each_info(info, 2, begun=True) == [{"x": 1, "final_info": {"x": 7}}, {"x": 2, "y": 4}]
-    assert (base.each_info([{"a": 1}], 1), base.each_info(None, 2)) == ([{"a": 1}], [{}, {}])
-
-
 def test_time_limits_terminate_and_ends_stay_ends():
     for ends in ("truncated", "terminated"):
         env = rejeu.TimeLimitTerminates(Counter((2,), ends))

@@ -16,7 +16,7 @@ from rejeu.envs.make import EnvPool, GymnasiumVector, InProcess, auto_backend, m
 from rejeu.sb3.common.env_util import make_vec_env
 from rejeu.sb3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 from rejeu.training.run import restart
-from tests.environments import Counter, Reach
+from tests.environments import Counter
 from tests.helpers import small_sac
 
 LENGTHS = (2, 4), (3, 1)
@@ -209,34 +209,6 @@ def test_envpool_shows_the_final_observation_and_restarts_only_what_ended():
 # Success.
 
 
-@pytest.mark.parametrize(
-    "make",
-    [
-        lambda: InProcess([Reach(stops=True), Reach(stops=True)], seed=0),
-        lambda: synchronous_reach(AutoresetMode.DISABLED),
-        lambda: synchronous_reach(AutoresetMode.SAME_STEP),
-    ],
-    ids=["in-process", "DISABLED", "SAME_STEP"],
-)
-def test_success_is_read_from_the_step_that_ended_the_episode(make):
-    vector = make()
-    obs, outcomes = vector.reset(), []
-    for t in range(60):
-        towards = np.clip(obs["desired_goal"] - obs["achieved_goal"], -1, 1)
-        step = vector.step(towards if t % 20 < 10 else -np.sign(towards + 1e-9))
-        done = step.terminated | step.truncated
-        for i in np.flatnonzero(done):
-            reached = abs(step.obs["achieved_goal"][i, 0] - step.obs["desired_goal"][i, 0]) < 0.5
-            assert vector.success(step, i) == float(reached)
-            outcomes.append(reached)
-        obs = vector.reset_done(done) if done.any() else step.obs
-    assert {bool(o) for o in outcomes} == {True, False}
-
-
-def synchronous_reach(mode):
-    return GymnasiumVector(SyncVectorEnv([lambda: Reach(stops=True)] * 2, autoreset_mode=mode), seed=0)
-
-
 # What may be given.
 
 
@@ -337,21 +309,6 @@ def test_each_environment_begins_with_the_seed_that_is_given_for_it(backend):
     again = np.array(vector.reset([3, 3, 7]))
     np.testing.assert_array_equal(again, obs[[1, 1, 0]])
     vector.close()
-
-
-@pytest.mark.parametrize("backend", ["gymnasium", "envpool"])
-def test_training_begins_with_the_seeds_given_for_each_environment_and_not_with_the_agents(backend):
-    def first(agent_seed, seeds):
-        env = make_vector("Pendulum-v1", 2, backend, seed=seeds)
-        agent = small_sac(env, seed=agent_seed)
-        seen = []
-        agent.learn(2, lambda agent, turn: seen.append(agent.run.replay.arrays()["obs.array"][:, 0]))
-        return seen[0]
-
-    expected = np.array(make_vector("Pendulum-v1", 2, backend, seed=[4, 9]).reset())
-    np.testing.assert_array_equal(first(0, [4, 9]), expected)
-    np.testing.assert_array_equal(first(1, [4, 9]), expected)
-    assert (first(0, 4) != first(1, 4)).any()  # one number is the agent's to choose
 
 
 @pytest.mark.parametrize("kind", ["gymnasium", "envpool", "jax", "SyncVectorEnv", "VecNormalize"])

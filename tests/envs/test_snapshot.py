@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import json
-import warnings
 from contextlib import closing
 
 import gymnasium as gym
@@ -96,17 +95,6 @@ class Remembering(gym.Wrapper):
 )
 def test_what_is_not_known_is_not_carried(make):
     env = make()
-    env.reset(seed=0)
-    assert state_of(env) is None
-
-
-def test_box2d_cannot_be_carried():
-    with warnings.catch_warnings():
-        warnings.simplefilter(
-            "ignore", DeprecationWarning
-        )  # of what SWIG generates, and it crashes where they are errors
-        pytest.importorskip("Box2D")
-    env = gym.make("LunarLander-v3")
     env.reset(seed=0)
     assert state_of(env) is None
 

@@ -83,3 +83,19 @@ def test_a_summary_has_the_means_of_all_and_of_the_last_episodes():
     assert (longer.all.mean_length, longer.last.mean_length, longer.last.lengths.tolist()) == (10.0, 10.0, [5, 15])
     assert (longer.last.returns.tolist(), longer.last.successes.tolist()) == ([5, 7], [0, 1])
     assert (summary.best.step, summary.best.episode_return) == (30, 6.0)
+
+
+def test_a_summary_shows_itself_as_a_table():
+    text = repr(returning(1.0, 2.0, successes=[0.0, 1.0]).summary())
+    assert text.splitlines() == [
+        "2 episodes in 20 steps, 4.0 s",
+        "          all            last 2",
+        "return    1.50 \N{PLUS-MINUS SIGN} 0.50    1.50 \N{PLUS-MINUS SIGN} 0.50",
+        "length    10.00 \N{PLUS-MINUS SIGN} 0.00   10.00 \N{PLUS-MINUS SIGN} 0.00",
+        "success   50.0%          50.0%",
+        "best return 2.00 at step 20 (2 records)",
+    ]
+    assert repr(History().summary()) == "0 episodes in 0 steps, 0.0 s"
+    assert "success" not in repr(returning(1.0).summary())
+    with pytest.raises(ValueError, match="window=0 must be a whole number of at least 1"):
+        History().summary(0)

@@ -18,14 +18,6 @@ def evaluated(step, success=float("nan")):
     return step, Evaluation(np.array([-500.0, -400.0]), np.array([50, 50]), np.array([success, success]))
 
 
-def test_the_line_is_the_moving_average():
-    record = history(20)
-    figure = learning_curve(record, window=5)
-    line = next(line for line in figure.axes[0].lines if line.get_label() == "mean of 5 episodes")
-    expected = [np.mean(record["return"][max(0, i - 4) : i + 1]) for i in range(20)]
-    np.testing.assert_allclose(line.get_ydata(), expected)
-
-
 @pytest.mark.parametrize(
     ("given", "error", "message"),
     [

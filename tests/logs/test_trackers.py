@@ -78,13 +78,6 @@ def assert_close(given, expected):
         assert given[key] == pytest.approx(value, rel=1e-6, nan_ok=True), key
 
 
-def test_json_lines_hold_what_the_csv_file_holds():
-    _, expected = learn("json")
-    with open("logs/SAC_1/progress.json", encoding="utf-8") as file:
-        rows = [json.loads(line) for line in file]
-    assert_close({(row["step"], name): v for row in rows for name, v in row.items() if name != "step"}, expected)
-
-
 def test_tensorboard_holds_what_the_csv_file_holds():
     accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
     agent, expected = learn("tensorboard")

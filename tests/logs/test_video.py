@@ -8,7 +8,6 @@ import os
 import re
 import subprocess
 import sys
-from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
 from typing import NamedTuple
@@ -151,23 +150,6 @@ def test_own_environment_is_made_again_with_its_arguments_and_wrappers(tmp_path)
         assert (tmp_path / "log.monitor.csv").read_bytes() == log
     finally:
         del gym.registry["Lamp-v0"]
-
-
-@pytest.mark.parametrize("setting", [None, "dummy", "x11"])
-def test_environment_variables_are_put_back(setting, monkeypatch):
-    monkeypatch.delenv("DISPLAY", raising=False)
-    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    if setting is None:
-        monkeypatch.delenv("SDL_VIDEODRIVER", raising=False)
-    else:
-        monkeypatch.setenv("SDL_VIDEODRIVER", setting)
-    monkeypatch.setenv("XDG_RUNTIME_DIR", "given")
-    before = dict(os.environ)
-    with suppress(KeyError), rendering.display_for_pygame():
-        inside = os.environ.get("SDL_VIDEODRIVER")
-        raise KeyError
-    assert dict(os.environ) == before
-    assert inside in ({"x11"} if setting == "x11" else {None, "dummy"})
 
 
 def test_an_error_leaves_the_older_file_and_nothing_half_written(lamp, tmp_path):

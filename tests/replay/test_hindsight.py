@@ -248,10 +248,14 @@ def test_impossible_settings_are_refused(settings, words):
         HindsightConfig(**settings)
 
 
+def any_of_the_episode(steps):
+    return steps.integers(steps.first, steps.last + 1)
+
+
 FUNCTIONS = {
-    "final": lambda rng, time, first, last: last,
-    "future": lambda rng, time, first, last: time + 1 + (rng.random(len(time)) * (last - time)).astype(np.int64),
-    "episode": lambda rng, time, first, last: first + (rng.random(len(time)) * (last - first + 1)).astype(np.int64),
+    "final": lambda steps: steps.end(steps.time),
+    "future": lambda steps: steps.integers(steps.time + 1, steps.last + 1),
+    "episode": any_of_the_episode,
 }
 
 
@@ -288,15 +292,52 @@ def test_a_function_as_strategy_draws_what_the_named_one_does(strategy, n_envs):
     np.testing.assert_array_equal(one.reward, two.reward)
 
 
+def last_three_episodes(steps):
+    begin = steps.first - 1
+    for _ in range(2):
+        begin = steps.begin(begin - 1)
+    return steps.integers(begin + 1, steps.last + 1)
+
+
+FOUR_EPISODES = [turn("truncated" if i in (3, 8) else "terminated" if i == 12 else "no") for i in range(17)]
+
+
+@pytest.mark.parametrize("rows", [40, 12])
+def test_a_strategy_of_the_last_three_episodes_is_one_function(rows):
+    """With 12 rows the first episode is forgotten, and of the second the beginning."""
+    replay, model = filled(1, rows, FOUR_EPISODES, last_three_episodes, k=10**6)
+    batch = replay.sample(np.random.default_rng(0), (20_000,))
+    places, goals = (batch.obs[key][:-1, 1].astype(int) for key in ("observation", "desired_goal"))
+    for _, place in model.steps():
+        number = model.frames[0][place].episode
+        allowed = [i for i in model.kept(0) if number - 2 <= model.frames[0][i].episode <= number][1:]
+        assert {*goals[places == place]} == {*allowed}
+
+
 @pytest.mark.parametrize(
     ("chosen", "received"),
     [
-        (lambda last: last + 1, r"it returned \d+ where first is \d+ and last is \d+"),
-        (lambda last: last[1:], r"of shape \(32,\); it returned int64 of shape \(31,\)"),
-        (lambda last: last + 0.0, r"it returned float64 of shape \(32,\)"),
+        (lambda steps: steps.newest + 1, r"it returned \d+ where oldest is \d+ and newest is \d+"),
+        (lambda steps: steps.oldest - 1, r"it returned \d+ where oldest is \d+ and newest is \d+"),
+        (lambda steps: steps.last[1:], r"of shape \(32,\); it returned int64 of shape \(31,\)"),
+        (lambda steps: steps.last + 0.0, r"it returned float64 of shape \(32,\)"),
     ],
 )
-def test_a_function_that_leaves_the_episode_is_refused(chosen, received):
-    replay, _ = filled(1, 16, RUNNING_AND_WRAPPED, lambda rng, time, first, last: chosen(last))
-    with pytest.raises(ValueError, match=f"must return whole numbers from first to last.*{received}"):
+def test_times_that_are_not_stored_are_refused(chosen, received):
+    replay, _ = filled(1, 16, RUNNING_AND_WRAPPED, chosen)
+    with pytest.raises(ValueError, match=f"must return whole numbers, times that are stored.*{received}"):
         replay.sample(np.random.default_rng(0), (40,))
+
+
+def test_episodes_begin_and_end_where_they_are_stored():
+    replay, model = filled(1, 12, FOUR_EPISODES, lambda steps: steps.last)
+    seen = []
+    replay.config = dataclasses.replace(
+        replay.config, goal_selection_strategy=lambda steps: [seen.append(steps), steps.last][1]
+    )
+    replay.sample(np.random.default_rng(0), (400,))
+    (steps,) = seen
+    for time in model.kept(0):
+        times = np.full(len(steps.time), time)
+        episode = model.episode(0, time)
+        assert (steps.begin(times)[0], steps.end(times)[0]) == (episode[0], episode[-1])

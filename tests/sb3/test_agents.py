@@ -17,18 +17,6 @@ pytestmark = pytest.mark.usefixtures("learners_are_shared")
 TINY = {"policy_kwargs": {"net_arch": [4]}}
 
 
-class Endless(gym.Env):
-    observation_space = gym.spaces.Box(-1, 1, (2,), np.float32)
-    action_space = gym.spaces.Discrete(2)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        return np.zeros(2, np.float32), {}
-
-    def step(self, action):
-        return np.zeros(2, np.float32), 1.0, False, False, {}
-
-
 def test_the_environments_of_an_id_have_the_methods_of_the_original():
     model = A2C("MlpPolicy", "CartPole-v1", n_steps=8, **TINY)
     env = model.env
@@ -44,13 +32,6 @@ def test_the_environments_of_an_id_have_the_methods_of_the_original():
     assert env.env_method("get_wrapper_attr", "gravity") == [5.0]
     with pytest.raises(AttributeError, match="use set_env"):
         model.env = env
-
-
-def test_a_gymnasium_environment_gets_one_monitor():
-    for env in (Endless(), Monitor(Endless())):
-        model = A2C("MlpPolicy", env, n_steps=8, **TINY)
-        assert model.env.env_is_wrapped(Monitor) == [True]
-        assert isinstance(model.env.envs[0].env, Endless)
 
 
 def test_a_seed_seeds_the_global_generators_too(tmp_path):

@@ -61,20 +61,6 @@ class Corridor(gym.Env):
         return 2 * number + self.end
 
 
-def test_observations_have_a_leading_axis_and_their_own_memory():
-    env = DummyVecEnv([Corridor, Corridor])
-    first = env.reset()
-    assert set(first) == {"where", "kind", "pair"}
-    assert first["where"].shape == (2, 1)
-    assert first["kind"].shape == (2,)
-    second, rewards, dones, infos = env.step(np.array([0, 1]))
-    np.testing.assert_array_equal(first["where"], [[0], [0]])
-    np.testing.assert_array_equal(second["where"], [[1], [1]])
-    np.testing.assert_array_equal(rewards, np.array([0, 10], np.float32))
-    assert (rewards.dtype, dones.dtype, dones.tolist()) == (np.float32, bool, [False, False])
-    assert [info["time"] for info in infos] == [1, 1]
-
-
 def test_an_ended_environment_is_reset_within_the_step():
     env = DummyVecEnv([lambda: Corridor(end=2), Corridor])
     env.reset()
@@ -101,20 +87,6 @@ def test_seeds_and_options_are_of_the_next_reset_only():
     env.reset()
     env.reset()
     assert [e.calls for e in env.envs] == [[(5, {"a": 1}), (None, None)], [(6, {"a": 1}), (None, None)]]
-
-
-def test_attributes_and_methods_are_reached_through_wrappers():
-    wrapped = [lambda: gym.wrappers.TimeLimit(Corridor(end=3), 7), lambda: gym.wrappers.TimeLimit(Corridor(end=4), 7)]
-    env = DummyVecEnv(wrapped)
-    assert env.get_attr("end") == [3, 4]
-    assert env.get_attr("end", 1) == [4]
-    env.set_attr("end", 8, indices=[0])
-    assert [e.unwrapped.end for e in env.envs] == [8, 4]
-    assert env.env_method("double", 1, indices=[1, 0]) == [6, 10]
-    assert env.env_is_wrapped(gym.wrappers.TimeLimit) == [True, True]
-    assert env.env_is_wrapped(gym.wrappers.ClipAction) == [False, False]
-    assert env.has_attr("end")
-    assert not env.has_attr("begin")
 
 
 def test_functions_must_be_functions_and_make_new_environments():

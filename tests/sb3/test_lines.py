@@ -364,3 +364,10 @@ def test_masks_forbid_choices_and_bits():
     bits = distributions.BernoulliDistribution(3).proba_distribution(np.zeros((1, 3)))
     bits.apply_masking([[True, True, False, True, True, False]])  # 0 and 1 of each bit
     assert {tuple(bits.sample()[0].tolist()) for _ in range(20)} == {(0, 1, 0), (1, 1, 0)}
+
+
+def test_squashed_actions_stay_in_their_bounds():
+    shape = {"squash_output": True, "net_arch": [8], "log_std_init": 3.0}
+    model = sb3.A2C("MlpPolicy", "Pendulum-v1", use_sde=True, policy_kwargs=shape, seed=0)
+    actions = model.policy.get_distribution(np.ones((256, 3), np.float32)).sample()
+    assert 1.9 < np.abs(actions).max() <= 2.0  # of Pendulum

@@ -45,14 +45,6 @@ def read(path):
         return header, list(csv.DictReader(file))
 
 
-def test_episode_is_in_the_info_of_its_last_step_only():
-    infos = play(Monitor(Stairs()), 2)
-    assert ["episode" in info for info in infos] == [False, False, True] * 2
-    assert infos[2]["episode"]["r"] == 6
-    assert infos[2]["episode"]["l"] == 3
-    assert 0 <= infos[2]["episode"]["t"] <= infos[5]["episode"]["t"]
-
-
 def test_totals_count_all_episodes():
     env = Monitor(Stairs())
     play(env, 2)
@@ -100,12 +92,3 @@ def test_step_needs_a_running_episode():
     play(env)
     with pytest.raises(RuntimeError, match=r"call reset"):
         env.step(0)
-
-
-def test_attributes_of_the_environment_stay_in_reach():
-    env = Monitor(Stairs())
-    assert env.get_wrapper_attr("compute_reward")(None, None, {}) == 42
-    made = Monitor(gym.make("CartPole-v1"))
-    assert made.spec.id == "CartPole-v1"
-    assert made.observation_space == made.unwrapped.observation_space
-    assert gym.make(made.spec).get_wrapper_attr("get_total_steps")() == 0

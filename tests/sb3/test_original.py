@@ -87,17 +87,6 @@ def test_a_features_extractor_is_used_saved_and_loaded(tmp_path):
         ppo(policy_kwargs={"features_extractor_class": AdamW})
 
 
-def test_the_width_of_convolutions_and_images_that_are_scaled_already():
-    image = envs.FakeImageEnv(screen_height=36, screen_width=36, channel_first=True)
-    env = VecNormalize(DummyVecEnv([lambda: image]))
-    shape = {"features_extractor_kwargs": {"features_dim": 16}, "normalize_images": False}
-    model = sb3.A2C("CnnPolicy", env, policy_kwargs=shape)
-    assert model.state.network.encoder.n_features == 16
-    assert model.state.network.encoder.images[0].scale == 1.0
-    with pytest.raises(AssertionError, match="uint8"):
-        sb3.A2C("CnnPolicy", env)
-
-
 def test_a_policy_class_of_ones_own_sets_the_layers():
     model = sb3.PPO(Wide, "CartPole-v1", n_steps=16, batch_size=16)
     assert isinstance(model.policy, Wide)
@@ -492,3 +481,14 @@ def test_the_checker_renders_if_it_is_asked_to():
     for skips in (True, False):
         env_checker.check_env(env, skip_render_check=skips)
     assert rendered == [1]
+
+
+def test_hyperparameters_are_attributes_that_can_be_set():
+    model = ppo(**SMALL, learning_rate=lambda remaining: 1e-3 if remaining > 0.5 else 1e-4, clip_range=0.3)
+    assert (model.gamma, model.batch_size, model.clip_range(0.1)) == (0.99, 16, 0.3)
+    assert (model.lr_schedule(0.9), model.lr_schedule(0.1)) == (1e-3, 1e-4)
+    model.gamma = 0.5
+    assert model.config.gamma == 0.5
+    assert model.learn(16)._n_updates == 1
+    with pytest.raises(AttributeError):
+        _ = model.no_such_thing

@@ -12,7 +12,6 @@ import rejeu
 from rejeu.core.errors import BadEnvironmentError
 from rejeu.sb3.common.env_util import make_vec_env
 from rejeu.sb3.common.monitor import Monitor
-from rejeu.sb3.common.running_mean_std import RunningMeanStd
 from rejeu.sb3.common.vec_env import (
     DummyVecEnv,
     VecCheckNan,
@@ -204,19 +203,6 @@ def test_an_agent_of_scaled_observations_is_not_shown_raw_ones(tmp_path):
         rejeu.record_video(agent, tmp_path / "video")
 
 
-def test_an_agent_gives_back_the_vector_it_was_given():
-    env = VecNormalize(walks())
-    agent = rejeu.DQN("MlpPolicy", env, **SMALL)
-    assert agent.get_env() is env
-    assert agent.get_vec_normalize_env() is env
-    assert agent.env.venv is env
-    dummy = walks()
-    agent.set_env(dummy)
-    assert agent.get_env() is dummy
-    assert agent.get_vec_normalize_env() is None
-    assert agent.get_env().get_attr("rank") == [0, 1]
-
-
 def test_learning_begins_new_episodes_after_the_vector_was_stepped_by_hand():
     env = walks()
     agent = rejeu.DQN("MlpPolicy", env, learning_starts=1000, **SMALL).learn(2)
@@ -268,18 +254,6 @@ def test_wrappers_ask_their_environments_what_they_do_not_know():
 # VecNormalize.
 
 
-def test_moments_of_batches_are_those_of_all_values():
-    values = np.random.default_rng(0).normal(3.0, 2.0, (50, 4))
-    moments, other = RunningMeanStd(1e-9, (4,)), RunningMeanStd(1e-9, (4,))
-    for part in np.split(values[:30], 6):
-        moments.update(part)
-    other.update(values[30:])
-    moments.combine(other)
-    np.testing.assert_allclose(moments.mean, values.mean(0), rtol=1e-6)
-    np.testing.assert_allclose(moments.var, values.var(0), rtol=1e-6)
-    assert moments.copy().count == pytest.approx(50)
-
-
 def test_statistics_are_saved_without_pickle(tmp_path):
     env = VecNormalize(walks(), gamma=0.9, clip_obs=5.0)
     env.seed(0)
@@ -296,16 +270,6 @@ def test_statistics_are_saved_without_pickle(tmp_path):
     obs = np.array([[1.0, 2.0, 0.6], [2.0, -1.0, 0.5]], np.float32)
     np.testing.assert_array_equal(loaded.normalize_obs(obs), env.normalize_obs(obs))
     np.testing.assert_allclose(env.unnormalize_obs(env.normalize_obs(obs)), obs, rtol=1e-5)
-
-
-def test_statistics_move_to_another_vector():
-    env = VecNormalize(walks(2))
-    env.reset()
-    env.set_venv(walks(3))
-    assert env.num_envs == 3
-    before = env.obs_rms.count
-    assert env.reset().shape == (3, 3)
-    assert env.obs_rms.count == before + 3
 
 
 def test_nothing_moves_while_training_is_off():

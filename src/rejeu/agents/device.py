@@ -16,7 +16,7 @@ from rejeu.callbacks.base import Periodic, TrainingCallback
 from rejeu.core import devices
 from rejeu.envs.functional.vector import reset_all
 from rejeu.envs.masks import functional_vector
-from rejeu.replay.hindsight import HerReplayBuffer, takes_generator
+from rejeu.replay.hindsight import HerReplayBuffer
 from rejeu.replay.rollout import RolloutBuffer
 from rejeu.replay.uniform import ReplayBuffer
 from rejeu.training.compiled import Stops
@@ -152,11 +152,8 @@ def reason_against_replay(buffer: Any, config: OffPolicyConfig) -> str | None:
         return "demonstrations are on the host"
     if config.needs_next_action:
         return f"{config.name} learns from next actions, which batches of the host have"
-    strategy = None if config.hindsight is None else config.hindsight.goal_selection_strategy
     if type(buffer) not in (ReplayBuffer, HerReplayBuffer):
         return f"the replay buffer {type(buffer).__name__} is your own"
-    if strategy is not None and takes_generator(strategy):
-        return "goal_selection_strategy is a function of NumPy's generator; write it as a function (steps) -> times"
     if config.hindsight is not None and config.hindsight.copy_info_dict:
         return "copy_info_dict computes rewards from infos, which exist on the host only"
     if config.priorities is not None and most_updates(config, buffer.ring.n_envs) is None:

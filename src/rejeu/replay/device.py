@@ -26,7 +26,7 @@ from rejeu.core.algorithm import PyTree, Transition
 from rejeu.core.prng import below
 from rejeu.replay import device_priorities
 from rejeu.replay.device_priorities import DevicePriorities
-from rejeu.replay.hindsight import BUILT_IN, GoalStrategy, HindsightSteps, whole_times
+from rejeu.replay.hindsight import GoalStrategy, HindsightSteps
 from rejeu.replay.prioritized import PriorityConfig
 from rejeu.replay.ring import LAST, STEP, TERMINATED, Ring, episode_counters
 from rejeu.replay.uniform import NewGoals, discounts_of, outcome, replaced
@@ -256,25 +256,30 @@ class DeviceReplay:
 
     def goal_positions(self, ring: DeviceRing, key: Array, rows: DeviceRows) -> Array:
         """Returns the positions of the rows whose achieved goals become the new goals of ``rows``, by the strategy."""
-        n = len(rows.time)
-        if self.strategy == "random":
-            other = self.draw_rows(ring, key, n)
-            return self.positions(other.env, other.time + 1)
-        place = self.positions(rows.env, ring.episode[rows.position])
-        first = jnp.maximum(ring.begins[place], self.oldest(ring)[rows.env]) + 1
-        last = jnp.minimum(ring.ends[place], ring.head[rows.env])
-        numbers = count()
+        oldest, newest, numbers = self.oldest(ring)[rows.env], ring.head[rows.env], count()
+
+        def episode(times: Array) -> Array:
+            return self.positions(rows.env, ring.episode[self.positions(rows.env, jnp.maximum(times, oldest))])
 
         def integers(low: Array, high: Array) -> Array:
             shape = jnp.broadcast_shapes(jnp.shape(low), jnp.shape(high))
             return low + below(jax.random.bits(jax.random.fold_in(key, next(numbers)), shape, jnp.uint32), high - low)
 
-        goals_at = ring.obs[self.achieved].__getitem__, ring.obs[self.desired].__getitem__
-        steps = HindsightSteps.of(jnp, self.positions, rows.env, (rows.time, first, last), goals_at, integers)
-        times = steps.chosen_by(self.strategy)  # type: ignore[arg-type]
-        if self.strategy not in BUILT_IN:
-            times = jnp.clip(whole_times(times, last).astype(jnp.int32), first, last)
-        return self.positions(rows.env, times)
+        steps = HindsightSteps(
+            jnp,
+            rows.env,
+            rows.time,
+            oldest,
+            newest,
+            lambda times: jnp.maximum(ring.begins[episode(times)], oldest),
+            lambda times: jnp.minimum(ring.ends[episode(times)], newest),
+            integers,
+            lambda: self.draw_rows(ring, key, len(rows.time))[:2],
+            self.positions,
+            (ring.obs[self.achieved].__getitem__, ring.obs[self.desired].__getitem__),
+        )
+        positions: Array = steps.chosen_by(self.strategy)  # type: ignore[arg-type]
+        return positions
 
 
 def put(store: Array, index: Array, values: Array) -> Array:

@@ -19,13 +19,12 @@ remains a crash. Each strategy is one definition for host and device.
 
 from __future__ import annotations
 
-import inspect
 import math
 from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import dataclass
 from enum import Enum
-from functools import cache, partial
+from functools import cache, cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -33,7 +32,7 @@ import numpy as np
 from rejeu.core.algorithm import Transition
 from rejeu.envs.goals import GoalFunctions
 from rejeu.replay.prioritized import Draw, Priorities
-from rejeu.replay.ring import Ring
+from rejeu.replay.ring import LAST, Ring
 from rejeu.replay.uniform import BaseReplayBuffer, NewGoals
 
 N_CANDIDATES = 8
@@ -52,56 +51,61 @@ class HindsightSteps:
 
     np: Any
     """The module that computes with the arrays: ``numpy`` or ``jax.numpy``."""
+    env: Any
+    """Their environments."""
     time: Any
     """Times of the observations; ``time + 1`` is that of the next ones."""
-    first: Any
-    """The first times of the same episodes that may be chosen: those after the oldest observations that are stored. None for
-    strategies of :data:`FROM_LATER` on the host."""
-    last: Any
-    """The last times that may be chosen: those of the newest observations."""
-    achieved: Callable[[Any], Any]
-    """``achieved(times)`` returns the achieved goals of the same episodes at times ``(n,)`` or ``(n, k)``."""
-    desired: Callable[[], Any]
-    """``desired()`` returns the goals that the transitions have."""
+    oldest: Any
+    """Times of the oldest observations of the same environments that are stored."""
+    newest: Any
+    """Times of the newest ones."""
+    begin: Callable[[Any], Any]
+    """``begin(times)`` returns the times of the first observations of the episodes at times ``(n,)``, or the oldest stored."""
+    end: Callable[[Any], Any]
+    """``end(times)`` returns the times of the last observations of these episodes, or the newest."""
     integers: Callable[[Any, Any], Any]
     """``integers(low, high)`` returns random whole numbers from ``low`` to ``high - 1``, arrays ``(n,)`` or ``(n, k)``."""
+    drawn: Callable[[], tuple[Any, Any]]
+    """``drawn()`` returns environments and times of steps drawn from all that are stored."""
+    index: Callable[[Any, Any], Any]
+    """Returns positions in the ring, given environments and times."""
+    goals_at: tuple[Callable[[Any], Any], Callable[[Any], Any]]
+    """Return the achieved and the desired goals at positions."""
 
-    @classmethod
-    def of(
-        cls,
-        np: Any,
-        index: Callable[[Any, Any], Any],
-        env: Any,
-        times: tuple[Any, Any, Any],
-        goals_at: tuple[Callable[[Any], Any], Callable[[Any], Any]],
-        integers: Callable[[Any, Any], Any],
-    ) -> HindsightSteps:
-        """Returns transitions of the environments ``env`` ``(n,)``.
+    @cached_property
+    def first(self) -> Any:
+        """The first times of the same episodes with a goal that was reached by an action."""
+        return self.begin(self.time) + 1
 
-        Args:
-            np: the module of the arrays.
-            index: returns positions in a ring, given environments and times.
-            env: the environments.
-            times: ``time``, ``first`` and ``last``.
-            goals_at: return the achieved and the desired goals at positions.
-            integers: as above.
-        """
-        achieved_at, desired_at = goals_at
-        achieved = lambda at: achieved_at(index(env.reshape(-1, *[1] * (at.ndim - 1)), at))  # noqa: E731
-        return cls(np, *times, achieved, lambda: desired_at(index(env, times[0])), integers)
+    @cached_property
+    def last(self) -> Any:
+        """The last times of the same episodes."""
+        return self.end(self.time)
+
+    def achieved(self, times: Any) -> Any:
+        """Returns the achieved goals of the same environments at times ``(n,)`` or ``(n, k)``."""
+        return self.goals_at[0](self.index(self.env.reshape(-1, *[1] * (times.ndim - 1)), times))
+
+    def desired(self) -> Any:
+        """Returns the goals that the transitions have."""
+        return self.goals_at[1](self.index(self.env, self.time))
 
     def chosen_by(self, strategy: str | GoalStrategy) -> Any:
-        """Returns the times of the new goals that a strategy, or the one of this name, chooses."""
-        return (STRATEGIES[strategy] if isinstance(strategy, str) else strategy)(self)
+        """Returns the positions of the new goals that a strategy, or the one of this name, chooses."""
+        if strategy == "random":
+            env, time = self.drawn()
+            return self.index(env, time + 1)
+        times = (STRATEGIES[strategy] if isinstance(strategy, str) else strategy)(self)
+        return self.index(self.env, times if strategy in BUILT_IN else stored(self, times))
 
 
 GoalStrategy = Callable[[HindsightSteps], Any]
 """A goal strategy of your own: ``strategy(steps) -> times``, for the loop of the host and for the program on the device.
 
-The result says at which times of the same episodes the achieved goals are taken, whole numbers ``(n,)`` from
-``steps.first`` to ``steps.last``. Others are an error on the host, and the nearest allowed time on the device.
-:func:`register_goal_strategy` gives it a name, by which it is saved. A function ``(rng, time, first, last) -> times`` of
-NumPy's generator and arrays works as well, on the host only."""
+The result says at which times of the same environments the achieved goals are taken, whole numbers ``(n,)`` from
+``steps.oldest`` to ``steps.newest``: from ``steps.first`` to ``steps.last`` those of the same episodes, before and after them
+those of others. Others are an error on the host, and the nearest stored time on the device.
+:func:`register_goal_strategy` gives it a name, by which it is saved."""
 
 
 def future(steps: HindsightSteps) -> Any:
@@ -137,7 +141,7 @@ def next_future(steps: HindsightSteps) -> Any:
 
 FROM_LATER = {"future": future, "final": final, "closest": closest, "next_future": next_future}
 BUILT_IN = {**FROM_LATER, "episode": episode}
-"""Without ``random``, which takes the goals of other episodes."""
+"""Without ``random``, which takes the goals of other environments too."""
 STRATEGIES: dict[str, GoalStrategy] = dict(BUILT_IN)
 """All strategies that have a name."""
 
@@ -165,17 +169,6 @@ def name_of(strategy: str | Callable[..., Any]) -> str | Callable[..., Any]:
     """Returns the name of a strategy, or the function itself if it has none."""
     names = [name for name, known in STRATEGIES.items() if known is strategy]
     return names[0] if names else strategy
-
-
-def takes_generator(strategy: str | Callable[..., Any]) -> bool:
-    """Returns whether a strategy is a function ``(rng, time, first, last)``, for the host only."""
-    if not callable(strategy):
-        return False
-    try:
-        inspect.signature(strategy).bind(None)
-    except TypeError:
-        return True
-    return False
 
 
 class GoalSelectionStrategy(str, Enum):
@@ -225,10 +218,9 @@ def counters(config: HindsightConfig | None) -> tuple[str, ...]:
     >>> counters(HindsightConfig(goal_selection_strategy="future"))
     ('until_end',)
     """
-    strategy = None if config is None else config.goal_selection_strategy
-    if strategy is None or strategy == "random":
+    if config is None or config.goal_selection_strategy == "random":
         return ()
-    return ("until_end",) if strategy in (*FROM_LATER,) else ("since_start", "until_end")
+    return ("until_end",) if config.goal_selection_strategy in (*FROM_LATER,) else ("since_start", "until_end")
 
 
 class HerReplayBuffer(BaseReplayBuffer):
@@ -313,27 +305,28 @@ class HerReplayBuffer(BaseReplayBuffer):
             step: their records, ``(n,)``, with the :func:`counters` of the strategy: ``until_end`` is the number of steps from
                 ``time`` to the end of the episode, 0 while it runs; ``since_start`` the number since its first observation.
         """
-        ring, strategy = self.ring, self.config.goal_selection_strategy
-        if strategy == "random":
-            other = ring.draw(rng, len(step))
-            return ring.index(other.env, other.time + 1)
-        until_end, names = step["until_end"], step.dtype.names or ()
-        last = time + np.where(until_end, until_end, ring.head[env] - time)
-        first = (
-            time - np.minimum(step["since_start"], time - ring.oldest()[env]) + 1 if "since_start" in names else None
-        )
-        if takes_generator(strategy):
-            with_generator: Any = strategy
-            return ring.index(env, checked(with_generator(rng, time, first, last), first, last))
+        ring, oldest, newest = self.ring, self.ring.oldest()[env], self.ring.head[env]
+
+        def begin(times: np.ndarray) -> np.ndarray:
+            times = np.maximum(times, oldest)
+            return np.maximum(times - ring.since_start[ring.index(env, times)], oldest)  # type: ignore[index]
+
+        def end(times: np.ndarray) -> np.ndarray:
+            position = ring.index(env, times)
+            until_end = ring.until_end[position]  # type: ignore[index]
+            has_ended = (until_end > 0) | (ring.kind[position] == LAST)
+            return np.where(has_ended, times + until_end, newest)
 
         def integers(low: np.ndarray, high: np.ndarray) -> np.ndarray:
             u = rng.random(np.broadcast_shapes(np.shape(low), np.shape(high)))
             return low + (u * (high - low)).astype(np.int64)
 
+        def drawn() -> tuple[np.ndarray, np.ndarray]:
+            return ring.draw(rng, len(time))[:2]
+
         goals_at = partial(ring.read_leaf, self.achieved), partial(ring.read_leaf, self.desired)
-        steps = HindsightSteps.of(np, ring.index, env, (time, first, last), goals_at, integers)
-        times = steps.chosen_by(strategy)
-        return ring.index(env, times if strategy in BUILT_IN else checked(times, first, last))
+        steps = HindsightSteps(np, env, time, oldest, newest, begin, end, integers, drawn, ring.index, goals_at)
+        return np.asarray(steps.chosen_by(self.config.goal_selection_strategy))
 
 
 @cache
@@ -347,30 +340,21 @@ def relabeled_positions(shape: tuple[int, ...], k: int) -> slice | np.ndarray:
     return np.flatnonzero(chosen)
 
 
-WANTED = "goal_selection_strategy must return whole numbers from first to last, one for each transition,"
-
-
-def whole_times(times: Any, last: Any) -> Any:
-    """Returns the times that a strategy of the user's own chose, of which only shape and dtype are known on the device.
+def stored(steps: HindsightSteps, times: Any) -> Any:
+    """Returns the times that a strategy of the user's own chose; on the device, where they are not known yet, in the range.
 
     Raises:
-        ValueError: if they are not whole numbers ``(n,)``.
+        ValueError: if they are not whole numbers ``(n,)``, or on the host one is not stored.
     """
-    times = times if hasattr(times, "dtype") else np.asarray(times)
-    if times.shape != last.shape or times.dtype.kind not in "iu":
-        raise ValueError(f"{WANTED} of shape {last.shape}; it returned {times.dtype} of shape {times.shape}")
-    return times
-
-
-def checked(times: Any, first: Any, last: np.ndarray) -> np.ndarray:
-    """Returns the times that a strategy of the user's own chose.
-
-    Raises:
-        ValueError: if one is outside of the episode.
-    """
-    times = np.asarray(whole_times(times, last))
-    if ((times < first) | (times > last)).any():
-        wrong = np.flatnonzero((times < first) | (times > last))[0]
-        received = f"{times[wrong]} where first is {first[wrong]} and last is {last[wrong]}"
-        raise ValueError(f"{WANTED} of shape {last.shape}; it returned {received}")
+    times, wanted = times if hasattr(times, "dtype") else np.asarray(times), steps.time.shape
+    message = (
+        f"goal_selection_strategy must return whole numbers, times that are stored, of shape {wanted}; it returned"
+    )
+    if times.shape != wanted or times.dtype.kind not in "iu":
+        raise ValueError(f"{message} {times.dtype} of shape {times.shape}")
+    if steps.np is not np:
+        return steps.np.clip(times.astype(steps.time.dtype), steps.oldest, steps.newest)
+    if (wrong := np.flatnonzero((times < steps.oldest) | (times > steps.newest))).size:
+        i = wrong[0]
+        raise ValueError(f"{message} {times[i]} where oldest is {steps.oldest[i]} and newest is {steps.newest[i]}")
     return times

@@ -94,17 +94,3 @@ def test_the_point_never_enters_a_wall_and_reaches_every_cell(layout):
     assert np.abs(way.velocity).max() < point_maze.MAX_SPEED
     steps = np.abs(np.diff(np.asarray(way.position), axis=0)).max()
     assert steps < 0.5  # nothing is jumped over
-
-
-def test_a_wall_stops_the_point_and_lets_it_slide_along():
-    env = PointMaze(layout="u")
-    state, _ = env.reset(KEY)
-    step = jax.jit(env.step)
-    state = state._replace(position=jnp.array([-1.0, 1.0]), velocity=jnp.zeros(2), goal=jnp.array([1.0, -1.0]))
-    for _ in range(10):
-        state, obs, reward, terminated, _ = step(KEY, state, jnp.array([1.0, 1.0]))
-    assert state.velocity[1] == 0.0  # at the upper wall
-    np.testing.assert_allclose(state.position[1], 1.5 - RADIUS, atol=1e-3)
-    assert state.position[0] > 0.5  # still moving to the right
-    assert (float(reward), bool(terminated)) == (-1.0, False)
-    np.testing.assert_array_equal(obs["achieved_goal"], state.position)

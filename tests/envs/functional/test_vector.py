@@ -79,19 +79,6 @@ def test_a_vector_is_the_pure_functions_for_the_key_of_its_seed():
     assert env.goals() is None
 
 
-def test_inactive_environments_do_not_move():
-    env = rejeu.make_vector("jax/Pendulum-v1", 2, seed=0)
-    reference = rejeu.make_vector("jax/Pendulum-v1", 2, seed=0)
-    obs = env.reset().copy()
-    reference.reset()
-    step = env.step(np.ones((2, 1)), active=np.array([True, False]))
-    np.testing.assert_array_equal(step.obs[1], obs[1])
-    assert (step.obs[0] != obs[0]).any()
-    assert step.reward[1] == 0.0
-    later = env.step(np.ones((2, 1)), active=np.array([False, True]))
-    np.testing.assert_allclose(later.obs, reference.step(np.ones((2, 1))).obs, atol=1e-6)
-
-
 def test_a_snapshot_continues_in_another_vector():
     env = rejeu.make_vector("jax/CartPole-v1", 2, seed=0)
     env.reset()

@@ -133,14 +133,6 @@ def test_tables_hold_every_episode_and_evaluation(run):
     assert "train/critic_loss" in rows(run / "metrics.csv")[0]
 
 
-def test_the_best_model_is_that_of_the_best_evaluation(run):
-    table = rows(run / "evaluations.csv")
-    last_best = max(i for i, row in enumerate(table) if row["best"] == "1")
-    assert last_best == np.argmax([float(row["mean_return"]) for row in table])
-    counters = rejeu.load(run / "best.safetensors").num_timesteps
-    assert counters == int(table[last_best]["step"])
-
-
 def test_train_says_what_it_does_and_what_came_of_it(tmp_path, capsys):
     assert train(tmp_path / "run", "--seed", "1", *FEWER_FILES, steps=60) == 0
     text = capsys.readouterr().out

@@ -72,20 +72,6 @@ def commands(folder):
     return [line.split() for path in folder.rglob("commands.txt") for line in path.read_text().splitlines()]
 
 
-def test_a_study_finds_the_best_trial_and_writes_it_as_a_preset(tmp_path):
-    result = run(tuning.open_study(make_plan(), tmp_path / "study"))
-    assert result.complete
-    assert [one.index for one in result.trials] == [0, 1, 2, 3]
-    assert result.trials[0].values == {"learning_rate": 1e-3}  # that of rejeu's preset
-    assert result.best is result.trials[0]
-    assert result.preset.hyperparameters["learning_rate"] == 1e-3
-    assert result.preset.hyperparameters["policy_kwargs"] == {"net_arch": [64, 64]}  # of rejeu's preset
-    assert result.preset.total_steps == 40
-    assert "trial 0 of 4, mean return" in result.preset.source
-    assert not list(tmp_path.rglob("checkpoints"))
-    assert result.final.verdict == "the default itself"
-
-
 def test_a_study_with_one_worker_is_reproducible_and_another_seed_differs(whole, tmp_path):
     one, other = (
         run(tuning.open_study(make_plan(seed=seed, trials=trials, final_seeds=0), tmp_path / f"seed {seed}"))
@@ -142,17 +128,6 @@ def test_a_trial_is_the_mean_over_its_seeds(tmp_path):
     seeds = [json.loads(path.read_text())["seed"] for path in runs]
     assert len(seeds) == 3
     assert result.best.value == pytest.approx(1 + sum(seed % 7 for seed in seeds) / 300)
-
-
-def test_a_failed_trial_keeps_its_reason_and_does_not_stop_the_study(tmp_path):
-    rates = {"learning_rate": LogUniform(6e-3, 1e-2)}
-    result = run(tuning.open_study(make_plan(trials=3, search=rates, final_seeds=5), tmp_path / "study"))
-    assert [one.state for one in result.trials] == ["failed"] * 3
-    assert all(one.reason.endswith("failed with exit status 2: at step 20: the loss is NaN") for one in result.trials)
-    assert (result.best, result.final, result.preset) == (None, None, None)
-    again = run(studies.open_study(StudyFolder(tmp_path / "study")))
-    assert facts(again) == facts(result)
-    assert len(commands(tmp_path / "study")) == 3  # failed trials are not repeated
 
 
 def test_a_trial_below_the_median_is_pruned(tmp_path):
@@ -338,3 +313,17 @@ def test_processes_are_ended_if_the_search_ends_by_an_error(tmp_path):
         search.run(fail)
     assert begun
     assert [one.poll() for one in begun] == [143]
+
+
+def test_a_study_finds_the_best_trial_and_writes_it_as_a_preset(tmp_path):
+    result = run(tuning.open_study(make_plan(), tmp_path / "study"))
+    assert result.complete
+    assert [one.index for one in result.trials] == [0, 1, 2, 3]
+    assert result.trials[0].values == {"learning_rate": 1e-3}  # that of rejeu's preset
+    assert result.best is result.trials[0]
+    assert result.preset.hyperparameters["learning_rate"] == 1e-3
+    assert result.preset.hyperparameters["policy_kwargs"] == {"net_arch": [64, 64]}  # of rejeu's preset
+    assert result.preset.total_steps == 40
+    assert "trial 0 of 4, mean return" in result.preset.source
+    assert not list(tmp_path.rglob("checkpoints"))
+    assert result.final.verdict == "the default itself"

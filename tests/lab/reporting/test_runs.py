@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from filelock import FileLock
 
-from rejeu.lab.reporting.runs import best_row, read_run
+from rejeu.agents import BUILT_IN
+from rejeu.lab.reporting.runs import best_row, default_hyperparameters, read_run
 from rejeu.lab.runs import config
 
 CONFIG = {
@@ -179,3 +180,7 @@ def test_named_pipe_does_not_block(folder):
     (folder / "metrics.csv").unlink()
     os.mkfifo(folder / "metrics.csv")
     assert "metrics.csv cannot be read: metrics.csv is not a regular file" in read_run(folder).notes
+
+
+def test_the_defaults_of_every_algorithm_are_known():
+    assert [name for name in BUILT_IN if not default_hyperparameters(name)] == []

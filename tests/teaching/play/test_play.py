@@ -13,7 +13,7 @@ import rejeu
 from rejeu.envs.registry import make_env
 from rejeu.lab.cli import main
 from rejeu.teaching.play import play
-from tests.playing import LEVER, Pull, down, error_of, hold, lever, perform, pygame, tap, up
+from tests.playing import LEVER, down, error_of, hold, lever, perform, pygame, tap, up
 from tests.tiers import exhaustive
 
 
@@ -152,37 +152,6 @@ def test_keys_close_the_window(key):
         raise AssertionError("the window is still open")
 
     assert perform(script, play, LEVER).closed
-
-
-def test_episodes_close_the_game_and_the_scores_are_printed(capsys):
-    def script(window, game):
-        down("d")
-        while True:
-            yield
-
-    assert perform(script, main, ["play", LEVER, "--episodes", "2", "--seed", "1"]) == 0
-    assert capsys.readouterr().out.endswith("you: 2 episodes, mean 10.00, best 10.00\n")
-
-
-def test_the_window_shows_both_pictures_side_by_side_and_the_keys_held():
-    def script(window, game):
-        down("d")
-        yield
-        yield
-        shown = pygame.surfarray.array3d(window.canvas).swapaxes(0, 1)
-        grey = (shown == 80).all(2)  # what the lever looks like after two steps
-        columns = np.flatnonzero(grey.sum(0) > 250)
-        assert len(columns) == 800
-        assert len(np.flatnonzero(np.diff(columns) > 1)) == 1
-        legend = shown[-30:]
-        held = (legend == (40, 104, 190)).all(2).sum()
-        up("d")
-        yield
-        yield
-        shown = pygame.surfarray.array3d(window.canvas).swapaxes(0, 1)
-        assert held > 100 > (shown[-30:] == (40, 104, 190)).all(2).sum()
-
-    perform(script, play, LEVER, against=Pull())
 
 
 @pytest.fixture(scope="module")

@@ -165,16 +165,6 @@ def test_a_resumed_run_continues_bit_for_bit(tmp_path: Path, priorities: dict[st
     assert_same_runs(whole, resumed, 0.0)
 
 
-def test_unsupported_settings_train_on_the_host_with_a_warning() -> None:
-    agent = make(rejeu.DQN, "jax/CartPole-v1", priorities={}, gradient_steps=-1, train_freq=(1, "episode"))
-    with pytest.warns(UserWarning, match="priorities with gradient_steps=-1"):
-        agent.learn(30)
-    assert agent.num_timesteps == 30
-    agent.on_device = True
-    with pytest.raises(ValueError, match="priorities with gradient_steps=-1"):
-        agent.learn(30)
-
-
 @pytest.mark.exhaustive
 def test_priorities_continue_from_the_loop_of_the_host_and_back() -> None:
     """Also with the TD errors of several gradient steps that are still to set priorities."""
