@@ -654,7 +654,8 @@ def test_every_setting_is_in_one_of_the_tables() -> None:
     settings = {field for case in CASES for field in case.fields} | set(nested)
     assert settings - SHOWN.keys() - ELSEWHERE.keys() == set()
     assert (SHOWN.keys() | ELSEWHERE.keys()) - settings == set()
-    assert set(AGENTS) == {case.kind for case in CASES}
+    own = {name for name, kind in AGENTS.items() if kind.algorithm.make.__module__ == kind.algorithm.__name__}
+    assert own <= {case.kind for case in CASES} <= set(AGENTS)  # others are settings of one of these
 
 
 def test_what_shows_a_setting_elsewhere_is_there() -> None:
