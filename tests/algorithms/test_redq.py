@@ -1,4 +1,4 @@
-"""SAC with a subset of its critics as target and with dropout in them (REDQ and DroQ)."""
+"""REDQ, and SAC with a subset of its critics as target and with dropout in them (DroQ)."""
 
 from __future__ import annotations
 
@@ -90,3 +90,18 @@ def test_settings_that_cannot_be_are_refused():
         rejeu.TD3("MlpPolicy", "Pendulum-v1", policy_kwargs={"dropout": 0.1})
     with pytest.raises(ValueError, match="architecture='simba' conflicts with dropout"):
         sac.Config(policy_kwargs={"dropout": 0.1, "architecture": "simba"})
+
+
+def test_redq_is_sac_with_many_critics_and_gradient_steps():
+    settings = {"policy_kwargs": {"net_arch": [4]}, "learning_starts": 10, "seed": 0}
+    often = {"n_critics": 10, "target_subset": 2, "gradient_steps": 20, "policy_delay": 20}
+    one = rejeu.REDQ("MlpPolicy", "Pendulum-v1", **settings).learn(15)
+    other = rejeu.SAC("MlpPolicy", "Pendulum-v1", **settings, **often).learn(15)
+    assert rejeu.REDQ("MlpPolicy", "Pendulum-v1").config.learning_starts == 5000
+    for key, array in other.get_parameters().items():
+        np.testing.assert_array_equal(one.get_parameters()[key], array, err_msg=key)
+
+
+def test_redq_takes_the_actions_of_sac():
+    agent = rejeu.REDQ("MlpPolicy", "CartPole-v1", policy_kwargs={"net_arch": [4]}, learning_starts=5).learn(8)
+    assert agent.q_values(np.zeros(4), critics="all").shape == (10, 2)

@@ -27,6 +27,9 @@ class IQN(OffPolicyAgent):
 class TQC(OffPolicyAgent):
     """Truncated quantile critics (Kuznetsov et al. 2020), for continuous actions."""
 
+class REDQ(OffPolicyAgent):
+    """SAC with 20 gradient steps of 10 critics for each step (Chen et al. 2021), for the actions of SAC."""
+
 class CrossQ(OffPolicyAgent):
     """SAC with batch renormalization instead of target networks (Bhatt et al. 2024), for continuous actions."""
 
