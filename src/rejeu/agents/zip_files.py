@@ -59,6 +59,10 @@ IGNORED: tuple[str, ...] = (
 )
 IGNORED += ("replay_buffer_kwargs", "train_freq")
 """Hyperparameters that have another form in a file."""
+OWN = ("seed", "device", "stats_window_size")
+"""Arguments of an agent that are no hyperparameters."""
+OUTPUTS = {"verbose": int, "log": None, "tensorboard_log": str}
+"""Those that say where it reports to, with their types in a file; None: not in a file."""
 
 
 class Pickled(msgspec.Struct):
@@ -460,84 +464,100 @@ def load_zip(
         CheckpointError: if the file is damaged, names code, or its policy cannot be expressed; the message says which part.
         TypeError, ValueError: for unknown or invalid ``changes``.
     """
-    path = Path(path)
-    path = path if path.suffix or path.is_dir() else path.with_name(f"{path.name}.zip")
-    path = zoo.model_in(path, which) if path.is_dir() else path
+    path = zoo.model_in(Path(path), which) if Path(path).is_dir() else Path(path)
+    path = path if path.suffix else path.with_name(f"{path.name}.zip")
     with explained(path):
         model = read(path)
         algorithm = algorithm_of(model)
-        if kind is not None and kind.algorithm.Config.name != algorithm:
-            raise Malformed(
-                f"it is a model of {algorithm}, not of {kind.algorithm.Config.name}; load it with {algorithm}.load"
-            )
-    notes: list[str] = []
-    if vecnormalize is None and (beside := zoo.statistics_beside(path)) is not None:
-        vecnormalize = beside
-        notes.append(f"observations are normalized by {beside}, which lies beside it; vecnormalize=False leaves it out")
-        if path.stem == zoo.BEST:
-            notes.append(
-                "these statistics may be of the end of training, and the model is not: it can act worse than it did"
-            )
-    notes += zoo.notes_beside(path, vecnormalize or None, changes)
-    state = None
-    if vecnormalize:
-        with explained(Path(vecnormalize)):
-            state = read_normalization(Path(vecnormalize))
+        if kind is not None and (name := kind.algorithm.Config.name) != algorithm:
+            raise Malformed(f"it is a model of {algorithm}, not of {name}; load it with {algorithm}.load")
+    vecnormalize, notes = normalization_for(path, vecnormalize, changes)
     cls = kind or BUILT_IN[algorithm]
-    agent: Agent = cls.__new__(cls)
-    agent.notes = notes  # before it is built, when only known attributes can be set
-    own_names = ("seed", "device", "stats_window_size", "verbose", "log", "tensorboard_log")
-    own = {key: changes.pop(key) for key in [*changes] if key in own_names}
-    outputs = {key: own.pop(key) for key in [*own] if key in ("verbose", "log", "tensorboard_log")}
+    own = {key: changes.pop(key) for key in [*changes] if key in (*OWN, *OUTPUTS)}
+    outputs = {key: own.pop(key) for key in [*own] if key in OUTPUTS}
     with explained(path):
-        seed = model.value("seed")
-        own.setdefault("seed", seed if isinstance(seed, int) and 0 <= seed < 2**32 else None)
-        if isinstance(window := model.readable("_stats_window_size"), int) and 0 < window < 2**31:
-            own.setdefault("stats_window_size", window)
-        file_space, keys = space_of(model, "observation_space")
-        action_space, _ = space_of(model, "action_space")
-        kwargs = model.readable("policy_kwargs")
-        squashes = algorithm in ON_POLICY and isinstance(kwargs, dict) and kwargs.get("squash_output") is True
-        weights = model.tensors["policy"]
-        if OLD_HER in model.fields and not keys:
-            file_space, keys, weights = with_goals(model, file_space)
-        policy = OriginalPolicy(weights, spaces.leaves(file_space), keys, action_space, squashes)
+        own = arguments_of(model) | own
+        policy, space = policy_of(model, algorithm)
         settings = settings_of(cls.algorithm.Config, model, notes, changes)
         settings |= policy_settings(model, policy, algorithm)
-        arrays: dict[str, np.ndarray] = {}
-    if state is not None:
-        with explained(Path(vecnormalize or path)):
-            settings["normalize"], arrays = statistics_of(state, policy.leaves, notes)
+    arrays: dict[str, np.ndarray] = {}
+    if vecnormalize:
+        with explained(vecnormalize):
+            settings["normalize"], arrays = statistics_of(read_normalization(vecnormalize), policy.leaves, notes)
     with explained(path):
         check_depths(cls.algorithm.Config(**settings))
-    config: Any = build(cls.algorithm.Config, settings | changes)
-    name = spaces.POLICIES[1] if keys else spaces.POLICIES[2 if policy.is_image(policy.leaves[0]) else 0]
-    agent.configure(name, config, **own)
+    agent: Agent = cls.__new__(cls)
+    agent.notes = notes  # before it is built, when only known attributes can be set
+    agent.configure(name_of(policy), build(cls.algorithm.Config, settings | changes), **own)
     agent.set_outputs(**outputs)
     vector = None if env is None else agent.make_envs(env, 1, seed=agent.seed)
+    given = None if vector is None else vector.observation_space
     with explained(path):
-        agent.build(
-            observation_space_of(file_space, None if vector is None else vector.observation_space), action_space
-        )
-        prefix = "" if config.normalize is None else "learner."
-        parts = parts_of(algorithm, policy, getattr(config, "n_quantiles", 1))
-        found, left_out = converted(parts, policy, model.tensors)
-        notes += [f"the state of {name} is not taken over: it is of another optimizer" for name in left_out]
-        found |= counts_of(algorithm, model)
-        arrays |= {f"{prefix}{key}": value for key, value in found.items()}
-        arrays = checked(agent.learner.shapes, arrays, [f"{prefix}{part.field}." for part in parts])
-        agent.start_run(None)
-        agent.set_parameters(arrays, exact_match=False)
-        restore_counters(agent, model, found)
+        agent.build(observation_space_of(space, given), policy.action_space)
+        restore(agent, model, policy, algorithm, arrays)
     restore_windows(agent, model.readable)
     if kind is not None:  # as the original's load does
-        wanted: dict[str, Any] = {"verbose": int, "tensorboard_log": str}
-        said: dict[str, Any] = {key: model.readable(key) for key in wanted}
-        agent.set_outputs(**{key: x for key, x in said.items() if type(x) is wanted[key]} | outputs)
+        said = {key: model.readable(key) for key in OUTPUTS}
+        agent.set_outputs(**{key: x for key, x in said.items() if type(x) is OUTPUTS[key]} | outputs)
     if vector is not None:
         agent.set_env(vector)
         agent.made_from_id = isinstance(env, str)
     return agent
+
+
+def normalization_for(
+    path: Path, vecnormalize: str | Path | Literal[False] | None, changes: Mapping[str, Any]
+) -> tuple[Path | None, list[str]]:
+    """Returns the file of the statistics that a policy was trained behind, if any, and notes about what lies beside it."""
+    notes: list[str] = []
+    if vecnormalize is None and (vecnormalize := zoo.statistics_beside(path)) is not None:
+        notes.append(
+            f"observations are normalized by {vecnormalize}, which lies beside it; vecnormalize=False leaves it out"
+        )
+        if path.stem == zoo.BEST:
+            notes.append(
+                "these statistics may be of the end of training, and the model is not: it can act worse than it did"
+            )
+    return Path(vecnormalize) if vecnormalize else None, notes + zoo.notes_beside(path, vecnormalize or None, changes)
+
+
+def arguments_of(model: Model) -> dict[str, Any]:
+    """Returns the arguments of an agent that are no hyperparameters."""
+    seed, window = model.value("seed"), model.readable("_stats_window_size")
+    arguments = {"seed": seed if isinstance(seed, int) and 0 <= seed < 2**32 else None}
+    return arguments | ({"stats_window_size": window} if isinstance(window, int) and 0 < window < 2**31 else {})
+
+
+def policy_of(model: Model, algorithm: str) -> tuple[OriginalPolicy, gym.Space]:
+    """Returns the networks of a file, and the space of their observations."""
+    space, keys = space_of(model, "observation_space")
+    action_space, _ = space_of(model, "action_space")
+    kwargs, weights = model.readable("policy_kwargs"), model.tensors["policy"]
+    squashes = algorithm in ON_POLICY and isinstance(kwargs, dict) and kwargs.get("squash_output") is True
+    if OLD_HER in model.fields and not keys:
+        space, keys, weights = with_goals(model, space)
+    return OriginalPolicy(weights, spaces.leaves(space), keys, action_space, squashes), space
+
+
+def name_of(policy: OriginalPolicy) -> str:
+    """Returns the name of a policy by what it observes."""
+    return spaces.POLICIES[1] if policy.keys else spaces.POLICIES[2 if policy.is_image(policy.leaves[0]) else 0]
+
+
+def restore(
+    agent: Agent, model: Model, policy: OriginalPolicy, algorithm: str, statistics: Mapping[str, np.ndarray]
+) -> None:
+    """Starts a run of an agent with the weights, the optimizers and the counters of a file."""
+    prefix = "" if agent.config.normalize is None else "learner."
+    parts = parts_of(algorithm, policy, getattr(agent.config, "n_quantiles", 1))
+    values, left_out = converted(parts, policy, model.tensors)
+    agent.notes += [f"the state of {name} is not taken over: it is of another optimizer" for name in left_out]
+    values |= counts_of(algorithm, model)
+    arrays = {**statistics, **{f"{prefix}{key}": value for key, value in values.items()}}
+    arrays = checked(agent.learner.shapes, arrays, [f"{prefix}{part.field}." for part in parts])
+    agent.start_run(None)
+    agent.set_parameters(arrays, exact_match=False)
+    restore_counters(agent, model, values)
 
 
 def counts_of(algorithm: str, model: Model) -> dict[str, np.ndarray]:
