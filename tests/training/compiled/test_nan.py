@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 import pytest
 
@@ -29,11 +30,18 @@ def test_an_environment_that_returns_nan_is_reported_with_its_steps(what: str) -
         agent.learn(100)
     assert agent.stops is not None
     assert "\n" not in str(raised.value)
+    assert_finite_experience(agent)
     if what == "reward":
         with pytest.raises(rejeu.BadEnvironmentError, match="reward nan in environment 0 after 48 steps"):
             learn_on_host(make(rejeu.DQN, Breaks(what=what), 2), 100)
         first, last = (int(number) for number in re.findall(r"\d+", str(raised.value))[-2:])
         assert first <= 48 <= last
+
+
+def assert_finite_experience(agent: Any) -> None:
+    """Asserts that what is learned from next is finite."""
+    batch, _ = agent.run.replay.draw(np.random.default_rng(0), (200,), 0.0)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(batch))
 
 
 def assert_reported(agent: Any, said: str) -> rejeu.NonFiniteError:
@@ -68,7 +76,10 @@ def assert_reported(agent: Any, said: str) -> rejeu.NonFiniteError:
     ],
 )  # fmt: skip
 def test_nan_of_an_update_is_reported_with_its_steps(kind: Any, env: Any, settings: dict[str, Any], said: str) -> None:
-    assert_reported(make(kind, env, **settings), said)
+    agent = make(kind, env, **settings)
+    assert_reported(agent, said)
+    if kind is not rejeu.DDPG:  # whose goals are judged when they are drawn
+        assert_finite_experience(agent)
 
 
 def test_an_agent_trains_on_after_a_nan_and_the_host_names_its_update(tmp_path: Path) -> None:
@@ -88,3 +99,4 @@ def test_an_agent_trains_on_after_a_nan_and_the_host_names_its_update(tmp_path: 
 def test_nan_of_an_on_policy_update_is_reported_with_its_steps() -> None:
     agent = on_policy.make(rejeu.PPO, "jax/CartPole-v1", **on_policy.PPO, learning_rate=1e38)
     assert "policy_gradient_loss" in str(assert_reported(agent, "lower learning_rate").names)
+    assert agent.run.replay.size() == 0

@@ -159,9 +159,14 @@ def take_chunks(
 
 
 def raise_fault(trainer: DeviceTrainer, which: int, first_step: int, before: tuple[Any, int]) -> NoReturn:
-    """Raises the error of a run in a chunk after ``first_step``, before which its state and updates were ``before``."""
+    """Raises the error of a run in a chunk after ``first_step``, before which its state and updates were ``before``.
+
+    Its experience holds what is finite; a rollout is dropped.
+    """
     run, report, after = trainer.runs[which], trainer.reports[which], trainer.carries[which].state
     run.state, run.n_updates = before
+    if isinstance(trainer.program, OnPolicyProgram):
+        run.replay.length = 0
     if report.nonfinite_env:
         run.obs = run.action = None
         raise BadEnvironmentError(

@@ -28,7 +28,17 @@ from rejeu.replay.device_priorities import Pending, noted
 from rejeu.replay.hindsight import HerReplayBuffer
 from rejeu.replay.prioritized import Draw
 from rejeu.training.checks import checked_restart
-from rejeu.training.compiled.program import Carry, Learned, Limits, Loop, Program, capacity_of, random_action, step_envs
+from rejeu.training.compiled.program import (
+    Carry,
+    Learned,
+    Limits,
+    Loop,
+    Program,
+    all_finite,
+    capacity_of,
+    random_action,
+    step_envs,
+)
 from rejeu.training.run import Run
 
 DRAWS = 2**32 - 1
@@ -153,7 +163,8 @@ def take_turn(program: OffPolicyProgram, env: FunctionalEnv, loop: Loop, limits:
     assert before.action is not None
     loop = step_envs(program, env, loop, before.action, limits, i)
     result, episodes, learned = loop.result, loop.carry.episodes, loop.learned
-    ring = replay.add(loop.experience, before.action, result.reward, result.terminated, result.obs, result.kept)
+    kept = result.kept & ~loop.nonfinite_env & all_finite(before.action)  # a run with NaN goes on until the chunk ends
+    ring = replay.add(loop.experience, before.action, result.reward, result.terminated, result.obs, kept)
     ring = replay.begin(ring, episodes.obs, episodes.ended)
     if algorithm.observe is not None:
         learned = learned._replace(state=algorithm.observe(learned.state, episodes.obs, episodes.running_return))
