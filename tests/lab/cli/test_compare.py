@@ -3,6 +3,8 @@
 import json
 import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -103,3 +105,23 @@ def test_status(runs, capsys):
     assert "1,000 of 5,000 (20%)" in printed
     assert r"warning: the reward\x1b is large" in printed
     assert cli.main(["status", str(runs / "none")]) == 2
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals are POSIX's")
+def test_runs_are_followed_until_ctrl_c(runs):
+    command = [sys.executable, "-m", "rejeu", "runs", str(runs), "--follow"]
+    env = {**os.environ, "PYTHONUNBUFFERED": "1"}
+    ended = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, encoding="utf-8", env=env
+    )
+    for line in ended.stdout:
+        if "PPO_2" in line:
+            break
+    (runs / "DQN_0" / "agent.safetensors").unlink()
+    (runs / "DQN_0" / "lock").touch()
+    for line in ended.stdout:
+        if "DQN_0" in line:
+            break
+    assert "crashed" in line
+    ended.terminate()
+    assert ended.communicate(timeout=60)[1].strip() == "rejeu: no longer followed"

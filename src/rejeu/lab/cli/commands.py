@@ -408,7 +408,7 @@ class Report(RunOptions):
 
 
 @dataclass(frozen=True)
-class Studio:
+class Studio(RunOptions):
     """Serves a page to this computer on which runs are started, watched, played against and compared in the web browser.
 
     Runs that it starts go on when it ends. Example: rejeu studio runs

@@ -58,12 +58,19 @@ def show(rows: Sequence[Row], folder: Path) -> None:
 
 
 def follow(reader: Rows) -> None:
-    """Shows the rows on a terminal, and again once a second, until Ctrl-C."""
+    """Shows the rows on a terminal, and when they change again, until Ctrl-C; elsewhere each time below the last."""
     from rich.live import Live
 
+    seen: list[Row] = []
     with leaving("no longer followed"), Live(console=formatting.console(highlight=False), auto_refresh=False) as live:
         while True:
-            live.update(table_of(COLUMNS, ([*cells(row).values()] for row in reader.read()), N_TEXT), refresh=True)
+            rows = reader.read()
+            texts = [[*cells(row).values()] for row in rows]
+            if rows != seen and live.console.is_terminal:
+                live.update(table_of(COLUMNS, texts, N_TEXT), refresh=True)
+            elif rows != seen:
+                show_table(COLUMNS, texts, N_TEXT)
+            seen = rows
             time.sleep(EVERY)
 
 

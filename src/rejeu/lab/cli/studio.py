@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import webbrowser
 from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from pathlib import Path
 
 from rejeu.core.errors import MissingExtra
 from rejeu.lab.cli.commands import PORT, Studio
 from rejeu.lab.cli.environment import Environment
+from rejeu.lab.runs.config import EnvironmentOptions, RunConfig
 
 
 def run_studio(arguments: Studio) -> tuple[int, None]:
@@ -19,7 +21,9 @@ def run_studio(arguments: Studio) -> tuple[int, None]:
     """
     if arguments.folder.exists() and not arguments.folder.is_dir():
         raise NotADirectoryError(f"{arguments.folder} is no folder; expected one of runs, such as runs")
-    open_studio(arguments.folder, arguments.port, not arguments.no_browser)
+    given = {one.name: getattr(arguments, one.name) for one in fields(EnvironmentOptions)}
+    typed = None if arguments.env is None else RunConfig(env=arguments.env, **given)
+    open_studio(arguments.folder, arguments.port, not arguments.no_browser, typed=typed)
     return 0, None
 
 
@@ -29,6 +33,7 @@ def open_studio(
     has_browser: bool = True,
     guests: Mapping[str, tuple[Path, Environment]] | None = None,
     page: tuple[str, Sequence[tuple[str, str]]] = ("/", ()),
+    typed: RunConfig | None = None,
 ) -> None:
     """Serves the studio until Ctrl-C.
 
@@ -38,6 +43,7 @@ def open_studio(
         has_browser: whether the page is opened in the web browser.
         guests: models that may be elsewhere, with their environments, by their names.
         page: that is opened, and its query.
+        typed: the environment that the command line names, and which runs may therefore import.
 
     Raises:
         MissingExtra: if NiceGUI is not installed.
@@ -54,4 +60,7 @@ def open_studio(
         if has_browser:
             webbrowser.open(address)
 
-    server.serve(state.Studio(folder, guests), port, ready, page)
+    studio = state.Studio(folder, guests)
+    if typed is not None:
+        studio.trust(typed)
+    server.serve(studio, port, ready, page)

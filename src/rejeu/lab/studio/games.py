@@ -16,7 +16,6 @@ from rejeu.agents import load
 from rejeu.checkpoints.run_folder import dated, find_model
 from rejeu.core.language import said
 from rejeu.lab.cli import environment, expected_errors, one_line
-from rejeu.lab.cli.commands import RunOptions
 from rejeu.lab.cli.environment import Environment
 from rejeu.lab.runs.config import EnvironmentOptions
 from rejeu.lab.studio.state import Studio
@@ -79,7 +78,7 @@ def find_agent(studio: Studio, name: str) -> tuple[Path, Environment]:
     if path.is_absolute() or ".." in path.parts:
         raise ValueError(f"{name!r} is not in the folder of the studio")
     model = find_model(studio.folder / path)
-    return model, environment.environment_of(model, RunOptions())
+    return model, environment.environment_of(model, studio.given(name))
 
 
 class Playing:

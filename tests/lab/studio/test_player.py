@@ -1,0 +1,125 @@
+"""An agent that acts for those who watch: which policy, from which seed, and what is said when it cannot. No browser."""
+
+import json
+import os
+import time
+
+import numpy as np
+import pytest
+
+pytest.importorskip("nicegui", reason="needs nicegui, which is in the extra studio")
+
+import rejeu
+from rejeu.checkpoints.run_folder import RunFolder
+from rejeu.lab.cli.commands import RunOptions
+from rejeu.lab.runs.config import RunConfig
+from rejeu.lab.studio import player
+from rejeu.lab.studio.player import BEST, Episode, Player
+from rejeu.lab.studio.state import Studio
+from tests.lab.reporting.report.folders import CONFIG, write
+
+
+@pytest.fixture(scope="module")
+def agents():
+    """Two agents with other weights, at other steps."""
+    settings = {"policy_kwargs": {"net_arch": [8]}, "learning_starts": 10, "buffer_size": 200}
+    return [rejeu.DQN("MlpPolicy", "CartPole-v1", seed=seed, **settings).learn(20 + seed) for seed in range(2)]
+
+
+@pytest.fixture
+def folder(tmp_path, agents):
+    folder = RunFolder(write(tmp_path / "run", videos=False))
+    agents[0].save(folder.agent)
+    agents[1].save(folder.best)
+    folder.models.mkdir()
+    agents[1].save(folder.models / "step_000000000021.safetensors")
+    return folder
+
+
+@pytest.fixture
+def watched(folder, monkeypatch):
+    """A player, and the captions that it showed."""
+    monkeypatch.setattr(player, "LEAST_FPS", 2000.0)
+    monkeypatch.setattr(player, "REST", 0.3)
+    monkeypatch.setattr(player, "RENEW", 0.05)
+    shown = []
+    one = Player(folder.path, RunOptions(), lambda pictures, captions: shown.append((pictures[0].shape, captions[0])))
+    yield one, shown
+    one.close()
+
+
+def until(condition):
+    end = time.monotonic() + 60
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+def test_the_last_policy_acts_then_the_one_that_is_chosen_from_its_seed(watched, agents, folder):
+    one, shown = watched
+    until(lambda: shown)
+    assert shown[0][0] == (400, 600, 3)
+    assert shown[0][1]["name"] == "the policy at step 20"
+    for model in (BEST, "step_000000000021"):
+        one.choose(model, 7)
+        until(lambda model=model: one.episode.model == model and one.episode.is_over)
+        assert (one.episode.seed, one.episode.step) == (7, 21)
+        expected = agents[1].evaluate(1, env="CartPole-v1", seed=7)
+        assert sum(one.episode.rewards) == expected.mean_return
+        assert len(one.episode.values) == len(one.episode.rewards)
+    one.close()
+    until(lambda: not one._thread.is_alive())
+
+
+def test_new_weights_are_taken_while_the_run_trains(watched, agents, folder):
+    _, shown = watched
+    until(lambda: shown)
+    agents[1].save(folder.live)
+    until(lambda: shown[-1][1]["name"] == "the policy at step 21")
+
+
+@pytest.mark.usefixtures("watched")
+def test_nobody_is_asked_once_the_run_has_ended_and_no_request_is_left(folder):
+    until(lambda: folder.watch.exists())  # nothing says that no process trains
+    (folder.path / "lock").touch()
+    folder.watch.unlink()
+    time.sleep(0.2)  # four looks for new weights
+    assert not folder.watch.exists()
+
+
+def test_what_cannot_be_shown_is_said_in_one_line(folder, monkeypatch):
+    monkeypatch.setattr(player, "RENEW", 0.01)
+    config = json.loads(folder.config.read_text())
+    for change, problem in (
+        ({"env": "my_env:Walk-v0"}, "no file may name what is imported"),
+        ({"env": "NoSuch-v0"}, "NoSuch"),
+        ({"env_argument": "my_env.py"}, "name it again: --env my_env.py"),
+    ):
+        folder.config.write_text(json.dumps({**config, **change}), encoding="utf-8")
+        one = Player(folder.path, RunOptions(), lambda *_: None)
+        until(lambda one=one: one.problem)
+        one.close()
+        assert problem in one.problem
+        assert "\n" not in one.problem
+
+
+def test_an_environment_that_was_typed_may_be_imported(tmp_path):
+    write(tmp_path / "run", {**CONFIG, "env": "Walk-v0", "env_argument": "walk.py"})
+    studio = Studio(tmp_path)
+    with studio:
+        until(lambda: studio.version)
+    assert studio.given("run") == RunOptions()
+    studio.trust(RunConfig(env="walk.py", env_kwargs={"g": 2}, imports=("a.py",)))
+    assert studio.given("run") == RunOptions(env="walk.py", env_kwargs={"g": 2}, imports=("a.py",))
+
+
+def test_the_return_that_follows_a_step_is_discounted():
+    episode = Episode("current", 0, 0, rewards=[1.0, 2.0, 4.0])
+    np.testing.assert_allclose(episode.to_go(0.5), [3.0, 4.0, 4.0])
+
+
+@pytest.mark.skipif(not hasattr(os, "setpriority"), reason="threads have no priority here")
+def test_it_yields_to_training(watched):
+    one, shown = watched
+    until(lambda: shown)
+    assert os.getpriority(os.PRIO_PROCESS, one._thread.native_id) == player.NICE
