@@ -424,9 +424,10 @@ class Studio(RunOptions):
 
 @dataclass(frozen=True)
 class Class(EnvironmentOptions):
-    """Evaluates the models in a folder, such as those of a class, and writes a leaderboard with confidence intervals.
+    """Evaluates the models in a folder, such as those of a class, and prints a leaderboard with confidence intervals.
 
-    Every model plays the same episodes. A file that is damaged or of another environment gets one line.
+    Every model plays the same episodes. A file that is damaged or of another environment gets one line. The page Class of
+    rejeu studio FOLDER shows the same live, each model to be watched.
     """
 
     folder: Annotated[Path, Shown("FOLDER", is_positional=True)]
@@ -443,8 +444,8 @@ class Class(EnvironmentOptions):
     """Return from which on an episode counts as a success; by default the environment's own. That of a file is not used."""
     language: Annotated[Literal["en", "fr"] | None, Shown("{en,fr}")] = None
     """Of the leaderboard; by default that of the environment variable REJEU_LANGUAGE, else English."""
-    out: Annotated[Path, Shown("FILE")] = Path("leaderboard.html")
-    """Page to write; a name that ends in .md or .json is written as Markdown or JSON."""
+    out: Annotated[Path | None, Shown("FILE")] = None
+    """File to write, .md or .json."""
     json: Json = False
 
 

@@ -1,4 +1,4 @@
-"""``rejeu course`` writes the notebooks of the courses and grades notebooks; ``rejeu class`` writes a leaderboard."""
+"""``rejeu course`` writes the notebooks of the courses and grades notebooks; ``rejeu class`` prints a leaderboard."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ from rejeu.core.validation import whole
 from rejeu.lab.cli import dumps, environment
 from rejeu.lab.cli.commands import Class, Course
 from rejeu.lab.cli.output import echo
+from rejeu.lab.cli.runs import show_table
+from rejeu.logs.formatting import quoted
 from rejeu.teaching.courses import grading, leaderboard, write
 
 MAX_EPISODES = 1_000
@@ -48,19 +50,15 @@ def grade(arguments: Course) -> tuple[int, dict[str, Any]]:
 
 
 def run_class(arguments: Class) -> tuple[int, dict[str, Any]]:
-    """Evaluates the models in a folder, prints a line for each, and writes the leaderboard."""
+    """Evaluates the models in a folder, prints a line for each and the leaderboard, and writes it if asked to."""
     episodes = whole("--episodes", arguments.episodes, 1, MAX_EPISODES)
-    formats = {
-        ".html": leaderboard.page,
-        ".md": leaderboard.markdown,
-        ".json": lambda board: dumps(leaderboard.to_dict(board)) + "\n",
-    }
+    formats = {".md": leaderboard.markdown, ".json": lambda board: dumps(leaderboard.to_dict(board)) + "\n"}
     out = arguments.out
-    if out.suffix not in formats:
-        raise ValueError(f"--out {out} must end in {', '.join(formats)}")
+    if out is not None and out.suffix not in formats:
+        raise ValueError(
+            f"--out {out} must end in {' or '.join(formats)}; the page is that of rejeu studio {arguments.folder}"
+        )
     paths, language = leaderboard.models(arguments.folder), chosen(arguments.language)
-    if out.suffix == ".html":
-        leaderboard.template()  # a missing package is named before the evaluations
     made = environment.from_arguments(arguments.env or leaderboard.usual_env_id(paths), arguments)
     echo(said("{}, {} episodes of each of {} models", made, episodes, len(paths), language=language))
     board = leaderboard.build(
@@ -75,5 +73,11 @@ def run_class(arguments: Class) -> tuple[int, dict[str, Any]]:
         language,
         echo,
     )
-    echo(atomic.write(out, formats[out.suffix](board)))
+    if not arguments.json:
+        show_table(board.texts["columns"], [leaderboard.cells_of(row, language) for row in board.rows], 3)
+        for note in leaderboard.notes(board):
+            echo(note)
+    echo(said("the page of the class: {}", f"rejeu studio {quoted(arguments.folder)}", language=language))
+    if out is not None:
+        echo(atomic.write(out, formats[out.suffix](board)))
     return 0, {**leaderboard.to_dict(board), "file": out}

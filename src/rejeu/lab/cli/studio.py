@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 
+from rejeu.core import devices
 from rejeu.core.errors import MissingExtra
 from rejeu.lab.cli.commands import PORT, Studio
 from rejeu.lab.cli.environment import Environment
@@ -53,6 +54,7 @@ def open_studio(
         import nicegui  # noqa: F401 - a missing one is named in one line
     except ImportError:
         raise MissingExtra("the studio", "nicegui", "studio") from None
+    devices.start_with("--device", "cpu")  # the memory of a GPU is for what trains
     from rejeu.lab.studio import server, state
 
     def ready(address: str) -> None:

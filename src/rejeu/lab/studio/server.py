@@ -14,7 +14,7 @@ from fastapi import FastAPI, Request, Response
 from fastapi.responses import FileResponse
 from nicegui import app, ui
 
-from rejeu.lab.studio import compare, figures, new, play, run, runs
+from rejeu.lab.studio import classroom, compare, figures, new, play, run, runs
 from rejeu.lab.studio.guard import HOST, Guard
 from rejeu.lab.studio.layout import frame
 from rejeu.lab.studio.state import Studio
@@ -42,6 +42,7 @@ PAGES = (
     Page("/new", "New run", new.build),
     Page("/play", "Play", play.build),
     Page("/compare", "Compare", compare.build),
+    Page("/class", "Class", classroom.build),
     Page("/run", "Run", run.build, is_listed=False),
 )
 

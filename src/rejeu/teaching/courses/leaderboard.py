@@ -17,7 +17,7 @@ from functools import cache
 from html import escape
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -25,15 +25,11 @@ from rejeu.agents import load
 from rejeu.agents.policy import policy
 from rejeu.checkpoints.run_folder import RunFolder, find_model
 from rejeu.core import checkpoint, xla
-from rejeu.core.errors import MissingExtra
 from rejeu.core.language import Language, said
 from rejeu.core.records import shown
 from rejeu.envs.make import VectorEnv
 from rejeu.envs.registry import is_plain_id
 from rejeu.logs.evaluation import Evaluation, evaluate
-
-if TYPE_CHECKING:
-    from jinja2 import Template
 
 MAX_MODELS = 1_000
 """Upper limit on the models of a folder; the others are left out, with a line that says so."""
@@ -42,6 +38,23 @@ MAX_BYTES = 2**28
 NARROW_SPACE = "\N{NARROW NO-BREAK SPACE}"
 PROBLEMS = (ArithmeticError, LookupError, MemoryError, OSError, RuntimeError, TypeError, ValueError)
 """Exceptions that a damaged or hostile model can cause."""
+
+
+class Unranked(ValueError):
+    """A model cannot be ranked.
+
+    Args:
+        key: of the text that says why.
+        values: in that text.
+    """
+
+    def __init__(self, key: str, **values: Any) -> None:
+        super().__init__(key)
+        self.key, self.values = key, values
+
+    def said(self, language: Language) -> str:
+        """Returns why, in a language."""
+        return str(texts()[language][self.key].format(**self.values))
 
 
 @dataclass(frozen=True)
@@ -73,7 +86,7 @@ class Leaderboard:
     env_id: str
     episodes: int
     rows: tuple[Entrant, ...]
-    problems: tuple[tuple[str, str], ...]
+    problems: tuple[tuple[str, Unranked], ...]
     """Name and reason."""
     language: Language = "en"
     equal: tuple[tuple[str, ...], ...] = ()
@@ -158,7 +171,7 @@ def usual_env_id(paths: Sequence[Path]) -> str:
     return ids.most_common(1)[0][0]
 
 
-def header(path: Path, language: Language = "en") -> dict[str, Any]:
+def header(path: Path) -> dict[str, Any]:
     """Returns the header of a model file.
 
     Raises:
@@ -168,7 +181,7 @@ def header(path: Path, language: Language = "en") -> dict[str, Any]:
     """
     size = path.stat().st_size
     if size > MAX_BYTES:
-        raise Unranked(texts()[language]["large"].format(size=size / 2**20, most=MAX_BYTES >> 20))
+        raise Unranked("large", size=size / 2**20, most=MAX_BYTES >> 20)
     return dict(checkpoint.read_header(path, "agent"))
 
 
@@ -199,47 +212,59 @@ def build(
         language: of the leaderboard.
         report: called with a line for each model.
     """
-    done: list[Entrant] = []
-    problems = []
-    written, board = texts()[language], Leaderboard(env_id, episodes, (), (), language)
-    if len(paths) > MAX_MODELS:
-        problems.append((written["more"].format(n=len(paths) - MAX_MODELS), written["first"].format(n=MAX_MODELS)))
+    results: dict[Path, Entrant | Unranked] = {}
+    columns = texts()[language]["columns"]
     with closing(make_vector(episodes)) as env:
         for path in paths[:MAX_MODELS]:
             name = name_of(path, folder, paths)
-            try:
-                model = evaluated(name, path, env_id, env, episodes, seed, seconds, success_threshold, language)
-            except Unranked as error:
-                reason = str(error)
-            except PROBLEMS as error:
-                text = str(error).replace(f"{path}: ", "").replace(str(path), "the file") or type(error).__name__
-                reason = written["damaged"].format(reason=shown(" ".join(text.split()), 300))
+            found = results[path] = result_of(path, name, env_id, env, episodes, seed, seconds, success_threshold)
+            if isinstance(found, Unranked):
+                text = found.said(language)
             else:
-                done.append(model)
-                cells, columns = cells_of(model, board), written["columns"]
-                found = f"{columns[5]} {cells[5]} ({columns[6]} {cells[6]})"
-                report(said("{}: {}", name, found, language=language))
-                continue
-            problems.append((name, reason))
-            report(said("{}: {}", name, reason, language=language))
+                cells = cells_of(found, language)
+                text = f"{columns[5]} {cells[5]} ({columns[6]} {cells[6]})"
+            report(said("{}: {}", name, text, language=language))
+    return board_of(folder, paths, env_id, episodes, results, language)
+
+
+def board_of(
+    folder: Path,
+    paths: Sequence[Path],
+    env_id: str,
+    episodes: int,
+    results: Mapping[Path, Entrant | Unranked],
+    language: Language,
+) -> Leaderboard:
+    """Returns the leaderboard of the models that have a result; the other arguments are those of :func:`build`."""
+    problems = [(name_of(path, folder, paths), found) for path, found in results.items() if isinstance(found, Unranked)]
+    if len(paths) > MAX_MODELS:
+        left_out = texts()[language]["more"].format(n=len(paths) - MAX_MODELS)
+        problems.insert(0, (left_out, Unranked("first", n=MAX_MODELS)))
     equal = tuple(tuple(name_of(path, folder, paths) for path in group) for group in equal_files(paths[:MAX_MODELS]))
-    return replace(board, rows=ranked(done), problems=tuple(problems), equal=equal)
+    rows = ranked(found for found in results.values() if isinstance(found, Entrant))
+    return Leaderboard(env_id, episodes, rows, tuple(problems), language, equal)
 
 
-class Unranked(ValueError):
-    """A model cannot be ranked; the message says why, in the language of the leaderboard."""
+def result_of(path: Path, *how: Any) -> Entrant | Unranked:
+    """Returns a model with its evaluation, or why it has none; the arguments are those of :func:`evaluated`."""
+    try:
+        return evaluated(path, *how)
+    except Unranked as error:
+        return error
+    except PROBLEMS as error:
+        text = str(error).replace(f"{path}: ", "").replace(str(path), "the file") or type(error).__name__
+        return Unranked("damaged", reason=shown(" ".join(text.split()), 300))
 
 
 def evaluated(
-    name: str,
     path: Path,
+    name: str,
     env_id: str,
     env: VectorEnv,
     episodes: int,
     seed: int,
     seconds: float,
     success_threshold: float | None,
-    language: Language,
 ) -> Entrant:
     """Returns a model with its evaluation.
 
@@ -247,26 +272,25 @@ def evaluated(
         Unranked: if it is too large or of another environment, takes too long, or has returns that are not finite.
         ValueError: if it is damaged.
     """
-    texts_of = texts()[language]
-    trained_on = header(path, language).get("env_id")
+    trained_on = header(path).get("env_id")
     if trained_on != env_id:
-        raise Unranked(texts_of["other_env"].format(said=shown(trained_on), env_id=env_id))
+        raise Unranked("other_env", said=shown(trained_on), env_id=env_id)
     end = xla.clock() + seconds
     agent = load(path)
     try:
         agent.check_spaces(env, env_id)
     except ValueError as error:
-        raise Unranked(texts_of["spaces"].format(env_id=env_id, reason=error)) from None
+        raise Unranked("spaces", env_id=env_id, reason=error) from None
     choose = policy(agent, deterministic=True)
 
     def within_budget(obs: Any, started: np.ndarray) -> np.ndarray:
         if xla.clock() > end:
-            raise Unranked(texts_of["slow"].format(seconds=seconds, n=episodes))
+            raise Unranked("slow", seconds=seconds, n=episodes)
         return choose(obs, started)
 
     result = evaluate(within_budget, env, episodes, success_threshold, seed)
     if not np.isfinite(result.returns).all():
-        raise Unranked(texts_of["not_finite"])
+        raise Unranked("not_finite")
     return Entrant(name, agent.name, agent.num_timesteps, agent.seed, result)
 
 
@@ -297,7 +321,7 @@ def to_dict(board: Leaderboard) -> dict[str, Any]:
         }
         for row in board.rows
     ]
-    problems = [{"name": name, "reason": reason} for name, reason in board.problems]
+    problems = [{"name": name, "reason": reason.said(board.language)} for name, reason in board.problems]
     return {
         "env_id": board.env_id,
         "episodes": board.episodes,
@@ -310,18 +334,27 @@ def to_dict(board: Leaderboard) -> dict[str, Any]:
 def markdown(board: Leaderboard) -> str:
     """Returns a leaderboard as a Markdown table."""
     columns = board.texts["columns"]
-    rows = [columns, ["---"] * len(columns), *([quoted(cell) for cell in cells_of(row, board)] for row in board.rows)]
+    rows = [
+        columns,
+        ["---"] * len(columns),
+        *([quoted(cell) for cell in cells_of(row, board.language)] for row in board.rows),
+    ]
     lines = ["| " + " | ".join(cells) + " |" for cells in rows]
     lines += ["", f"{board.env_id}, {board.texts['episodes'].format(n=board.episodes)}.", ""]
-    for name, reason in board.problems:
-        lines.append(said("{}: {}", f"- {quoted(name)}", quoted(reason), language=board.language))
-    lines += [f"- {board.texts['equal']}{quoted(', '.join(names))}" for names in board.equal]
+    lines += [f"- {quoted(line)}" for line in notes(board)]
     return "\n".join(lines).rstrip() + "\n"
 
 
-def cells_of(row: Entrant, board: Leaderboard) -> list[str]:
+def notes(board: Leaderboard) -> list[str]:
+    """Returns a line for each model without a place, and for each group of equal files."""
+    said_of = ((name, reason.said(board.language)) for name, reason in board.problems)
+    lines = [said("{}: {}", *one, language=board.language) for one in said_of]
+    return [*lines, *(board.texts["equal"] + ", ".join(names) for names in board.equal)]
+
+
+def cells_of(row: Entrant, language: Language) -> list[str]:
     """Returns the cells of a row, in the order of the columns."""
-    to, result = board.texts["to"], row.evaluation
+    to, result = texts()[language]["to"], row.evaluation
     low, high = row.interval
     place = f"{row.first}" if row.first == row.last else f"{row.first} {to} {row.last}"
     numbers = [
@@ -332,7 +365,7 @@ def cells_of(row: Entrant, board: Leaderboard) -> list[str]:
         "" if math.isnan(result.success_rate) else f"{result.success_rate:.0%}",
         f"{result.mean_length:,.0f}",
     ]
-    if board.language == "fr":
+    if language == "fr":
         numbers = [one.replace(",", NARROW_SPACE).replace(".", ",").replace("%", f"{NARROW_SPACE}%") for one in numbers]
     return [place, row.name, row.algorithm, *numbers]
 
@@ -344,34 +377,3 @@ def quoted(text: str) -> str:
     'a\\|b &lt;b&gt;\\*x\\*'
     """
     return "".join(f"\\{c}" if c in "\\|*_[]`#~!" else c for c in escape(text, quote=False))
-
-
-def page(board: Leaderboard) -> str:
-    """Returns a leaderboard as an HTML page that needs no network.
-
-    Raises:
-        MissingExtra: if Jinja2 is not installed.
-    """
-    ends = [end for row in board.rows for end in row.interval] or [0.0]
-    low, width = min(ends), max(max(ends) - min(ends), 1e-9)
-    means = [row.evaluation.mean_return for row in board.rows]
-    bars = [
-        [100 * (end - low) / width for end in (*row.interval, mean)]
-        for row, mean in zip(board.rows, means, strict=True)
-    ]
-    rows = [(cells_of(row, board), bar) for row, bar in zip(board.rows, bars, strict=True)]
-    return f"{template().render(board=board, texts=board.texts, rows=rows)}\n"
-
-
-def template() -> Template:
-    """Returns the template of the page.
-
-    Raises:
-        MissingExtra: if Jinja2 is not installed.
-    """
-    try:
-        from jinja2 import Environment
-    except ImportError:
-        raise MissingExtra("the page", "jinja2", "course") from None
-    text = (resources.files("rejeu.teaching.courses") / "leaderboard.html").read_text(encoding="utf-8")
-    return Environment(autoescape=True).from_string(text)

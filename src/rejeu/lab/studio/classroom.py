@@ -1,0 +1,134 @@
+"""The page of a class: a leaderboard of the models below the folder, in English or French, also for a projector."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+from fastapi import Request
+from nicegui import ui
+
+from rejeu.core.language import LANGUAGES, Language, chosen
+from rejeu.lab.reporting.rows import steps_text
+from rejeu.lab.studio.judging import Judging
+from rejeu.lab.studio.layout import EVERY, address
+from rejeu.lab.studio.state import Studio
+from rejeu.teaching.courses import leaderboard
+from rejeu.teaching.courses.leaderboard import Leaderboard
+
+CSS = """
+.class td.name { font-weight: 600; white-space: normal; overflow-wrap: anywhere; }
+.class a { text-decoration: none; }
+.class svg { width: 7rem; height: 1rem; display: block; }
+.projector .header { display: none; }
+.projector .page { max-width: none; padding: 2vw; }
+.projector .class td, .projector .class th { font-size: min(2.2rem, 3.2vw); line-height: 1.5; }
+.projector .class td .quiet { font-size: min(1.4rem, 2.2vw); }
+.projector .class svg { width: 16vw; height: 1.6rem; }
+.projector .title { font-size: min(3rem, 5vw); line-height: 1.2; }
+.projector .small { display: none; }
+"""
+NAMES = ("place", "name", "algorithm", "steps", "seed", "return", "interval", "success", "length")
+LEFT_OUT = {
+    "algorithm": "gt-sm small",
+    "steps": "gt-sm small",
+    "seed": "gt-sm small",
+    "length": "gt-sm small",
+    "bar": "gt-xs",
+}
+"""Classes of columns that a phone, or the projector, leaves out."""
+SLOTS = {
+    "name": """<q-td :props="props" class="name">
+        <a v-if="props.row.link" class="run" :href="props.row.link" :title="props.row.watch"><q-icon
+        name="play_arrow" />{{ props.row.name }}</a>
+        <span v-else>{{ props.row.name }}</span>
+        <div class="text-caption quiet">{{ props.row.training }}</div></q-td>""",
+    "bar": """<q-td :props="props"><svg viewBox="-2 0 104 10" preserveAspectRatio="none" aria-hidden="true">
+        <rect :x="props.row.low" y="3" :width="props.row.width" height="4" fill="var(--dots)" />
+        <rect :x="props.row.middle" y="0" width="2" height="10" fill="var(--line)" /></svg></q-td>""",
+}
+"""Cells as Vue's templates, which escape what they are given."""
+
+
+@cache
+def judging_of(studio: Studio) -> Judging:
+    """Returns the results of a studio's folder, the same for all pages."""
+    return Judging(studio.folder)
+
+
+def build(studio: Studio, request: Request) -> None:
+    """Makes the page; its address may name a ``language``, and ``projector`` for large letters."""
+    ui.add_css(CSS)
+    judging, asked = judging_of(studio), request.query_params
+    language = chosen(asked.get("language") if asked.get("language") in LANGUAGES else None)
+    is_large = "projector" in asked
+    texts = leaderboard.texts()[language]
+    ui.query("body").classes("projector" if is_large else "")
+    other: Language = "en" if language == "fr" else "fr"
+    large = {} if is_large else {"projector": "1"}
+    with ui.row().classes("items-center w-full"):
+        title = ui.label().classes("text-h5 title")
+        ui.space()
+        ui.link(texts["other_language"], address("/class", language=other, **({} if large else {"projector": "1"})))
+        ui.link(texts["projector"], address("/class", language=language, **large))
+    table = ui.table(rows=[], columns=columns(texts["columns"]), row_key="name", pagination=0)
+    table.classes("w-full class").props("flat bordered dense hide-pagination")
+    for name, template in SLOTS.items():
+        table.add_slot(f"body-cell-{name}", template)
+    notes = ui.label().classes("text quiet")
+    seen: Any = None
+
+    def look() -> None:
+        nonlocal seen
+        judging.look()
+        now = judging.version, judging.now, judging.problem, studio.version
+        if now == seen:
+            return
+        seen = now
+        board = judging.board(language)
+        title.text = f"{texts['title']} {board.env_id}"
+        table.rows = [*lines(studio, judging, board)]
+        doing = texts["evaluating"].format(name=judging.now) if judging.now else ""
+        said = f"{texts['episodes'].format(n=board.episodes)}. {texts['places']}" if board.rows else ""
+        notes.text = "\n".join(filter(None, (doing, judging.problem, said, *leaderboard.notes(board))))
+
+    look()
+    ui.timer(EVERY, look)
+
+
+def columns(titles: list[str]) -> list[dict[str, Any]]:
+    """Returns the columns of the table."""
+    named = [*zip(NAMES, titles, strict=True)]
+    named.insert(NAMES.index("interval") + 1, ("bar", ""))
+    return [
+        {
+            "name": name,
+            "label": title,
+            "field": name,
+            "align": "left" if name in ("place", "name", "algorithm", "bar") else "right",
+            "classes": LEFT_OUT.get(name, ""),
+            "headerClasses": LEFT_OUT.get(name, ""),
+        }
+        for name, title in named
+    ]
+
+
+def lines(studio: Studio, judging: Judging, board: Leaderboard) -> list[dict[str, Any]]:
+    """Returns the lines of the table: the models by mean return, then the runs that train and have no model yet."""
+    texts = board.texts
+    ends = [end for row in board.rows for end in row.interval] or [0.0]
+    scale = 100 / max(max(ends) - min(ends), 1e-9)
+    running = {
+        row["run"]: texts["training"].format(steps=steps_text(row)) for row in studio.rows if row["state"] == "running"
+    }
+    found = []
+    for row in board.rows:
+        low, high = ((end - min(ends)) * scale for end in row.interval)
+        path = judging.path_of(row.name)
+        found.append(
+            dict(zip(NAMES, leaderboard.cells_of(row, board.language), strict=True))
+            | {"low": low, "width": high - low, "middle": (row.evaluation.mean_return - min(ends)) * scale - 1}
+            | {"training": running.pop(row.name, ""), "watch": texts["watch"]}
+            | {"link": path and address("/play", agent=path.as_posix(), watch="1")}
+        )
+    return [*found, *({"name": name, "training": steps} for name, steps in running.items())]
