@@ -1,7 +1,7 @@
 """The catalog: every algorithm once (``catalog.toml``), with what the rest of the package needs to know of it.
 
-Agents, public names, defaults, ``rejeu list`` and NumPy policies derive from it. A new algorithm is a file beside this one, an
-entry, a page and a test. Nothing is imported before :meth:`Entry.load`.
+Agents, public names, defaults, ``rejeu list`` and the names of :mod:`rejeu.sb3` derive from it. A new algorithm is a file
+beside this one, an entry, a page and a test. Nothing is imported before :meth:`Entry.load`.
 
 >>> CATALOG["TD3BC"].module, CATALOG["TD3BC"].kind
 ('td3_bc', 'offline')
@@ -35,6 +35,10 @@ class Entry(NamedTuple):
     """Whether the policy for Box actions does not explore by itself."""
     is_projected: bool = False
     """Whether the networks have normalized layers, whose weights are scaled after each step."""
+    original: str = ""
+    """The package of Stable-Baselines3 or its Contrib that has it; empty if neither does."""
+    policy: str = ""
+    """The class of its policies there, if they are none of on-policy algorithms."""
     zoo: str = ""
     """In folders of RL Zoo, if that is not the name in lowercase."""
 

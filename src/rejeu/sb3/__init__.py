@@ -15,6 +15,8 @@ from collections.abc import Mapping
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
+from rejeu.algorithms.catalog import CATALOG
+
 if TYPE_CHECKING:
     from rejeu.agents.zip_files import load_zip
     from rejeu.sb3.algorithms import A2C, DDPG, DQN, PPO, QRDQN, SAC, TD3, TQC, CrossQ, MaskablePPO, RecurrentPPO
@@ -22,18 +24,8 @@ if TYPE_CHECKING:
     from rejeu.sb3.common.utils import get_system_info
 
 __all__ = [
-    "A2C",
-    "DDPG",
-    "DQN",
-    "PPO",
-    "QRDQN",
-    "SAC",
-    "TD3",
-    "TQC",
-    "CrossQ",
+    *(name for name, entry in CATALOG.items() if entry.original),
     "HerReplayBuffer",
-    "MaskablePPO",
-    "RecurrentPPO",
     "get_system_info",
     "load_zip",
 ]
@@ -95,13 +87,12 @@ def define_lazily(path: str, names: Mapping[str, str]) -> None:
 
 
 POLICIES = ("CnnPolicy", "MlpPolicy", "MultiInputPolicy", "Actor", "DQNPolicy", "QNetwork", "SACPolicy", "TD3Policy")
-for _name in ("A2C", "DDPG", "DQN", "PPO", "SAC", "TD3"):
-    _path, _names = (
-        f"{__name__}.{_name.lower()}",
-        {_name: f"{__name__}.algorithms"} | dict.fromkeys(POLICIES, f"{__name__}.policy"),
-    )
-    define_lazily(_path, _names)
-    alias(_path, _name.lower(), "policies")
+for _name, _entry in CATALOG.items():
+    _package, _, _last = _entry.original.partition(".")
+    if _package == "stable_baselines3":
+        _names = {_name: f"{__name__}.algorithms"} | dict.fromkeys(POLICIES, f"{__name__}.policy")
+        define_lazily(f"{__name__}.{_last}", _names)
+        alias(f"{__name__}.{_last}", _last, "policies")
 define_lazily(
     f"{__name__}.her",
     {"HerReplayBuffer": f"{__name__}.common.buffers", "GoalSelectionStrategy": "rejeu.replay.hindsight"},

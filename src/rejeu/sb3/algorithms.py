@@ -32,6 +32,7 @@ from rejeu.agents.zoo import statistics_beside
 from rejeu.algorithms import config as configs
 from rejeu.algorithms.actor_critic.network import ActorCritic
 from rejeu.algorithms.actor_critic.steps import samples
+from rejeu.algorithms.catalog import CATALOG
 from rejeu.algorithms.config import REPLAY_BUFFERS
 from rejeu.callbacks.base import Callback, TrainingCallback
 from rejeu.checkpoints import model_files
@@ -55,21 +56,7 @@ from rejeu.sb3.common.vec_env.vec_transpose import VecTransposeImage
 from rejeu.sb3.policy import BasePolicy
 from rejeu.training import finite
 
-__all__ = [
-    "A2C",
-    "ARS",
-    "DDPG",
-    "DQN",
-    "PPO",
-    "QRDQN",
-    "SAC",
-    "TD3",
-    "TQC",
-    "TRPO",
-    "CrossQ",
-    "MaskablePPO",
-    "RecurrentPPO",
-]
+__all__ = [name for name, entry in CATALOG.items() if entry.original]
 
 RUN = {"_last_obs": "obs", "_last_episode_starts": "ended", "_n_updates": "n_updates", "_episode_num": "episode"}
 """Attributes of a run by the names that scripts read of an agent."""
@@ -196,8 +183,7 @@ class Original(Agent):
     def policy(self) -> BasePolicy:
         """The policy, with the networks as its parts."""
         if self.policy_object is None:
-            is_off_policy = isinstance(self, OffPolicyAgent)
-            self.policy_object = (POLICIES[self.name] if is_off_policy else policies.ActorCriticPolicy).of(self)
+            self.policy_object = getattr(policies, CATALOG[self.name].policy or "ActorCriticPolicy").of(self)
         return self.policy_object
 
     @policy.setter
@@ -821,13 +807,3 @@ def load_any(path: Any, device: Any) -> Any:
 
 
 policies.BaseModel.load_agent = staticmethod(load_any)
-POLICIES: dict[str, type[BasePolicy]] = {
-    "DQN": policies.DQNPolicy,
-    "QRDQN": policies.DQNPolicy,
-    "TD3": policies.TD3Policy,
-    "DDPG": policies.TD3Policy,
-    "SAC": policies.SACPolicy,
-    "TQC": policies.SACPolicy,
-    "CrossQ": policies.SACPolicy,
-}
-"""Classes of the policies of off-policy agents."""

@@ -17,6 +17,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+from rejeu.algorithms.catalog import CATALOG
 from rejeu.sb3 import define
 from rejeu.sb3.algorithms import ARS, QRDQN, TQC, TRPO, CrossQ, MaskablePPO, RecurrentPPO
 from rejeu.sb3.common import distributions
@@ -176,12 +177,13 @@ MODULES: dict[str, dict[str, Any]] = {
     },
 }
 """Names by the module in which sb3-contrib has them."""
-for kind, folder in ((QRDQN, "qrdqn"), (TQC, "tqc"), (CrossQ, "crossq"), (MaskablePPO, "ppo_mask"), (TRPO, "trpo")):
+for kind in (QRDQN, TQC, CrossQ, MaskablePPO, TRPO):
+    folder = CATALOG[kind.__name__].original.rpartition(".")[2]
     named = {"CnnPolicy": CnnPolicy, "MlpPolicy": MlpPolicy, "MultiInputPolicy": MultiInputPolicy}
     MODULES |= {folder: {kind.__name__: kind, **named}, f"{folder}.{folder}": {kind.__name__: kind}}
     parts = {f"{kind.__name__}Policy": SACPolicy, "Actor": Actor, "Critic": ContinuousCritic}
     parts |= {"QRDQNPolicy": DQNPolicy, "QuantileNetwork": QNetwork, "CrossQCritic": ContinuousCritic}
-    MODULES[f"{folder}.policies"] = named | ({} if folder in ("ppo_mask", "trpo") else parts)
+    MODULES[f"{folder}.policies"] = named | (parts if CATALOG[kind.__name__].policy else {})
 linear = dict.fromkeys(("LinearPolicy", "ARSLinearPolicy"), "LinearPolicy") | {"MlpPolicy": "MlpPolicy"}
 linear["ARSPolicy"] = "MlpPolicy"
 MODULES |= {"ars": {"ARS": ARS, **linear}, "ars.ars": {"ARS": ARS}, "ars.policies": linear}
