@@ -39,7 +39,9 @@ BARS = "▁▂▃▄▅▆▇█"
 FILES = (CONFIG, EPISODES, METRICS, EVALUATIONS, WARNINGS, "agent.safetensors", "checkpoints", "video.mp4")
 PICTURES = ("video.mp4", "curve.png")
 SHARE = 20.0
-"""A run whose reading takes a second is read at most once in so many seconds."""
+"""A run whose reading takes a second is read at most once in so many seconds, ..."""
+LONGEST = 10.0
+"""... up to this."""
 SLICE = 64
 """Most files of another program's run whose times are looked at."""
 
@@ -104,7 +106,7 @@ class Rows:
         except (OSError, ValueError, ImportError) as error:
             row = {**nothing(path, "damaged"), "notes": (shown(error, 300),)}
         now = time.monotonic()
-        self._known[path] = Known(found, row, run, now + SHARE * (now - began))
+        self._known[path] = Known(found, row, run, now + min(SHARE * (now - began), LONGEST))
 
 
 def stamp(path: Path) -> Any:

@@ -1,0 +1,233 @@
+"""What the studio costs: watching an agent, a table of many runs, and a server that is killed while runs train.
+
+    python benchmarks/studio.py watching CartPole-v1 60000
+    python benchmarks/studio.py table 500
+    python benchmarks/studio.py kills 10
+    python benchmarks/studio.py memory MINUTES
+
+Pages are opened in headless Chromium, which draws in software here. It has the least priority, so that its work is kept apart
+as far as the system can do that; ``--browser-priority 0`` counts it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import os
+import random
+import shutil
+import signal
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from playwright.sync_api import Page, sync_playwright
+
+from tests.lab.reporting.report.folders import CONFIG, write
+
+PAIRS = 5
+PAUSES = """window.longest = 0; let last = performance.now();
+(function look(now) { window.longest = Math.max(window.longest, now - last); last = now; requestAnimationFrame(look); }
+)(last)"""
+
+
+@contextmanager
+def served(folder: Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """Context of a server of the studio, with its address."""
+    command = [sys.executable, "-m", "rejeu", "studio", str(folder), "--port", "0", "--no-browser"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONUNBUFFERED": "1"})
+    assert process.stdout is not None
+    try:
+        yield process, process.stdout.readline().split()[0]
+    finally:
+        process.kill()
+        process.wait()
+
+
+@contextmanager
+def opened(address: str, path: str, priority: int) -> Iterator[Page]:
+    """Context of a page in Chromium."""
+    chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    before = os.getpriority(os.PRIO_PROCESS, 0)
+    with sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=chromium, args=["--no-sandbox", "--disable-gpu"])
+        for line in subprocess.run(["ps", "-eo", "pid,comm"], capture_output=True, text=True).stdout.splitlines():
+            if "chrom" in line and priority != before:
+                os.setpriority(os.PRIO_PROCESS, int(line.split()[0]), priority)
+        page = browser.new_page(viewport={"width": 1280, "height": 900})
+        page.goto(address.replace("/?", f"{path}{'&' if '?' in path else '?'}", 1))
+        yield page
+        browser.close()
+
+
+def train(folder: Path, name: str, env: str, steps: int, *more: str) -> subprocess.Popen[str]:
+    """Starts a run."""
+    words = ["train", env, "--steps", str(steps), "--seed", "0", "--out", str(folder / name)]
+    words += ["--no-report", "--no-video", "--json", "--evaluate-every", str(steps), *more]
+    return subprocess.Popen(
+        [sys.executable, "-m", "rejeu", *words], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    )
+
+
+def rate(process: subprocess.Popen[str]) -> float:
+    """Returns the steps a second of a run, when it has ended."""
+    return float(json.loads(process.communicate()[0])["steps_per_second"])
+
+
+def counted(times: list[float], data: str | bytes) -> None:
+    """Notes when a picture came."""
+    if isinstance(data, bytes):
+        times.append(time.monotonic())
+
+
+def alone(env: str, steps: int, room: Path) -> float:
+    """Returns the steps a second of a run beside a studio that nobody looks at."""
+    with served(room):
+        return rate(train(room, "run", env, steps))
+
+
+def watched(env: str, steps: int, room: Path, priority: int) -> tuple[float, float]:
+    """Returns the steps a second of a run that is watched, and the frames a second."""
+    times: list[float] = []
+    with served(room) as (_, address):
+        process = train(room, "run", env, steps)
+        while not (room / "run" / "config.json").exists():
+            time.sleep(0.1)
+        with opened(address, "/run?run=run", priority) as page:
+            page.on("websocket", lambda socket: socket.on("framereceived", partial(counted, times)))
+            page.reload()
+            while process.poll() is None and "agent.safetensors" not in os.listdir(room / "run"):
+                page.wait_for_timeout(500)
+            return rate(process), (len(times) - 1) / (times[-1] - times[0])
+
+
+def watching(env: str, steps: int, priority: int) -> None:
+    """Prints steps a second with and without somebody who watches, in pairs, and the frames a second."""
+    ratios, frames = [], []
+    for i in range(PAIRS):
+        with tempfile.TemporaryDirectory() as first, tempfile.TemporaryDirectory() as second:
+            before = alone(env, steps, Path(first)) if i % 2 else 0.0
+            shown, fps = watched(env, steps, Path(second), priority)
+            undisturbed = before or alone(env, steps, Path(first))
+        ratios.append(shown / undisturbed)
+        frames.append(fps)
+        print(f"pair {i}: {undisturbed:,.0f} steps/s alone, {shown:,.0f} watched, {fps:.1f} frames/s", flush=True)
+    print(f"watched over alone: median {statistics.median(ratios):.3f}, {min(ratios):.3f} to {max(ratios):.3f}")
+    print(f"frames a second: median {statistics.median(frames):.1f}, least {min(frames):.1f}")
+
+
+def table(n: int, priority: int) -> None:
+    """Prints how long it takes until rows are there, and until one has changed, and the memory of the server."""
+    with tempfile.TemporaryDirectory() as folder:
+        root = Path(folder)
+        for i in range(n):
+            write(root / f"run_{i:03}", {**CONFIG, "seed": i}, videos=False, episodes=500)
+        began = time.monotonic()
+        with served(root) as (process, address):
+            listening = time.monotonic() - began
+            with opened(address, "/", priority) as page:
+                asked = time.monotonic()
+                page.wait_for_selector("tbody tr td .quiet", state="attached")
+                first = time.monotonic() - asked
+                page.wait_for_selector(f"text={n} runs")
+                page.wait_for_function("!document.body.innerText.includes('unread')")
+                whole = time.monotonic() - asked
+                with (root / "run_000" / "episodes.csv").open("a") as file:
+                    file.write("3999,0,7,7,1,40\n")
+                changed = time.monotonic()
+                page.wait_for_selector("text=3,999")
+                follow = time.monotonic() - changed
+                page.evaluate(PAUSES)
+                page.get_by_label("filter").fill("run_00")
+                page.wait_for_selector("text=10 runs")
+                longest = page.evaluate("window.longest")
+            print(
+                f"{n} runs: listening after {listening:.2f} s, first rows after {first:.2f} s, all after {whole:.2f} s"
+            )
+            print(
+                f"a change is shown after {follow:.2f} s; the longest pause of the page while filtering is {longest:.0f} ms"
+            )
+            print(f"memory of the server: {memory(process.pid) / 1e6:.0f} MB")
+
+
+def memory(pid: int) -> int:
+    """Returns the memory of a process in bytes."""
+    text = Path(f"/proc/{pid}/status").read_text()
+    return 1024 * next(int(line.split()[1]) for line in text.splitlines() if line.startswith("VmRSS"))
+
+
+def kills(n: int) -> None:
+    """Kills the server at other times while three runs train that it watches; compares their models with undisturbed ones."""
+    with tempfile.TemporaryDirectory() as folder:
+        alone, watched = Path(folder) / "alone", Path(folder) / "watched"
+        found = {}
+        for room in (alone, watched):
+            room.mkdir()
+            runs = [
+                train(room, f"run_{i}", "CartPole-v1", 40_000, "--set", f"learning_starts={200 + i}") for i in range(3)
+            ]
+            deaths = 0
+            while room is watched and deaths < n:
+                with served(room) as (process, address), opened(address, f"/run?run=run_{deaths % 3}", 19) as page:
+                    page.wait_for_timeout(1000 + 1000 * random.random())
+                    process.send_signal(signal.SIGKILL)
+                deaths += 1
+            statuses = [run.wait() for run in runs]
+            found[room] = {
+                path.relative_to(room).as_posix(): digest(path) for path in sorted(room.glob("*/*.safetensors"))
+            }
+            print(f"{room.name}: exit statuses {statuses}, {deaths} kills", flush=True)
+        same = found[alone] == found[watched]
+        print(f"{len(found[alone])} model files, {'all equal' if same else 'DIFFERENT'}")
+
+
+def digest(path: Path) -> str:
+    """Returns what identifies the content of a model: its arrays, without the times in its header."""
+    import rejeu
+
+    agent = rejeu.load(path)
+    parameters = agent.get_parameters()
+    return hashlib.sha256(b"".join(key.encode() + parameters[key].tobytes() for key in sorted(parameters))).hexdigest()
+
+
+def grows(minutes: float, priority: int) -> None:
+    """Prints the memory of the server while it shows a run live."""
+    with tempfile.TemporaryDirectory() as folder, served(Path(folder)) as (process, address):
+        run = train(Path(folder), "run", "CartPole-v1", 10_000_000)
+        with opened(address, "/run?run=run", priority) as page:
+            until, began = time.monotonic() + 60 * minutes, time.monotonic()
+            while time.monotonic() < until:
+                page.wait_for_timeout(60_000 if minutes > 5 else 15_000)
+                print(f"{(time.monotonic() - began) / 60:.1f} min: {memory(process.pid) / 1e6:.0f} MB", flush=True)
+        run.terminate()
+        run.wait()
+
+
+def main() -> None:
+    """Runs one of the measurements."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=["watching", "table", "kills", "memory"])
+    parser.add_argument("values", nargs="*")
+    parser.add_argument("--browser-priority", type=int, default=19)
+    given = parser.parse_args()
+    values: list[Any] = given.values
+    if given.what == "watching":
+        watching(values[0], int(values[1]), given.browser_priority)
+    elif given.what == "table":
+        table(int(values[0]), given.browser_priority)
+    elif given.what == "kills":
+        kills(int(values[0]))
+    else:
+        grows(float(values[0]), given.browser_priority)
+
+
+if __name__ == "__main__":
+    main()
