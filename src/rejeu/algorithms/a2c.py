@@ -35,6 +35,7 @@ from rejeu.algorithms.actor_critic.steps import (
     masked_mean,
     samples,
     standardized,
+    std_of,
 )
 from rejeu.core.algorithm import EXPLAINED_VARIANCE, Algorithm, Clock, Metrics, PyTree, Rollout
 from rejeu.core.schedules import Schedule, at
@@ -113,9 +114,8 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
             "value_loss": losses.value_loss,
             "entropy_loss": -losses.entropy,
             EXPLAINED_VARIANCE: explained_variance(data.value, data.target, data.valid),
+            **std_of(network),
         }
-        if network.log_std is not None:
-            metrics["std"] = jnp.mean(jnp.exp(network.log_std))
         return State(network, optimizer_state, state.n_updates + 1), metrics
 
     return algorithm_of(config, kind, init, update)

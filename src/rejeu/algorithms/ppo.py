@@ -25,7 +25,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optax
@@ -36,14 +35,17 @@ from rejeu.algorithms import optimizers, search
 from rejeu.algorithms.actor_critic.config import OnPolicyConfig
 from rejeu.algorithms.actor_critic.network import ActorCritic, algorithm_of, checked
 from rejeu.algorithms.actor_critic.steps import (
+    RolloutState as State,
     Samples,
     clip_and_descend,
     entropy_of,
     explained_variance,
+    initial_state,
     masked_mean,
     minibatches,
     samples,
     standardized,
+    std_of,
 )
 from rejeu.algorithms.search import SearchSpace
 from rejeu.core import schedules
@@ -101,19 +103,6 @@ class Config(OnPolicyConfig):
         return self.target_kl is not None
 
 
-class State(eqx.Module):
-    """Everything that PPO learns; every leaf is an array."""
-
-    network: Any
-    """Policy and value, an :class:`ActorCritic` or, with memory, a ``RecurrentActorCritic``."""
-    optimizer: PyTree
-    key: Array
-    n_updates: Array
-    """Gradient steps so far, ``int32[]``."""
-    n_rollouts: Array
-    """Rollouts learned from, ``int32[]``."""
-
-
 class Losses(NamedTuple):
     """The losses of a minibatch, each ``float32[]``."""
 
@@ -135,9 +124,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     optimizer = optimizers.make(config.optimizer, eps=ADAM_EPSILON)
 
     def init(key: Array) -> State:
-        network_key, update_key = jax.random.split(key)
-        network = ActorCritic(network_key, obs_leaves, kind, shape, config.use_sde)
-        return State(network, optimizer.init(network), update_key, jnp.int32(0), jnp.int32(0))
+        return initial_state(key, lambda key: ActorCritic(key, obs_leaves, kind, shape, config.use_sde), optimizer)
 
     def update(state: State, rollout: Rollout, clock: Clock) -> tuple[State, Metrics]:
         data = samples(state.network, rollout, config.gae_lambda)
@@ -146,7 +133,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         network, optimizer_state, n_steps, losses = epochs(
             loss, state.network, state.optimizer, minibatch, n_minibatches, optimizer, config, clock
         )
-        state = State(network, optimizer_state, state.key, state.n_updates + n_steps, state.n_rollouts + 1)
+        state = state.after(network, optimizer_state, n_steps)
         return state, metrics_of(network, n_steps, losses, data.value, data.target, data.valid, config, clock)
 
     return algorithm_of(config, kind, init, update)
@@ -164,7 +151,7 @@ def metrics_of(
 ) -> Metrics:
     """Returns the metrics of an update, under the names of Stable-Baselines3."""
     ent_coef = at(config.ent_coef, clock.progress)
-    metrics = {
+    return {
         "loss": losses.policy_loss + config.vf_coef * losses.value_loss - ent_coef * losses.entropy,
         "policy_gradient_loss": losses.policy_loss,
         "value_loss": losses.value_loss,
@@ -175,10 +162,8 @@ def metrics_of(
         GRADIENT_STEPS: n_steps.astype(jnp.float32),
         EXPLAINED_VARIANCE: explained_variance(value, target, valid),
         "learning_rate": jnp.asarray(at(config.learning_rate, clock.progress), jnp.float32),
+        **std_of(network),
     }
-    if network.log_std is not None:
-        metrics["std"] = jnp.mean(jnp.exp(network.log_std))
-    return metrics
 
 
 def epochs(

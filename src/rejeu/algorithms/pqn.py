@@ -23,14 +23,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from gymnasium import spaces
 from jax import Array
 
 from rejeu.algorithms import optimizers, search
-from rejeu.algorithms.actor_critic.steps import flat, masked_mean, minibatches
+from rejeu.algorithms.actor_critic.steps import RolloutState as State, flat, initial_state, masked_mean, minibatches
 from rejeu.algorithms.config import network_inputs
 from rejeu.algorithms.dqn import check_epsilon, epsilon_greedy_algorithm, epsilon_schedule, metrics_of, taken
 from rejeu.algorithms.rollout_config import RolloutConfig
@@ -147,19 +146,6 @@ class Config(RolloutConfig):
         return self.n_epochs * -(-n // self.batch_size)
 
 
-class State(eqx.Module):
-    """Everything that PQN learns; every leaf is an array."""
-
-    network: Network
-    optimizer: PyTree
-    key: Array
-    """Root of the orders of the minibatches, ``uint32[2]``; never changes."""
-    n_updates: Array
-    """Gradient steps so far, ``int32[]``."""
-    n_rollouts: Array
-    """Rollouts learned from, ``int32[]``."""
-
-
 class Samples(NamedTuple):
     """The steps of a rollout as the loss takes them, leaves ``(batch, ...)``."""
 
@@ -184,9 +170,8 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     epsilon = epsilon_schedule(config)
 
     def init(key: Array) -> State:
-        network_key, update_key = jax.random.split(key)
-        network = Network(network_key, obs_leaves, n_actions, shape.critic_widths(HIDDEN_LAYERS), shape)
-        return State(network, optimizer.init(network), update_key, jnp.int32(0), jnp.int32(0))
+        build = lambda key: Network(key, obs_leaves, n_actions, shape.critic_widths(), shape)  # noqa: E731
+        return initial_state(key, build, optimizer)
 
     def update(state: State, rollout: Rollout, clock: Clock) -> tuple[State, Metrics]:
         data = samples(state.network, rollout, config.q_lambda)
@@ -208,8 +193,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
             GRADIENT_STEPS: n_steps.astype(jnp.float32),
             "learning_rate": jnp.asarray(rate, jnp.float32),
         }
-        n_updates = state.n_updates + n_steps
-        return State(network, optimizer_state, state.key, n_updates, state.n_rollouts + 1), metrics
+        return state.after(network, optimizer_state, n_steps), metrics
 
     def value(carry: PyTree, network: Network, obs: PyTree, ended: Array) -> Array:
         return jnp.max(network(obs), axis=-1)

@@ -31,8 +31,15 @@ from rejeu.algorithms.actor_critic.network import (
     checked,
     orthogonal,
 )
-from rejeu.algorithms.actor_critic.steps import Samples, flat, shuffled, with_advantages
-from rejeu.algorithms.ppo import ADAM_EPSILON, Losses, State, epochs, loss_of
+from rejeu.algorithms.actor_critic.steps import (
+    RolloutState as State,
+    Samples,
+    flat,
+    initial_state,
+    shuffled,
+    with_advantages,
+)
+from rejeu.algorithms.ppo import ADAM_EPSILON, Losses, epochs, loss_of
 from rejeu.algorithms.search import Choice, SearchSpace
 from rejeu.core.algorithm import Algorithm, Clock, Explorer, Masked, Metrics, PyTree, Rollout, renew, unmasked
 from rejeu.core.prng import nth
@@ -209,9 +216,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     optimizer = optimizers.make(config.optimizer, eps=ADAM_EPSILON)
 
     def init(key: Array) -> State:
-        network_key, update_key = jax.random.split(key)
-        network: Any = RecurrentActorCritic(network_key, obs_leaves, kind, shape)
-        return State(network, optimizer.init(network), update_key, jnp.int32(0), jnp.int32(0))
+        return initial_state(key, lambda key: RecurrentActorCritic(key, obs_leaves, kind, shape), optimizer)
 
     def act(
         memory: Memory, actor: RecurrentActorCritic, obs: PyTree, ended: Array, key: Array, clock: Clock
@@ -256,7 +261,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
             config,
             clock,
         )
-        state = State(network, optimizer_state, state.key, state.n_updates + n_taken, state.n_rollouts + 1)
+        state = state.after(network, optimizer_state, n_taken)
         return state, ppo.metrics_of(network, n_taken, losses, data.value, data.target, data.valid, config, clock)
 
     def value(memory: Memory, actor: RecurrentActorCritic, obs: PyTree, ended: Array) -> Array:

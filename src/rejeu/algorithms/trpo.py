@@ -36,12 +36,15 @@ from rejeu.algorithms import optimizers
 from rejeu.algorithms.actor_critic.config import OnPolicyConfig
 from rejeu.algorithms.actor_critic.network import ActorCritic, algorithm_of, checked, is_value
 from rejeu.algorithms.actor_critic.steps import (
+    RolloutState as State,
     Samples,
     explained_variance,
+    initial_state,
     masked_mean,
     minibatches,
     samples,
     standardized,
+    std_of,
 )
 from rejeu.algorithms.search import LogUniform, NearOne, SearchSpace
 from rejeu.core.algorithm import (
@@ -110,20 +113,6 @@ class Config(OnPolicyConfig):
         return 1 + self.n_critic_updates * -(-n // self.batch_size)
 
 
-class State(eqx.Module):
-    """Everything that TRPO learns; every leaf is an array."""
-
-    network: ActorCritic
-    optimizer: PyTree
-    """Of the value."""
-    key: Array
-    """Root of the orders of the minibatches, ``uint32[2]``; never changes."""
-    n_updates: Array
-    """Gradient steps so far, ``int32[]``."""
-    n_rollouts: Array
-    """Rollouts learned from, ``int32[]``."""
-
-
 class TrustRegionStep(NamedTuple):
     """The policy's step on a rollout, each ``float32[]``."""
 
@@ -145,9 +134,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     optimizer = optimizers.make(config.optimizer, config.max_grad_norm)
 
     def init(key: Array) -> State:
-        network_key, update_key = jax.random.split(key)
-        network = ActorCritic(network_key, obs_leaves, kind, shape, config.use_sde)
-        return State(network, optimizer.init(network), update_key, jnp.int32(0), jnp.int32(0))
+        return initial_state(key, lambda key: ActorCritic(key, obs_leaves, kind, shape, config.use_sde), optimizer)
 
     def update(state: State, rollout: Rollout, clock: Clock) -> tuple[State, Metrics]:
         warn_of_unused(config.sub_sampling_factor, rollout.reward.shape[1])
@@ -175,11 +162,9 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
             GRADIENT_STEPS: (1 + n_steps).astype(jnp.float32),
             EXPLAINED_VARIANCE: explained_variance(data.value, data.target, data.valid),
             "learning_rate": jnp.asarray(rate, jnp.float32),
+            **std_of(network),
         }
-        if network.log_std is not None:
-            metrics["std"] = jnp.mean(jnp.exp(network.log_std))
-        n_updates = state.n_updates + 1 + n_steps
-        return State(network, optimizer_state, state.key, n_updates, state.n_rollouts + 1), metrics
+        return state.after(network, optimizer_state, 1 + n_steps), metrics
 
     return algorithm_of(config, kind, init, update)
 

@@ -25,6 +25,31 @@ N_ROUNDS = 8
 """Rounds of the network that permutes more steps, four for each half of a number."""
 
 
+class RolloutState(eqx.Module):
+    """Everything that an algorithm learns from minibatches of rollouts; every leaf is an array."""
+
+    network: Any
+    """Policy and value, an :class:`ActorCritic` or, with memory, a ``RecurrentActorCritic``; in PQN the Q-network."""
+    optimizer: PyTree
+    key: Array
+    """Root of the orders of the minibatches, ``uint32[2]``; never changes."""
+    n_updates: Array
+    """Gradient steps so far, ``int32[]``."""
+    n_rollouts: Array
+    """Rollouts learned from, ``int32[]``."""
+
+    def after(self, network: Any, optimizer_state: PyTree, n_steps: Any) -> RolloutState:
+        """Returns the state after a rollout, from which ``n_steps`` gradient steps were taken."""
+        return RolloutState(network, optimizer_state, self.key, self.n_updates + n_steps, self.n_rollouts + 1)
+
+
+def initial_state(key: Array, build: Callable[[Array], Any], optimizer: optax.GradientTransformation) -> RolloutState:
+    """Returns the state before the first rollout; ``build(key)`` returns the network."""
+    network_key, update_key = jax.random.split(key)
+    network = build(network_key)
+    return RolloutState(network, optimizer.init(network), update_key, jnp.int32(0), jnp.int32(0))
+
+
 class Samples(NamedTuple):
     """The steps of a rollout as the losses take them, leaves ``(batch, ...)``."""
 
@@ -92,6 +117,11 @@ def clip_and_descend(
     parts = [clip(part, None, config.max_grad_norm) for part in eqx.partition(gradients, belongs_to_value)]
     rates = jax.tree.map(lambda own: value_rate if own else rate, belongs_to_value)
     return descend(network, eqx.combine(*parts), optimizer_state, optimizer, rates)
+
+
+def std_of(network: Any) -> dict[str, Array]:
+    """Returns the metric of the policy's standard deviation, if it has one of its own."""
+    return {} if network.log_std is None else {"std": jnp.mean(jnp.exp(network.log_std))}
 
 
 def explained_variance(predicted: Array, target: Array, valid: Array) -> Array:
