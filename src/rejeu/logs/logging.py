@@ -131,12 +131,14 @@ class CsvFile:
         return str(self.path)
 
     def write(self, step: int, metrics: Mapping[str, float]) -> None:
+        self.add({"step": step, **metrics})
+
+    def add(self, row: Mapping[str, Any]) -> None:
         """Adds a row.
 
         Raises:
             OSError: if writing fails; the file is not changed.
         """
-        row = {"step": step, **metrics}
         new = [name for name in row if name not in self._columns]
         columns = [*self._columns, *new]
         line = csv_lines([[row.get(name, "") for name in columns]])
@@ -186,13 +188,15 @@ class JsonLines:
         return str(self.path)
 
     def write(self, step: int, metrics: Mapping[str, float]) -> None:
+        self.add({"step": step, **{name: x if math.isfinite(x) else None for name, x in metrics.items()}})
+
+    def add(self, row: Mapping[str, Any]) -> None:
         """Adds a row.
 
         Raises:
             OSError: if writing fails; the file is not changed.
         """
-        row = {name: value if math.isfinite(value) else None for name, value in metrics.items()}
-        atomic.append(self.path, (json.dumps({"step": step, **row}, allow_nan=False) + "\n").encode())
+        atomic.append(self.path, (json.dumps(row) + "\n").encode())
 
     def close(self) -> None:
         """Does nothing, because rows are not buffered."""

@@ -24,7 +24,7 @@ import numpy as np
 
 from rejeu.logs import logging
 from rejeu.logs.formatting import LOGS
-from rejeu.logs.logging import TensorBoard, add_text, open_log
+from rejeu.logs.logging import CsvFile, JsonLines, TensorBoard, add_text, open_log
 
 __all__ = [
     "DEBUG",
@@ -201,16 +201,12 @@ class JSONOutputFormat(KVWriter):
     names = ("json",)
 
     def __init__(self, filename: str | Path) -> None:
-        self.file = open(filename, "w", encoding="utf-8")  # noqa: SIM115
+        self.sink = JsonLines(filename)
 
     def write_row(self, row: Mapping[str, Any], step: int) -> None:
-        plain = {key: value if isinstance(value, str) else np.asarray(value).tolist() for key, value in row.items()}
-        if plain:
-            self.file.write(json.dumps(plain) + "\n")
-            self.file.flush()
-
-    def close(self) -> None:
-        self.file.close()
+        if row:
+            plain = (value if isinstance(value, str) else np.asarray(value).tolist() for value in row.values())
+            self.sink.add(dict(zip(row, plain, strict=True)))
 
 
 class CSVOutputFormat(KVWriter):
@@ -219,24 +215,11 @@ class CSVOutputFormat(KVWriter):
     names = ("csv",)
 
     def __init__(self, filename: str | Path) -> None:
-        self.file = open(filename, "w+", encoding="utf-8", newline="")  # noqa: SIM115
-        self.keys: list[str] = []
+        self.sink = CsvFile(filename)
 
     def write_row(self, row: Mapping[str, Any], step: int) -> None:
-        if new := sorted({*row} - {*self.keys}):
-            self.file.seek(0)
-            old = [*csv.reader(self.file)][1:]
-            self.keys += new
-            self.file.seek(0)
-            self.file.truncate()
-            csv.writer(self.file, lineterminator="\n").writerows([self.keys, *(one + [""] * len(new) for one in old)])
         if row:
-            text = ["" if row.get(key) is None else row[key] for key in self.keys]
-            csv.writer(self.file, lineterminator="\n").writerow(text)
-            self.file.flush()
-
-    def close(self) -> None:
-        self.file.close()
+            self.sink.add({key: "" if value is None else value for key, value in sorted(row.items())})
 
 
 class TensorBoardOutputFormat(KVWriter):
