@@ -29,6 +29,8 @@ from rejeu.core.spaces import (
 )
 from rejeu.envs import masks, validation
 from rejeu.envs.base import SEEDS_END
+from rejeu.envs.functional.gym_env import GymnasiumEnv
+from rejeu.envs.functional.protocol import FunctionalEnv
 from rejeu.envs.goals import attribute
 
 MOST_STEPS = 2_000
@@ -78,7 +80,7 @@ class SeenStep(NamedTuple):
     info: dict[str, Any]
 
 
-def check_env(env: gym.Env, warn: bool = True, skip_render_check: bool = True) -> None:
+def check_env(env: gym.Env | FunctionalEnv, warn: bool = True, skip_render_check: bool = True) -> None:
     """Runs some episodes of an environment; raises its errors and warns about its other problems.
 
     Errors: observations whose structure, shape or dtype differs from the space, numbers that are not finite, rewards and
@@ -88,7 +90,7 @@ def check_env(env: gym.Env, warn: bool = True, skip_render_check: bool = True) -
     :func:`findings` returns all of them; ``rejeu check ENV`` prints them.
 
     Args:
-        env: an environment; it is reset and stepped, and left open.
+        env: an environment, of Gymnasium or in JAX; it is reset and stepped, and left open.
         warn: whether to warn; errors are always raised.
         skip_render_check: skip the check of its render modes.
 
@@ -105,10 +107,11 @@ def check_env(env: gym.Env, warn: bool = True, skip_render_check: bool = True) -
                 warnings.warn(finding.text, UserWarning, stacklevel=2)
     errors = [finding.text for finding in found if finding.level == "error"]
     if errors:
-        raise BadEnvironmentError(f"{validation.id_of(env)}: " + "\n".join(errors))
+        name = type(env).__name__ if isinstance(env, FunctionalEnv) else validation.id_of(env)
+        raise BadEnvironmentError(f"{name}: " + "\n".join(errors))
 
 
-def findings(env: gym.Env, skip_render_check: bool = True) -> list[Finding]:
+def findings(env: gym.Env | FunctionalEnv, skip_render_check: bool = True) -> list[Finding]:
     """Returns the problems of an environment; see :func:`check_env`.
 
     Raises:
@@ -117,6 +120,11 @@ def findings(env: gym.Env, skip_render_check: bool = True) -> list[Finding]:
     >>> findings(gym.make("Acrobot-v1"))
     []
     """
+    if isinstance(env, FunctionalEnv):
+        try:
+            env = GymnasiumEnv(env)
+        except BadEnvironmentError as error:  # of what it traces
+            return [Finding("error", str(error))]
     found = _played(env, Effort(seconds=MOST_SECONDS))
     if all(finding.level == "warning" for finding in found.values()):
         for text in _gymnasium_messages(env, skip_render_check):

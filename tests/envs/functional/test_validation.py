@@ -15,6 +15,7 @@ from gymnasium import spaces
 
 import rejeu
 from rejeu.core.errors import BadEnvironmentError
+from rejeu.envs.checker import findings
 from rejeu.envs.functional import REGISTRY, FunctionalEnv, GoalEnv, make
 from rejeu.envs.functional.validation import check
 from rejeu.lab.cli import main
@@ -234,3 +235,11 @@ def test_the_command_line_says_it_in_one_line(options, tmp_path: Path, capsys, m
     error = capsys.readouterr().err.strip()
     assert "Walk.step cannot be compiled (TracerBoolConversionError" in error.splitlines()[-1]
     assert len(error.splitlines()) == 1
+
+
+def test_the_checker_of_all_environments_takes_those_in_jax():
+    outside, endless = (one.text for one in findings(Walk()))
+    assert "outside of the declared bounds [-9.0, 9.0]" in outside
+    assert "no episode ended in 2,000 steps" in endless
+    with pytest.raises(BadEnvironmentError, match=r"Walk: Walk\.step cannot be compiled"):
+        rejeu.check_env(Walk(wrong=if_on_a_value))
