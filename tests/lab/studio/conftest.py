@@ -79,3 +79,36 @@ def opened(browser, served, path="/", width=1280, height=900, **settings):
         assert page.messages == []
     finally:
         context.close()
+
+
+def check_widths(page):
+    """Waits until nothing of a page is cut off, as wide as a phone's and as a desktop's."""
+    for width in (400, 1280):
+        page.set_viewport_size({"width": width, "height": 900})
+        page.wait_for_function(f"document.documentElement.scrollWidth <= {width}")
+
+
+HOSTILE = "<img src=x onerror=window.hacked=1>"
+
+
+@pytest.fixture(scope="session")
+def common(tmp_path_factory):
+    """A studio that several files of tests share: a trained run, models, and runs of two algorithms and three seeds."""
+    import rejeu
+    from rejeu.lab.cli import main
+    from tests.lab.reporting.test_comparison import write_run
+
+    folder = tmp_path_factory.mktemp("common")
+    for name, seed in (("anna", 0), (f"group/{HOSTILE}", 1)):
+        (folder / name).parent.mkdir(exist_ok=True)
+        agent = rejeu.PPO("MlpPolicy", "CartPole-v1", policy_kwargs={"net_arch": [8]}, seed=seed)
+        agent.save(folder / f"{name}.safetensors")
+    (folder / "cut.safetensors").write_bytes(b"cut")
+    for name, algorithm, level in (("dqn", "DQN", 10.0), ("other", HOSTILE, 20.0)):
+        for seed in range(3):
+            write_run(folder / name / f"seed_{seed}", algorithm, seed=seed, level=level + seed)
+    argv = ["train", "CartPole-v1", "--algo", "PPO", "--steps", "128", "--out", str(folder / "trained"), "--seed", "0"]
+    argv += ["--evaluate-episodes", "2", "--no-report", "--no-video", "--backend", "gymnasium"]
+    assert main([*argv, "--set", "n_steps=64", "policy_kwargs.net_arch=[8]"]) == 0
+    with serving(folder) as one:
+        yield one

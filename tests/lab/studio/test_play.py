@@ -10,42 +10,25 @@ from urllib.parse import quote
 import numpy as np
 import pytest
 
-import rejeu
 from rejeu.demonstrations import read
 from rejeu.lab.cli import main, studio as command
 from rejeu.lab.studio.games import Playing, Wanted, fitted
 from rejeu.lab.studio.state import Studio
 from rejeu.teaching.play import opened as game_opened
 from tests.lab.cli.test_cli import error_of
-from tests.lab.studio.conftest import opened, serving
+from tests.lab.studio.conftest import HOSTILE, check_widths, opened
 from tests.playing import LEVER, Pull
 
 pytest.importorskip("pygame")
 PICTURE = "() => [...document.querySelectorAll('.screen canvas')].map((canvas) => canvas.toDataURL())"
-HOSTILE = "<img src=x onerror=window.hacked=1>"
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    """A folder with two models, one of which has a hostile name."""
-    path = tmp_path_factory.mktemp("runs")
-    for name, seed in (("first", 0), (HOSTILE, 1)):
-        rejeu.PPO("MlpPolicy", "CartPole-v1", seed=seed).save(path / f"{name}.safetensors")
-    return path
-
-
-@pytest.fixture(scope="module")
-def served(folder):
-    with serving(folder) as one:
-        yield one
 
 
 def pictures(page):
     return page.evaluate(PICTURE)
 
 
-def test_a_game_is_played_by_keys_recorded_and_read_again(browser, served):
-    with opened(browser, served, "/play?env=FrozenLake-v1&seed=1") as page:
+def test_a_game_is_played_by_keys_recorded_and_read_again(browser, common):
+    with opened(browser, common, "/play?env=FrozenLake-v1&seed=1") as page:
         page.wait_for_selector("text=press a key to begin")
         page.get_by_role("switch", name="record").click()
         page.get_by_role("button", name="Start").click()
@@ -58,29 +41,28 @@ def test_a_game_is_played_by_keys_recorded_and_read_again(browser, served):
         assert pictures(page) != before
         page.get_by_role("button", name="q", exact=True).click()
         page.wait_for_selector("text=1 episode for MINARI_DATASETS_PATH")
-    (recorded,) = (served.folder / "played").iterdir()
+    (recorded,) = (common.folder / "played").iterdir()
     (episode,) = read(recorded).episodes
     assert episode.actions.tolist() == [2, 2, 1]  # right, right, down
 
 
-@pytest.mark.parametrize("width", [1280, 400])
-def test_two_agents_are_shown_side_by_side_from_the_same_start(browser, served, width):
-    query = f"agent=first.safetensors&agent={quote(HOSTILE)}.safetensors&watch=1&seed=3"
-    with opened(browser, served, f"/play?{query}", width=width) as page:
+def test_two_agents_are_shown_side_by_side_from_the_same_start(browser, common):
+    query = f"agent=anna.safetensors&agent={quote(f'group/{HOSTILE}')}.safetensors&watch=1&seed=3"
+    with opened(browser, common, f"/play?{query}") as page:
         page.wait_for_selector(".screen canvas >> nth=1")
         before = pictures(page)
         assert len(before) == 2
         page.wait_for_function(f"(before) => ({PICTURE})().every((one, i) => one !== before[i])", arg=before)
         names = page.locator(".screen b").all_inner_texts()
-        assert names == ["first.safetensors", f"{HOSTILE}.safetensors"]
-        assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
+        assert names == ["anna.safetensors", f"group/{HOSTILE}.safetensors"]
+        check_widths(page)
         page.keyboard.press("p")
         page.wait_for_selector("text=pause >> nth=0")
 
 
-def test_an_error_is_one_line_on_the_page(browser, served):
-    with opened(browser, served, f"/play?env={quote(HOSTILE)}&agent={quote(HOSTILE)}&seed={HOSTILE}") as page:
-        page.wait_for_selector(f"text=there is no run folder or model file {served.folder / HOSTILE}")
+def test_an_error_is_one_line_on_the_page(browser, common):
+    with opened(browser, common, f"/play?env={quote(HOSTILE)}&agent={quote(HOSTILE)}&seed={HOSTILE}") as page:
+        page.wait_for_selector(f"text=there is no run folder or model file {common.folder / HOSTILE}")
 
 
 @pytest.mark.parametrize(
@@ -88,15 +70,15 @@ def test_an_error_is_one_line_on_the_page(browser, served):
     [
         (Wanted("evil:Env-v0", (), True, None, False), "'evil:Env-v0' would be imported"),
         (Wanted("evil.py", (), True, None, False), "'evil.py' would be imported"),
-        (Wanted("", ("../first.safetensors",), True, None, False), "is not in the folder of the studio"),
+        (Wanted("", ("../anna.safetensors",), True, None, False), "is not in the folder of the studio"),
         (Wanted("", ("/etc/passwd",), True, None, False), "is not in the folder of the studio"),
-        (Wanted("Pendulum-v1", ("first.safetensors",), True, None, False), "plays CartPole-v1, not Pendulum-v1"),
+        (Wanted("Pendulum-v1", ("anna.safetensors",), True, None, False), "plays CartPole-v1, not Pendulum-v1"),
         (Wanted("Pendulum-v1", (), False, None, False), "nobody plays"),
     ],
 )
-def test_an_address_names_no_code_and_no_file_elsewhere(folder, wanted, message):
+def test_an_address_names_no_code_and_no_file_elsewhere(common, wanted, message):
     with pytest.raises(ValueError, match=re.escape(message)):
-        wanted.open(Studio(folder))
+        wanted.open(Studio(common.folder))
 
 
 class Shown:
@@ -160,15 +142,16 @@ def test_a_wide_picture_is_made_smaller():
     assert fitted(np.zeros((100, 600, 3), np.uint8)).shape == (100, 600, 3)
 
 
-def test_watch_of_two_opens_the_studio_with_both(folder, monkeypatch, capsys):
+def test_watch_of_two_opens_the_studio_with_both(common, monkeypatch, capsys):
+    folder = common.folder
     calls = []
     monkeypatch.setattr(command, "open_studio", lambda *_, **settings: calls.append(settings))
-    names = [str(folder / "first"), str(folder / f"{HOSTILE}.safetensors")]
+    names = [str(folder / "anna"), str(folder / "group" / f"{HOSTILE}.safetensors")]
     assert main(["watch", *names, "--seed", "5"]) == 0
     (call,) = calls
     assert call["page"] == ("/play", [("agent", names[0]), ("agent", names[1]), ("watch", "1"), ("seed", "5")])
     assert [(model.name, made.env_id) for model, made in call["guests"].values()] == [
-        ("first.safetensors", "CartPole-v1"),
+        ("anna.safetensors", "CartPole-v1"),
         (f"{HOSTILE}.safetensors", "CartPole-v1"),
     ]
     wanted = Wanted("", tuple(names), by_hand=False, seed=5, record=False)

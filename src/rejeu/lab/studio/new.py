@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import shlex
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
@@ -120,13 +120,22 @@ def command(texts: Texts, folder: Path) -> tuple[list[str], Train]:
     if not texts.get("env"):
         raise ValueError("choose an environment")
     named = str(texts.get("out") or dated(texts["env"], texts.get("algorithm")).name)
-    if Path(named).is_absolute() or ".." in Path(named).parts:
-        raise ValueError(f"out {named!r} must be a name of a folder below {folder}")
-    given = {**texts, "out": str(folder / named)}
+    given = {**texts, "out": str(below(folder, named))}
     words = [word for one in options(Train) for word in words_of(one, given.get(one.field))]
     _, arguments = parsing.parse(["train", *words], COMMANDS, TASKS, "")
     check_options(arguments)
     return ["train", *words], arguments
+
+
+def below(folder: Path, named: str) -> Path:
+    """Returns the path of a name below a folder.
+
+    Raises:
+        ValueError: if it is elsewhere.
+    """
+    if not named or Path(named).is_absolute() or ".." in Path(named).parts:
+        raise ValueError(f"folder {named!r} must be a name of a folder below {folder}")
+    return folder / named
 
 
 async def start(studio: Studio, texts: Texts, say: Callable[[str], object]) -> str:
@@ -142,13 +151,17 @@ async def start(studio: Studio, texts: Texts, say: Callable[[str], object]) -> s
             return printed
         say(printed)
     studio.trust(arguments)
-    path = Path(arguments.out or "")
+    return await lead_to(studio, words, Path(arguments.out or ""))
+
+
+async def lead_to(studio: Studio, words: Sequence[str], path: Path) -> str:
+    """Starts a run by a command, and leads to its page once it has begun; returns what went wrong, if anything did."""
     process = processes.start(words, path)
     name = path.relative_to(studio.folder).as_posix()
     while process.poll() is None and not studio.holds(name):
         await asyncio.sleep(LOOK)
     if not studio.holds(name):
-        return processes.read_log(path) or f"rejeu train ended with exit status {process.returncode}"
+        return processes.read_log(path) or f"rejeu {words[0]} ended with exit status {process.returncode}"
     ui.navigate.to(address("/run", run=name))
     return ""
 

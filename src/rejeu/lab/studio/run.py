@@ -17,6 +17,7 @@ from rejeu.lab.reporting.report import sections
 from rejeu.lab.reporting.rows import SHARE, Row
 from rejeu.lab.runs import requests
 from rejeu.lab.studio import processes
+from rejeu.lab.studio.branch import open_form
 from rejeu.lab.studio.figures import Figure
 from rejeu.lab.studio.layout import EVERY
 from rejeu.lab.studio.player import BEST, CURRENT, Episode, Player
@@ -150,6 +151,9 @@ def show_actions(page: RunPage, row: Row) -> None:
         ui.button("Resume", icon="play_arrow", on_click=lambda: resume(page)).props(
             "outline dense no-caps padding='2px 10px'"
         )
+    if page.is_ours:
+        branch = ui.button("Branch", icon="call_split", on_click=lambda: open_form(page.studio, page.name, page.path))
+        branch.props("outline dense no-caps padding='2px 10px'")
 
 
 def stop(folder: RunFolder) -> None:

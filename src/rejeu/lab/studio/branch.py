@@ -1,0 +1,46 @@
+"""The form on the page of a run that begins another run from one of its checkpoints, with other settings."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+
+from nicegui import ui
+
+from rejeu.checkpoints.run_folder import RunFolder, run_files, step_of
+from rejeu.lab.cli import parsing
+from rejeu.lab.cli.commands import COMMANDS, TASKS
+from rejeu.lab.studio.new import below, lead_to
+from rejeu.lab.studio.state import Studio
+
+
+def open_form(studio: Studio, name: str, path: Path) -> None:
+    """Opens the form over the page of a run; ``name`` is that of its row."""
+    steps = {step_of(one): f"{step_of(one):,}" for one in run_files(RunFolder(path).checkpoints)}
+    with ui.dialog(value=True) as form, ui.card().classes("w-full").style("max-width: 30rem"):
+        ui.label("A new run from a checkpoint of this one").classes("text-weight-medium")
+        step = ui.select(steps, label="from step", value=next(iter(steps), None)).classes("w-full")
+        settings = ui.input("settings that change", placeholder="learning_rate=1e-4 gamma=0.9").classes("w-full")
+        more = ui.input("steps, by default to the goal of this run").classes("w-full")
+        folder = ui.input("new folder", value=f"{name}-branch").classes("w-full")
+        said = ui.label().classes("text mono")
+
+        async def begin() -> None:
+            button.disable()
+            try:
+                out = below(studio.folder, folder.value or "")
+                words = ["branch", str(path), "--at", str(step.value), "--out", str(out)]
+                words += ["--steps", more.value] if more.value else []
+                words += ["--set", *shlex.split(settings.value)] if settings.value else []
+                parsing.parse(words, COMMANDS, TASKS, "")
+                said.text = await lead_to(studio, words, out)
+            except (ValueError, OSError) as error:
+                said.text = str(error)
+            button.enable()
+
+        with ui.row():
+            button = ui.button("Start", icon="call_split", on_click=begin).props("no-caps")
+            ui.button("Cancel", on_click=form.delete).props("flat no-caps")
+        if not steps:
+            button.disable()
+            said.text = "This run has no checkpoint yet."
