@@ -28,6 +28,16 @@ def test_the_best_evaluation_has_its_interval(tmp_path):
     assert (row["run"], [*cells(row)]) == ("a/b", [*COLUMNS])
 
 
+def test_the_rate_is_what_training_measured_last(tmp_path):
+    run = write(tmp_path / "a", videos=False)
+    (run / "metrics.csv").write_text(
+        "step,time/time_elapsed,time/fps\n1000,10,90\n2000,20,70\n3000,30,\n", encoding="utf-8"
+    )
+    (row,) = Rows(tmp_path).read()
+    assert row["steps_per_second"] == 70.0
+    assert cells(row)["rate"] == "70/s"
+
+
 def test_a_run_is_read_again_only_after_it_has_changed(tmp_path, reads):
     for name in ("a", "b"):
         write(tmp_path / name)

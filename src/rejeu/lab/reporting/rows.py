@@ -142,7 +142,9 @@ def describe(run: RunSummary) -> Row:
     """Returns what is worth knowing of a run, as plain values."""
     compiling = run.metrics.column("time/compile_seconds")
     seconds = run.seconds - (float(compiling[-1]) if len(compiling) and np.isfinite(compiling[-1]) else 0.0)
-    rate = run.steps / seconds if seconds > 0 else math.nan
+    rates = run.metrics.column("time/fps")
+    rates = rates[np.isfinite(rates)]  # without compilation, as training measures it
+    rate = float(rates[-1]) if len(rates) else run.steps / seconds if seconds > 0 else math.nan
     left = max(run.steps_asked - run.steps, 0) / rate if run.steps_asked and rate else math.nan
     if run.minutes_asked is not None:
         left = max(60 * run.minutes_asked - seconds, 0.0)

@@ -231,7 +231,7 @@ class Live:
         self.page, self.steps = page, [CURRENT]
         self.screen = Screen()
         self.status = ui.label("the agent is loaded").classes("quiet text")
-        with ui.row().classes("items-center w-full no-wrap gap-2"):
+        with ui.row().classes("items-center w-full no-wrap gap-4"):
             self.slider = ui.slider(min=0, max=0, value=0, on_change=self.chosen).props("label-always=false")
             self.label = ui.label().classes("quiet").style("min-width: 9em")
             ui.button("best", on_click=lambda: self.choose(BEST)).props("outline dense no-caps padding='2px 10px'")
