@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -255,14 +256,9 @@ def has_reached_goal(agent: Agent) -> bool:
 
 def pause(agent: Agent, limits: TrainingLimits) -> Callable[[Progress], bool]:
     """Returns a function that returns whether a pause is due after a turn of the loop."""
-    last_step = None if limits.pause_steps is None else agent.num_timesteps + limits.pause_steps
-    until = None if limits.pause_minutes is None else xla.clock() + 60 * limits.pause_minutes
-
-    def is_due(turn: Progress) -> bool:
-        by_steps = last_step is not None and agent.num_timesteps >= last_step
-        return by_steps or (until is not None and xla.clock() >= until)
-
-    return is_due
+    last_step = math.inf if limits.pause_steps is None else agent.num_timesteps + limits.pause_steps
+    until = math.inf if limits.pause_minutes is None else xla.clock() + 60 * limits.pause_minutes
+    return lambda turn: agent.num_timesteps >= last_step or xla.clock() >= until
 
 
 @contextmanager

@@ -107,7 +107,7 @@ def make_env(arguments: Train, made: Environment, preset: Preset | None, seed: i
     if arguments.assist:
         return make_vector(made.rendering, 1, "gymnasium", seed)
     n_envs = arguments.n_envs or (preset.n_envs if preset else 1)
-    backend = default_backend(made, preset)
+    backend = preset.backend if preset and made.is_plain else "auto"
     if backend == "envpool" and not is_envpool_installed() and (made.is_registered() or provider(made.env_id)):
         backend = "gymnasium"
     backend = arguments.backend or backend
@@ -117,14 +117,10 @@ def make_env(arguments: Train, made: Environment, preset: Preset | None, seed: i
     return made.vector(n_envs, backend, seed, workers)
 
 
-def default_backend(made: Environment, preset: Preset | None) -> str:
-    """Returns the backend of a preset, and ``"auto"`` without one."""
-    return preset.backend if preset and made.is_plain else "auto"
-
-
 def describe_backend(env: VectorEnv, made: Environment, preset: Preset | None) -> str:
     """Returns the backend, with a hint if the preset uses EnvPool and that is not installed."""
-    if env.backend != "gymnasium" or default_backend(made, preset) != "envpool" or is_envpool_installed():
+    is_slower = env.backend == "gymnasium" and made.is_plain and preset is not None and preset.backend == "envpool"
+    if not is_slower or is_envpool_installed():
         return env.backend
     return f'{env.backend}; EnvPool would be faster ({ENVPOOL_SIZE}): pip install "rejeu[envpool]"'
 
