@@ -412,7 +412,7 @@ def unscale_action(space: spaces.Space, action: np.ndarray) -> np.ndarray:
     return scaled.astype(np.float32).reshape(len(action), -1)
 
 
-def random_action(space: spaces.Space, n: int, rng: np.random.Generator, mask: np.ndarray | None = None) -> np.ndarray:
+def random_action(space: spaces.Space, n: int, rng: Any, mask: Any = None) -> Any:
     """Returns ``n`` uniformly random actions in the algorithm's range (see :func:`scale_action`).
 
     With ``mask``, ``bool (n, n_actions)``, the actions are Discrete and among the allowed ones.

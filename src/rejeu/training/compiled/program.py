@@ -393,22 +393,28 @@ def all_finite(*arrays: Array) -> Array:
 
 
 def random_action(space: gym.Space, n: int, key: Array, mask: Array | None = None) -> Array:
-    """Returns ``n`` uniformly random actions in the range of algorithms, like :func:`rejeu.core.spaces.random_action`."""
-    if mask is not None:
-        n_allowed = jnp.sum(mask, axis=-1, dtype=jnp.int32)
-        return spaces.nth_allowed(mask, below(jax.random.bits(key, (n,), jnp.uint32), n_allowed))
-    if isinstance(space, gym.spaces.Box):
-        bits = jax.random.bits(key, (n, int(np.prod(space.shape))), jnp.uint32)
-        return (bits >> 8).astype(jnp.float32) * jnp.float32(2.0**-23) - 1.0
+    """Returns :func:`rejeu.core.spaces.random_action` with the random numbers of a key."""
     if isinstance(space, gym.spaces.Dict | gym.spaces.Tuple):
         keys = [jax.random.fold_in(key, i) for i in range(len(space.spaces))]
         pairs = zip(spaces.members(space), keys, strict=True)
         parts = [random_action(part, n, own).reshape(n, -1).astype(jnp.float32) for part, own in pairs]
         return jnp.concatenate(parts, axis=-1)
-    sizes: Any = {
-        gym.spaces.Discrete: lambda: np.int32(space.n),  # type: ignore[attr-defined]
-        gym.spaces.MultiDiscrete: lambda: space.nvec.ravel().astype(np.int32),  # type: ignore[attr-defined]
-        gym.spaces.MultiBinary: lambda: np.full(int(np.prod(space.shape)), 2, np.int32),  # type: ignore[arg-type]
-    }[type(space)]()
-    bits = jax.random.bits(key, (n, *sizes.shape), jnp.uint32)
-    return below(bits, sizes if sizes.ndim == 0 else sizes[None])
+    return jnp.asarray(spaces.random_action(space, n, KeyGenerator(key), mask))
+
+
+class KeyGenerator:
+    """What random actions take of NumPy's generator, from a key."""
+
+    def __init__(self, key: Array) -> None:
+        self.key = key
+
+    def integers(self, high: Any, size: Any = None, dtype: Any = np.int32) -> Array:
+        """Returns whole numbers from 0 to ``high - 1``."""
+        high = jnp.asarray(high, dtype)
+        bits = jax.random.bits(self.key, high.shape if size is None else (size,) if isinstance(size, int) else size)
+        return below(bits, high if high.ndim in (0, bits.ndim) else high[None])
+
+    def uniform(self, low: float, high: float, size: tuple[int, ...]) -> Array:
+        """Returns numbers from ``low`` to ``high``, both not too far from 0."""
+        unit = (jax.random.bits(self.key, size) >> 8).astype(jnp.float32)
+        return unit * jnp.float32((high - low) * 2.0**-24) + jnp.float32(low)
