@@ -47,6 +47,15 @@ def test_a_run_that_changes_and_one_that_disappears_are_followed(browser, served
         row.locator("text=its folder is no longer there").wait_for()
 
 
+@pytest.fixture
+def ended(served):
+    """Asks the run that a test has started to end, also if the test has failed."""
+    yield
+    if (served.folder / "mine").is_dir():
+        (served.folder / "mine" / "stop").touch()
+
+
+@pytest.mark.usefixtures("ended")
 def test_a_run_is_started_from_the_form_watched_stopped_and_resumed(browser, served):
     with opened(browser, served, "/new?env=CartPole-v1") as page:
         settings = {"steps": "400000", "folder": "mine", "hyperparameters": "learning_starts=200"}

@@ -79,6 +79,8 @@ class Player:
         self.folder, self.given, self.show = RunFolder(folder), given, show
         self.episode: Episode | None = None
         """The episode that is played, or was played last."""
+        self.complete: Episode | None = None
+        """The last episode that was played to its end."""
         self.gamma = 1.0
         self.problem = ""
         """Why nothing is shown."""
@@ -127,6 +129,7 @@ class Player:
             self.episode = Episode(name, self._next_seed if self.seed is None else self.seed, self._step)
             self._next_seed += self.seed is None
             self._play(agent, playing, self.episode)
+            self.complete = self.episode if self.episode.is_over else self.complete
             self._changed.wait(REST)
 
     def _play(self, agent: Agent, env: gym.Env, episode: Episode) -> None:

@@ -14,8 +14,6 @@ HIDDEN = ".studio"
 """Folder of the logs, beside the run folders."""
 TAIL = 2**16
 """Most bytes of a log that are shown."""
-running: list[subprocess.Popen[bytes]] = []
-"""Those that have not ended, as far as is known."""
 
 
 def start(words: Sequence[str], run: Path) -> subprocess.Popen[bytes]:
@@ -24,15 +22,12 @@ def start(words: Sequence[str], run: Path) -> subprocess.Popen[bytes]:
     Raises:
         OSError: if that is impossible.
     """
-    running[:] = [one for one in running if one.poll() is None]
     log = log_of(run)
     log.parent.mkdir(parents=True, exist_ok=True)
     with log.open("ab") as out:
-        process = subprocess.Popen(
+        return subprocess.Popen(
             [sys.executable, "-m", "rejeu", *words], stdin=subprocess.DEVNULL, stdout=out, stderr=out, **apart()
         )
-    running.append(process)
-    return process
 
 
 def apart() -> dict[str, Any]:

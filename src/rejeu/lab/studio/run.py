@@ -252,8 +252,8 @@ class Live:
             self.slider.value = value
         self.name()
         self.status.text = self.player.problem
-        if self.page.values is not None and self.player.episode is not None:
-            self.page.values.show(self.player.episode, self.player.gamma)
+        if self.page.values is not None:
+            self.page.values.show(self.player.complete or self.player.episode, self.player.gamma)
 
     def name(self) -> None:
         """Says which policy the slider is at."""
@@ -280,8 +280,10 @@ class Values:
             self.title = ui.label().classes("text-weight-medium text")
             self.figure = Figure()
 
-    def show(self, episode: Episode, gamma: float) -> None:
+    def show(self, episode: Episode | None, gamma: float) -> None:
         """Draws an episode, as far as it is."""
+        if episode is None:
+            return
         self.title.text = f"Value of each step, seed {episode.seed}"
         to_go = episode.to_go(gamma) if episode.is_over else np.zeros(0)
         if episode.rewards:

@@ -22,7 +22,7 @@ const RejeuCharts = (() => {
       hoverlabel: { bgcolor: color("card"), bordercolor: color("rule"), font: { color: color("ink") }, namelength: -1 },
       hovermode: "closest", dragmode: phone ? false : "zoom",
       xaxis: {
-        ...line, showgrid: false, tickformat: "~s", title: title(more.x ?? ""), range: more.range, nticks: 8,
+        ...line, showgrid: false, tickformat: more.range?.every((end) => Math.abs(end) < 10) ? "" : "~s", title: title(more.x ?? ""), range: more.range, nticks: 8,
       },
       yaxis: {
         ...line, title: title(chart.y ?? ""), range: chart.range ?? undefined, nticks: 7, exponentformat: "power",
