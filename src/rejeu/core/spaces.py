@@ -349,7 +349,7 @@ def scale_action(space: spaces.Space, action: Any, xp: Any = np) -> Any:
     Discrete and MultiDiscrete: from 0 to n - 1 to the numbers of the space. MultiBinary: the bits. Dict and Tuple: from the
     numbers of all parts, ``float32 (batch, action_width)``, to a dict or tuple of the parts' arrays.
 
-    With ``xp=jax.numpy`` everything has 32 bits, so between bounds that are not symmetric about 0 the last bit may differ.
+    With ``xp=jax.numpy`` everything has 32 bits, and the last bit may differ.
 
     >>> scale_action(spaces.Box(-2.0, 2.0, (1,)), np.array([[0.25], [3.0]])).tolist()
     [[0.5], [2.0]]
@@ -387,6 +387,8 @@ def box_scaler(space: spaces.Box, shape: tuple[int, ...], dtype: Any, xp: Any) -
         return lambda action: xp.floor(ends[0] + (action.reshape(shape) + 1.0) * half).clip(*ends).astype(dtype)
     low, high = np.where(bounded(space), low, -1.0), np.where(bounded(space), high, 1.0)
     middle, half = (0.5 * (low + high)).astype(real), (0.5 * (high - low)).astype(real)
+    if xp is np:  # the order of the operations decides the last bit, which results for a seed depend on
+        return lambda action: (low + (action.reshape(shape) + 1.0) * half).clip(*ends).astype(dtype)
     return lambda action: (middle + action.reshape(shape) * half).clip(*ends).astype(dtype)
 
 
