@@ -1,6 +1,6 @@
 """What the studio costs: watching an agent, a table of many runs, and a server that is killed while runs train.
 
-    python benchmarks/studio.py watching CartPole-v1 60000
+    python benchmarks/studio.py watching CartPole-v1 5
     python benchmarks/studio.py table 500
     python benchmarks/studio.py kills 10
     python benchmarks/studio.py memory MINUTES
@@ -31,9 +31,11 @@ from typing import Any
 
 from playwright.sync_api import Page, sync_playwright
 
+from rejeu.logs.tables import read_table
 from tests.lab.reporting.report.folders import CONFIG, write
 
-PAIRS = 5
+LOADING, WHILE = 8, 15
+"""Seconds until an agent is shown, and of each measurement."""
 PAUSES = """window.longest = 0; let last = performance.now();
 (function look(now) { window.longest = Math.max(window.longest, now - last); last = now; requestAnimationFrame(look); }
 )(last)"""
@@ -88,38 +90,46 @@ def counted(times: list[float], data: str | bytes) -> None:
         times.append(time.monotonic())
 
 
-def alone(env: str, steps: int, room: Path) -> float:
-    """Returns the steps a second of a run beside a studio that nobody looks at."""
-    with served(room):
-        return rate(train(room, "run", env, steps))
+def last_row(run: Path) -> tuple[float, float]:
+    """Returns step and seconds of training of the last episode of a run."""
+    table = read_table(run / "episodes.csv", ("step", "seconds"))
+    return (float(table.column("step")[-1]), float(table.column("seconds")[-1])) if len(table) else (0.0, 0.0)
 
 
-def watched(env: str, steps: int, room: Path, priority: int) -> tuple[float, float]:
-    """Returns the steps a second of a run that is watched, and the frames a second."""
-    times: list[float] = []
-    with served(room) as (_, address):
-        process = train(room, "run", env, steps)
-        while not (room / "run" / "config.json").exists():
-            time.sleep(0.1)
+def speed(run: Path, page: Page) -> float:
+    """Returns the steps a second of a run over a while, which begins after the agent of the page was loaded."""
+    page.wait_for_timeout(1000 * LOADING)
+    before = last_row(run)
+    page.wait_for_timeout(1000 * WHILE)
+    after = last_row(run)
+    return (after[0] - before[0]) / (after[1] - before[1])
+
+
+def watching(env: str, pairs: int, priority: int) -> None:
+    """Prints steps a second with and without somebody who watches, in turns of one run, and the frames a second."""
+    ratios, frames = [], []
+    with tempfile.TemporaryDirectory() as folder, served(Path(folder)) as (_, address):
+        process = train(Path(folder), "run", env, 100_000_000)
+        run, times = Path(folder) / "run", []  # type: Path, list[float]
+        while last_row(run)[1] < LOADING:
+            time.sleep(0.5)
         with opened(address, "/run?run=run", priority) as page:
             page.on("websocket", lambda socket: socket.on("framereceived", partial(counted, times)))
-            page.reload()
-            while process.poll() is None and "agent.safetensors" not in os.listdir(room / "run"):
-                page.wait_for_timeout(500)
-            return rate(process), (len(times) - 1) / (times[-1] - times[0])
-
-
-def watching(env: str, steps: int, priority: int) -> None:
-    """Prints steps a second with and without somebody who watches, in pairs, and the frames a second."""
-    ratios, frames = [], []
-    for i in range(PAIRS):
-        with tempfile.TemporaryDirectory() as first, tempfile.TemporaryDirectory() as second:
-            before = alone(env, steps, Path(first)) if i % 2 else 0.0
-            shown, fps = watched(env, steps, Path(second), priority)
-            undisturbed = before or alone(env, steps, Path(first))
-        ratios.append(shown / undisturbed)
-        frames.append(fps)
-        print(f"pair {i}: {undisturbed:,.0f} steps/s alone, {shown:,.0f} watched, {fps:.1f} frames/s", flush=True)
+            shown = page.url
+            for i in range(pairs):
+                found = {}
+                for kind in ("alone", "watched") if i % 2 else ("watched", "alone"):
+                    page.goto(shown if kind == "watched" else "about:blank")
+                    times.clear()
+                    found[kind] = speed(run, page)
+                    frames += [len(times[len(times) // 2 :]) / (times[-1] - times[len(times) // 2])] if times else []
+                ratios.append(found["watched"] / found["alone"])
+                print(
+                    f"{found['alone']:,.0f} steps/s alone, {found['watched']:,.0f} watched, {frames[-1]:.1f} frames/s",
+                    flush=True,
+                )
+        process.terminate()
+        process.wait()
     print(f"watched over alone: median {statistics.median(ratios):.3f}, {min(ratios):.3f} to {max(ratios):.3f}")
     print(f"frames a second: median {statistics.median(frames):.1f}, least {min(frames):.1f}")
 

@@ -34,18 +34,18 @@ def asked(tmp_path):
     return SimpleNamespace(folder=folder, stop=stop, written=written, agent=agent, callback=callback)
 
 
-def test_the_model_is_written_only_while_somebody_watches_and_at_most_once_a_second(asked, monkeypatch):
+def test_the_model_is_written_only_while_somebody_watches_and_at_most_every_two_seconds(asked, monkeypatch):
     now = [100.0]
     monkeypatch.setattr(requests.time, "monotonic", lambda: now[0])
     asked.callback(asked.agent, None)
     assert asked.written == []
     requests.ask(asked.folder.watch)
-    for now[0] in (100.5, 101.0, 101.5, 102.0):
+    for now[0] in (101.0, 102.0, 103.0, 104.0):
         asked.callback(asked.agent, None)
     assert asked.written == ["live.safetensors"] * 2
     old = time.time() - 2 * requests.STALE
     os.utime(asked.folder.watch, (old, old))
-    now[0] = 103.0
+    now[0] = 106.0
     asked.callback(asked.agent, None)
     assert len(asked.written) == 2
     assert asked.agent.last_saved == "before"
@@ -59,7 +59,7 @@ def test_a_request_to_stop_is_answered_as_ctrl_c_and_an_older_one_dropped(asked)
     asked.callback(asked.agent, None)
     assert not asked.stop.requested
     requests.ask(asked.folder.stop)
-    asked.callback(asked.agent, SimpleNamespace())  # less than a second later
+    asked.callback(asked.agent, SimpleNamespace())  # less than two seconds later
     assert not asked.stop.requested
     asked.callback._next = 0.0
     asked.callback(asked.agent, None)

@@ -17,7 +17,7 @@ from rejeu.checkpoints.run_folder import RunFolder
 from rejeu.core.interrupt import Interrupt
 from rejeu.training.run import Progress
 
-EVERY = 1.0
+EVERY = 2.0
 """Seconds between two looks at the folder."""
 STALE = 10.0
 """Seconds after which a request to show the policy is over, unless it was renewed."""
@@ -55,7 +55,7 @@ class Requests(TrainingCallback):
         self.withdraw()
 
     def __call__(self, agent: Any, progress: Progress) -> None:
-        """Answers, at most once a second: writes the current model while it is watched; stops as Ctrl-C does."""
+        """Answers, at most every two seconds: writes the current model while it is watched; stops as Ctrl-C does."""
         now = time.monotonic()
         if now < self._next:
             return
@@ -90,4 +90,4 @@ def keep_model(agent: Any, folder: Path, step: int) -> None:
 
 def models(folder: Path) -> Sequence[Path]:
     """Returns the models of the course of training, oldest first."""
-    return sorted(folder.glob("step_*.safetensors"))
+    return sorted(path for path in folder.glob("step_*.safetensors") if path.stem.removeprefix("step_").isdecimal())

@@ -33,7 +33,7 @@ from rejeu.lab.runs.config import read_folder
 from rejeu.logs.video import playback_fps
 
 LEAST_FPS = 20.0
-"""Frames a second of environments that are slower."""
+"""Frames a second of environments that are slower; of faster ones not every step is shown, but at least so many a second."""
 RENEW = 2.0
 """Seconds between two looks for new weights, and two requests for them."""
 REST = 0.8
@@ -135,7 +135,8 @@ class Player:
     def _play(self, agent: Agent, env: gym.Env, episode: Episode) -> None:
         """Plays one episode, with new weights as they come; another choice ends it."""
         obs, _ = env.reset(seed=episode.seed)
-        memory, period, due = None, 1 / max(playback_fps(env), LEAST_FPS), time.perf_counter()
+        fps, memory, due = max(playback_fps(env), LEAST_FPS), None, time.perf_counter()
+        stride, period = max(int(fps / LEAST_FPS), 1), 1 / fps
         self._show(env, episode)
         while not (episode.is_over or self._changed.is_set()):
             if not self.is_seen:
@@ -151,7 +152,8 @@ class Player:
             episode.rewards.append(float(reward))
             episode.is_over = bool(terminated or truncated)
             episode.success = success_of(info) if episode.is_over else math.nan
-            self._show(env, episode)
+            if episode.is_over or len(episode.rewards) % stride == 0:
+                self._show(env, episode)
             due = max(due + period, time.perf_counter() - period)
             self._changed.wait(max(due - time.perf_counter(), 0.0))
 
@@ -164,8 +166,7 @@ class Player:
             requests.ask(self.folder.watch)
         self._renew_at = time.monotonic() + RENEW
         path = self._path()
-        status = path.stat()
-        stamp = path, status.st_mtime_ns, status.st_size
+        stamp = path, path.stat().st_mtime_ns
         if agent is None:
             agent = load(path, device="cpu")
         elif stamp != self._stamp:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import subprocess
 import sys
@@ -10,8 +9,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from rejeu.lab.reporting.runs import is_file
+
 HIDDEN = ".studio"
 """Folder of the logs, beside the run folders."""
+APART: dict[str, Any] = {"creationflags": 0x208} if sys.platform == "win32" else {"start_new_session": True}
+"""Options of a process that no signal to this one reaches; on Windows it is detached, and a process group of its own."""
 TAIL = 2**16
 """Most bytes of a log that are shown."""
 
@@ -26,15 +29,8 @@ def start(words: Sequence[str], run: Path) -> subprocess.Popen[bytes]:
     log.parent.mkdir(parents=True, exist_ok=True)
     with log.open("ab") as out:
         return subprocess.Popen(
-            [sys.executable, "-m", "rejeu", *words], stdin=subprocess.DEVNULL, stdout=out, stderr=out, **apart()
+            [sys.executable, "-m", "rejeu", *words], stdin=subprocess.DEVNULL, stdout=out, stderr=out, **APART
         )
-
-
-def apart() -> dict[str, Any]:
-    """Returns the options of a process that no signal to this one reaches."""
-    if sys.platform == "win32":
-        return {"creationflags": subprocess.DETACHED_PROCESS | subprocess.CREATE_NEW_PROCESS_GROUP}
-    return {"start_new_session": True}
 
 
 def log_of(run: Path) -> Path:
@@ -45,13 +41,10 @@ def log_of(run: Path) -> Path:
 def read_log(run: Path) -> str:
     """Returns the end of what a run has printed, of one that a sweep or the studio started; else nothing."""
     for path in (log_of(run), run.parent / f"{run.name}.log"):
-        try:
-            handle = os.open(path, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0))
-        except OSError:
-            continue
-        with os.fdopen(handle, "rb") as file:
-            file.seek(max(os.fstat(handle).st_size - TAIL, 0))
-            return plain(file.read(TAIL).decode("utf-8", "replace"))
+        if is_file(path):
+            with path.open("rb") as file:
+                file.seek(max(path.stat().st_size - TAIL, 0))
+                return plain(file.read(TAIL).decode("utf-8", "replace"))
     return ""
 
 

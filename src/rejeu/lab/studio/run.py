@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import asyncio
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from fastapi import Request
-from nicegui import run as threads, ui
+from nicegui import ui
 
 from rejeu.checkpoints.run_folder import RunFolder
 from rejeu.lab.experiments.work import HIDDEN
@@ -20,7 +22,7 @@ from rejeu.lab.studio import processes
 from rejeu.lab.studio.branch import open_form
 from rejeu.lab.studio.figures import Figure
 from rejeu.lab.studio.layout import EVERY
-from rejeu.lab.studio.player import BEST, CURRENT, Episode, Player
+from rejeu.lab.studio.player import BEST, CURRENT, Episode, Player, lower_priority
 from rejeu.lab.studio.runs import COLORS
 from rejeu.lab.studio.screen import CSS, Screen
 from rejeu.lab.studio.state import Studio
@@ -29,6 +31,8 @@ from rejeu.logs import charts
 FIRST = (sections.CURVES, sections.GOALS)
 """Headings of the charts that are open; the others are folded."""
 REPLAYS = 100
+READING = ThreadPoolExecutor(1, initializer=lower_priority)
+"""Where runs are read; training goes first."""
 SEEN = """<script>document.addEventListener("visibilitychange", () => emitEvent("seen", !document.hidden));</script>"""
 TITLE = "Returns of the trained agent: choose a bar, then an episode, which is shown again"
 EPISODES = [
@@ -84,10 +88,10 @@ class RunPage:
             return
         began = time.monotonic()
         try:
-            parts = await threads.io_bound(read, self.path)
+            parts = await asyncio.get_running_loop().run_in_executor(READING, read, self.path)
         except (OSError, ValueError, ImportError) as error:
             parts, row = None, {**row, "notes": (*row["notes"], str(error))}
-        self.seen, self.due = row, time.monotonic() + SHARE * (time.monotonic() - began) / 4
+        self.seen, self.due = row, time.monotonic() + SHARE * (time.monotonic() - began)
         self.show(row, parts)
 
     def show(self, row: Row, parts: sections.Parts | None) -> None:
@@ -282,11 +286,9 @@ class Values:
 
     def show(self, episode: Episode | None, gamma: float) -> None:
         """Draws an episode, as far as it is."""
-        if episode is None:
-            return
-        self.title.text = f"Value of each step, seed {episode.seed}"
-        to_go = episode.to_go(gamma) if episode.is_over else np.zeros(0)
-        if episode.rewards:
+        if episode is not None and episode.rewards:
+            self.title.text = f"Value of each step, seed {episode.seed}"
+            to_go = episode.to_go(gamma) if episode.is_over else np.zeros(0)
             self.figure.show(charts.value_chart(np.array(episode.values), to_go))
 
 
