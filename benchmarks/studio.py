@@ -1,9 +1,10 @@
-"""What the studio costs: watching an agent, a table of many runs, and a server that is killed while runs train.
+"""What the studio costs: watching an agent, a table of many runs, a server that is killed while runs train, keys of games.
 
     python benchmarks/studio.py watching CartPole-v1 5
     python benchmarks/studio.py table 500
     python benchmarks/studio.py kills 10
     python benchmarks/studio.py memory MINUTES
+    python benchmarks/studio.py keys CartPole-v1 FrozenLake-v1 parking-v0
 
 Pages are opened in headless Chromium, which draws in software here. It has the least priority, so that its work is kept apart
 as far as the system can do that; ``--browser-priority 0`` counts it.
@@ -39,6 +40,20 @@ LOADING, WHILE = 8, 15
 PAUSES = """window.longest = 0; let last = performance.now();
 (function look(now) { window.longest = Math.max(window.longest, now - last); last = now; requestAnimationFrame(look); }
 )(last)"""
+
+
+KEYS = """() => { window.took = []; let pressed = null, awaited = 0;
+const screen = document.querySelector(".screen");
+addEventListener("keydown", (event) => {
+  if (!event.repeat) [pressed, awaited] = [performance.now(), Number(screen.dataset.presses) + 1]; }, true);
+new MutationObserver(() => {
+  if (pressed === null || Number(screen.dataset.presses) < awaited) return;
+  const began = pressed;
+  pressed = null;
+  requestAnimationFrame(() => window.took.push(performance.now() - began));
+}).observe(screen, { attributes: true }); }"""
+"""Milliseconds from a key to the animation frame after the picture that has taken it was drawn."""
+PRESSES = 200
 
 
 @contextmanager
@@ -168,6 +183,29 @@ def table(n: int, priority: int) -> None:
             print(f"memory of the server: {memory(process.pid) / 1e6:.0f} MB")
 
 
+def keys(env: str, n_agents: int, priority: int) -> None:
+    """Prints the time from a key to the picture that has taken it, alone or beside agents."""
+    import rejeu
+
+    with tempfile.TemporaryDirectory() as folder:
+        names = [f"agent_{i}.safetensors" for i in range(n_agents)]
+        for i, name in enumerate(names):
+            rejeu.PPO("MlpPolicy", env, seed=i).save(Path(folder) / name)
+        query = "".join(f"&agent={name}" for name in names)
+        with served(Path(folder)) as (_, address), opened(address, f"/play?env={env}&seed=0{query}", priority) as page:
+            page.wait_for_selector(".screen canvas", timeout=60_000)
+            page.evaluate(KEYS)
+            for _ in range(PRESSES):
+                key = random.choice("ad")
+                page.keyboard.down(key)
+                page.wait_for_timeout(60)
+                page.keyboard.up(key)
+                page.wait_for_timeout(random.uniform(50, 250))
+            took = sorted(page.evaluate("window.took"))
+    p50, p95 = (took[round(share * (len(took) - 1))] for share in (0.5, 0.95))
+    print(f"{env}, beside {n_agents} agents: {len(took)} keys, p50 {p50:.0f} ms, p95 {p95:.0f} ms", flush=True)
+
+
 def memory(pid: int) -> int:
     """Returns the memory of a process in bytes."""
     text = Path(f"/proc/{pid}/status").read_text()
@@ -224,7 +262,7 @@ def grows(minutes: float, priority: int) -> None:
 def main() -> None:
     """Runs one of the measurements."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["watching", "table", "kills", "memory"])
+    parser.add_argument("what", choices=["watching", "table", "kills", "memory", "keys"])
     parser.add_argument("values", nargs="*")
     parser.add_argument("--browser-priority", type=int, default=19)
     given = parser.parse_args()
@@ -235,6 +273,10 @@ def main() -> None:
         table(int(values[0]), given.browser_priority)
     elif given.what == "kills":
         kills(int(values[0]))
+    elif given.what == "keys":
+        for env in values:
+            for n_agents in (0, 2) if env == values[0] else (0,):
+                keys(env, n_agents, given.browser_priority)
     else:
         grows(float(values[0]), given.browser_priority)
 

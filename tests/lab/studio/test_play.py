@@ -12,6 +12,7 @@ import pytest
 
 from rejeu.demonstrations import read
 from rejeu.lab.cli import main, studio as command
+from rejeu.lab.runs.config import RunConfig
 from rejeu.lab.studio.games import Playing, Wanted, fitted
 from rejeu.lab.studio.state import Studio
 from rejeu.teaching.play import opened as game_opened
@@ -79,6 +80,13 @@ def test_an_error_is_one_line_on_the_page(browser, common):
 def test_an_address_names_no_code_and_no_file_elsewhere(common, wanted, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         wanted.open(Studio(common.folder))
+
+
+def test_an_environment_that_the_command_line_names_is_played(tmp_path):
+    studio = Studio(tmp_path)
+    studio.trust(RunConfig(env=f"tests.playing:{LEVER}"))
+    with Wanted(f"tests.playing:{LEVER}", (), True, 3, False).open(studio) as made:
+        assert (made.env_id, made.game.seed) == (LEVER, 3)
 
 
 class Shown:

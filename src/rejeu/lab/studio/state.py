@@ -50,7 +50,11 @@ class Studio:
     def given(self, run: str) -> RunOptions:
         """Returns what people have typed about the environment of a run, which no file may let import code."""
         known = self.summaries.get(run)
-        return self._trusted.get("" if known is None or known.config is None else known.config.typed, RunOptions())
+        return self.typed("" if known is None or known.config is None else known.config.typed)
+
+    def typed(self, env: str) -> RunOptions:
+        """Returns what people have typed about an environment that they named like this."""
+        return self._trusted.get(env, RunOptions())
 
     def trust(self, run: RunConfig) -> None:
         """Lets runs on an environment that somebody has typed be shown, though it is imported."""
