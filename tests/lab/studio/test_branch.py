@@ -21,7 +21,7 @@ def test_a_run_is_branched_with_other_settings(browser, common):
         page.wait_for_selector("text=must be a name of a folder below")
         page.get_by_label("new folder").fill("branched")
         page.get_by_role("button", name="Start").click()
-        page.wait_for_url("**/run?run=branched", timeout=60_000)
+        page.wait_for_url("**/run?run=branched", timeout=120_000)
     config = json.loads((common.folder / "branched" / "config.json").read_text())
     assert config["origin"] == {
         "run": str(common.folder / "trained"),

@@ -61,7 +61,7 @@ def test_models_are_evaluated_again_when_they_change_while_somebody_looks(tmp_pa
     running = {"state": "running", "steps": 3, "steps_asked": 10}
     studio.rows = [{**running, "run": "run"}, {**running, "run": "new"}]
     first, second = lines(studio, judging, judging.board("fr"))
-    assert (first["name"], first["training"]) == ("run", "en entraînement : 3 of 10 (30%)")
+    assert (first["name"], first["training"]) == ("run", "s'entraîne : 30\N{NARROW NO-BREAK SPACE}%")
     assert first["link"] == "/play?agent=run.safetensors&watch=1"
     assert second == {"name": "new", "training": first["training"]}
     path.unlink()

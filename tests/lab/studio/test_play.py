@@ -7,13 +7,12 @@ import re
 from functools import partial
 from urllib.parse import quote
 
-import numpy as np
 import pytest
 
 from rejeu.demonstrations import read
 from rejeu.lab.cli import main, studio as command
 from rejeu.lab.runs.config import RunConfig
-from rejeu.lab.studio.games import Playing, Wanted, fitted
+from rejeu.lab.studio.games import Playing, Wanted
 from rejeu.lab.studio.state import Studio
 from rejeu.teaching.play import opened as game_opened
 from tests.lab.cli.test_cli import error_of
@@ -143,11 +142,6 @@ def test_an_error_of_a_game_is_what_it_says():
     while not playing.ended:
         pass
     assert "cannot be rendered to arrays" in playing.said
-
-
-def test_a_wide_picture_is_made_smaller():
-    assert fitted(np.zeros((100, 3000, 3), np.uint8)).shape == (34, 1000, 3)
-    assert fitted(np.zeros((100, 600, 3), np.uint8)).shape == (100, 600, 3)
 
 
 def test_watch_of_two_opens_the_studio_with_both(common, monkeypatch, capsys):

@@ -9,7 +9,7 @@ from fastapi import Request
 from nicegui import ui
 
 from rejeu.core.language import LANGUAGES, Language, chosen
-from rejeu.lab.reporting.rows import steps_text
+from rejeu.lab.reporting.rows import Row
 from rejeu.lab.studio.judging import Judging
 from rejeu.lab.studio.layout import EVERY, address
 from rejeu.lab.studio.state import Studio
@@ -23,19 +23,15 @@ CSS = """
 .projector .header { display: none; }
 .projector .page { max-width: none; padding: 2vw; }
 .projector .class td, .projector .class th { font-size: min(2.2rem, 3.2vw); line-height: 1.5; }
-.projector .class td .quiet { font-size: min(1.4rem, 2.2vw); }
+.projector .class td .quiet { font-size: min(1.4rem, 2.2vw); line-height: 1.3; }
 .projector .class svg { width: 16vw; height: 1.6rem; }
 .projector .title { font-size: min(3rem, 5vw); line-height: 1.2; }
 .projector .small { display: none; }
 """
 NAMES = ("place", "name", "algorithm", "steps", "seed", "return", "interval", "success", "length")
-LEFT_OUT = {
-    "algorithm": "gt-sm small",
-    "steps": "gt-sm small",
-    "seed": "gt-sm small",
-    "length": "gt-sm small",
-    "bar": "gt-xs",
-}
+LEFT_OUT = dict.fromkeys(("algorithm", "steps", "seed", "length"), "gt-sm small") | dict.fromkeys(
+    ("bar", "success"), "gt-xs"
+)
 """Classes of columns that a phone, or the projector, leaves out."""
 SLOTS = {
     "name": """<q-td :props="props" class="name">
@@ -118,9 +114,7 @@ def lines(studio: Studio, judging: Judging, board: Leaderboard) -> list[dict[str
     texts = board.texts
     ends = [end for row in board.rows for end in row.interval] or [0.0]
     scale = 100 / max(max(ends) - min(ends), 1e-9)
-    running = {
-        row["run"]: texts["training"].format(steps=steps_text(row)) for row in studio.rows if row["state"] == "running"
-    }
+    running = {row["run"]: progress(row, board.language) for row in studio.rows if row["state"] == "running"}
     found = []
     for row in board.rows:
         low, high = ((end - min(ends)) * scale for end in row.interval)
@@ -132,3 +126,10 @@ def lines(studio: Studio, judging: Judging, board: Leaderboard) -> list[dict[str
             | {"link": path and address("/play", agent=path.as_posix(), watch="1")}
         )
     return [*found, *({"name": name, "training": steps} for name, steps in running.items())]
+
+
+def progress(row: Row, language: Language) -> str:
+    """Returns how far a run is."""
+    asked = row["steps_asked"]
+    share = f"{row['steps'] / asked:.0%}" if asked else f"{row['steps']:,}"
+    return str(leaderboard.texts()[language]["training"].format(share=leaderboard.written(share, language)))

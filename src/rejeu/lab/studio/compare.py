@@ -18,11 +18,14 @@ from rejeu.logs.charts import GROUP_COLORS, group_chart
 
 EVERY = 3.0
 """Seconds between two looks whether a run that is compared has changed."""
-BY = {None: "groups: automatic", "algorithm": "by algorithm", "setting": "by setting", "env": "by environment"}
-AXES = {"steps": "over steps", "time": "over time"}
-SCORES = {"training": "end of training", "evaluation": "last evaluation"}
-STATISTICS = {"iqm": "interquartile mean", "mean": "mean", "median": "median"}
-SCALES = {None: "returns", "range": "scaled to the range"}
+CHOICES: dict[str, dict[str | None, str]] = {
+    "by": {None: "groups: automatic", "algorithm": "by algorithm", "setting": "by setting", "env": "by environment"},
+    "x": {"steps": "over steps", "time": "over time"},
+    "score": {"training": "end of training", "evaluation": "last evaluation"},
+    "statistic": {"iqm": "interquartile mean", "mean": "mean", "median": "median"},
+    "normalize": {None: "returns", "range": "scaled to the range"},
+}
+"""What people choose of the arguments of a comparison, the default first."""
 BETTER = ("group", "better than", "environment", "probability (95 % interval)")
 
 
@@ -35,13 +38,7 @@ def build(studio: Studio, request: Request) -> None:
     )
     named = request.query_params.getlist("run")
     with ui.row().classes("items-center w-full gap-2"):
-        controls = {
-            "by": ui.select(BY, value=None),
-            "x": ui.select(AXES, value="steps"),
-            "score": ui.select(SCORES, value="training"),
-            "statistic": ui.select(STATISTICS, value="iqm"),
-            "normalize": ui.select(SCALES, value=None),
-        }
+        controls = {name: ui.select(names, value=next(iter(names))) for name, names in CHOICES.items()}
     status = ui.label().classes("text")
     place = ui.column().classes("w-full gap-4")
     seen: Any = None

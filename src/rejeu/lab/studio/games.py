@@ -10,8 +10,6 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from rejeu.agents import load
 from rejeu.checkpoints.run_folder import dated, find_model
 from rejeu.core.language import said
@@ -23,8 +21,6 @@ from rejeu.teaching.play.game import Event, Game, Player
 from rejeu.teaching.play.keys import full_name
 from rejeu.teaching.play.window import message, number, score_summary
 
-MAX_PIXELS = 1440
-"""Most pixels in a row of a picture."""
 SLOW = 20.0
 """Steps a second below which a key that is pressed acts at once, rather than at the next step."""
 
@@ -137,7 +133,7 @@ class Playing:
             )
             if now != drawn:
                 drawn = now
-                pictures = [fitted(player.frame) for player in game.players]
+                pictures = [player.frame for player in game.players]
                 self._show(pictures, [caption(game, player) for player in game.players], self._presses)
             at = time.perf_counter()
             due = max(min(due, at) + 1 / made.fps, at)  # a step that took too long is not caught up
@@ -165,9 +161,3 @@ def caption(game: Game, player: Player) -> dict[str, Any]:
         "message": message(game, player),
         "won": player.success == 1.0,
     }
-
-
-def fitted(frame: np.ndarray) -> np.ndarray:
-    """Returns a picture, of which every second, third, ... pixel is left out if it is wider than a page shows it."""
-    step = -(-frame.shape[1] // MAX_PIXELS)
-    return frame[::step, ::step]

@@ -66,14 +66,14 @@ class Judging:
                 self._evaluate(leaderboard.models(self.folder))
                 self.problem = ""
             except expected_errors() as error:
-                self.problem, self._results = one_line(error), {}
+                self.problem, self._results, self._stamps = one_line(error), {}, {}
                 self.version += 1
             time.sleep(1.0)
 
     def _evaluate(self, paths: list[Path]) -> None:
         """Evaluates the models that are new, or have changed."""
         for path in self._results.keys() - {*paths}:
-            del self._results[path]
+            del self._results[path], self._stamps[path]
             self.version += 1
         due = [path for path in paths[: leaderboard.MAX_MODELS] if self._is_due(path)]
         if not due:
@@ -93,6 +93,5 @@ class Judging:
         self.now = ""
 
     def _is_due(self, path: Path) -> bool:
-        found, when = self._stamps.get(path, (None, 0.0))
-        is_changed = time_of(path) != found and time.monotonic() - when > AGAIN
-        return path not in self._results or is_changed
+        found, when = self._stamps.get(path, (None, -AGAIN))
+        return time_of(path) != found and time.monotonic() - when > AGAIN

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 
 from fastapi import Request
@@ -10,6 +11,7 @@ from nicegui import ui
 from rejeu.agents import presets
 from rejeu.core.language import said
 from rejeu.lab.studio.games import Playing, Wanted
+from rejeu.lab.studio.layout import follow
 from rejeu.lab.studio.screen import CSS, Screen
 from rejeu.lab.studio.state import Studio
 from rejeu.teaching.play.game import Event
@@ -31,12 +33,15 @@ def build(studio: Studio, request: Request) -> None:
     asked = request.query_params
     named = asked.getlist("agent")[:MOST_AGENTS]
     first = studio.row(named[0]) if named else None
-    chosen = asked.get("env") or (first["env"] if first is not None else "")
+    chosen = asked.get("env") or (first["env"] if first is not None else None)
     seed = asked.get("seed", "")
     with ui.row().classes("items-center w-full"):
-        env_ids = dict.fromkeys([*environments(studio), *filter(None, [chosen])])
         env = ui.select(
-            [*env_ids], label="environment", value=chosen or None, with_input=True, new_value_mode="add-unique"
+            environments(studio, chosen),
+            label="environment",
+            value=chosen,
+            with_input=True,
+            new_value_mode="add-unique",
         ).classes("w-64")
         agents = ui.select(offered(studio, chosen, named), label="agents", value=named, multiple=True).classes("w-64")
         agents.props(f"use-chips max-values={MOST_AGENTS}")
@@ -51,19 +56,28 @@ def build(studio: Studio, request: Request) -> None:
         wanted = Wanted(env.value or "", tuple(agents.value), bool(by_hand.value), from_seed, bool(record.value))
         place.clear()  # the screen of an earlier game ends it
         with place:
-            show(studio, wanted)
+            show(studio, wanted, offer)
 
-    env.on_value_change(lambda: agents.set_options(offered(studio, env.value, agents.value), value=agents.value))
+    def offer(env_id: str | None = None) -> None:
+        env_id = env.value or env_id
+        for control, value, options in (
+            (env, env_id, environments(studio, env_id)),
+            (agents, agents.value, offered(studio, env_id, agents.value)),
+        ):
+            if (control.options, control.value) != (options, value):
+                control.set_options(options, value=value)
+
+    env.on_value_change(lambda: offer())
+    follow(studio, offer)
     start.on_click(begin)
     if chosen or named:
         begin()
 
 
-def environments(studio: Studio) -> list[str]:
-    """Returns the ids of environments with presets, with keys, and of the runs."""
-    return sorted(
-        {*KNOWN, *(one.env_id for one in presets.every()), *(row["env"] for row in studio.rows if row["env"])}
-    )
+def environments(studio: Studio, chosen: str | None) -> list[str]:
+    """Returns the ids of environments with presets, with keys, and of the runs, and the one that is chosen."""
+    own = [*(one.env_id for one in presets.every()), *(row["env"] for row in studio.rows), chosen]
+    return sorted({*KNOWN, *filter(None, own)})
 
 
 def offered(studio: Studio, env_id: str | None, chosen: list[str]) -> list[str]:
@@ -72,8 +86,8 @@ def offered(studio: Studio, env_id: str | None, chosen: list[str]) -> list[str]:
     return [*dict.fromkeys([*chosen, *studio.guests, *runs])]
 
 
-def show(studio: Studio, wanted: Wanted) -> None:
-    """Begins a game, and shows it."""
+def show(studio: Studio, wanted: Wanted, begun: Callable[[str], object]) -> None:
+    """Begins a game, and shows it; ``begun`` is called with the id of its environment."""
     status = ui.label("The environment is made, and agents are compiled ...").classes("text")
     screen = Screen(lambda event: playing.handle(event))
     buttons = ui.row().classes("gap-1 items-center")
@@ -83,6 +97,7 @@ def show(studio: Studio, wanted: Wanted) -> None:
     def look() -> None:
         if playing.opened is not None and not buttons.default_slot.children:
             status.text = ""
+            begun(playing.opened.env_id)
             with buttons:
                 show_keys(playing, playing.opened.keys)
         if playing.ended:

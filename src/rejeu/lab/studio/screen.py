@@ -7,7 +7,7 @@ import io
 import secrets
 import weakref
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from fastapi import WebSocket, WebSocketDisconnect
@@ -42,17 +42,6 @@ KEYS |= {"shift": "left shift", "control": "left ctrl", "right control": "right 
 _open: weakref.WeakValueDictionary[str, Screen] = weakref.WeakValueDictionary()
 
 
-class Shown(NamedTuple):
-    """Pictures with their captions."""
-
-    pictures: Sequence[bytes]
-    """JPEGs."""
-    captions: Sequence[dict[str, Any]]
-    """Texts of each: ``name``, ``score``, ``about`` and ``message``; ``won`` colors the message."""
-    presses: int = 0
-    """How many keys had been pressed when they were drawn."""
-
-
 class Screen(Element, component="screen.js"):
     """Pictures side by side. Mutable: ``show`` replaces them; it may be called from any thread.
 
@@ -64,7 +53,8 @@ class Screen(Element, component="screen.js"):
 
     def __init__(self, key: Callable[[Event], object] | None = None) -> None:
         super().__init__()
-        self._key, self._newest = key, Shown((), ())
+        self._key = key
+        self._newest: tuple[Sequence[bytes], dict[str, Any]] = (), {}
         self._changed, self._loop = asyncio.Event(), asyncio.get_running_loop()
         self.on_leave: Callable[[], object] = lambda: None
         """Called when the page is closed, or the element removed."""
@@ -73,8 +63,12 @@ class Screen(Element, component="screen.js"):
         _open[channel] = self
 
     def show(self, pictures: Sequence[np.ndarray], captions: Sequence[dict[str, Any]], presses: int = 0) -> None:
-        """Shows pictures, ``uint8 (height, width, 3)``."""
-        self._newest = Shown([jpeg(picture) for picture in pictures], captions, presses)
+        """Shows pictures, ``uint8 (height, width, 3)``.
+
+        Captions are texts: ``name``, ``score``, ``about`` and ``message``; ``won`` colors the message. ``presses`` says how
+        many keys had been pressed before.
+        """
+        self._newest = [jpeg(picture) for picture in pictures], {"captions": captions, "presses": presses}
         self._loop.call_soon_threadsafe(self._changed.set)
 
     def _handle_delete(self) -> None:
@@ -104,10 +98,10 @@ class Screen(Element, component="screen.js"):
         while True:
             await self._changed.wait()
             self._changed.clear()
-            shown = self._newest
-            if shown.pictures:
-                await socket.send_json({"captions": shown.captions, "presses": shown.presses})
-                for picture in shown.pictures:
+            pictures, texts = self._newest
+            if pictures:
+                await socket.send_json(texts)
+                for picture in pictures:
                     await socket.send_bytes(picture)
                 await drawn.wait()
                 drawn.clear()

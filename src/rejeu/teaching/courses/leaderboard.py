@@ -365,9 +365,14 @@ def cells_of(row: Entrant, language: Language) -> list[str]:
         "" if math.isnan(result.success_rate) else f"{result.success_rate:.0%}",
         f"{result.mean_length:,.0f}",
     ]
-    if language == "fr":
-        numbers = [one.replace(",", NARROW_SPACE).replace(".", ",").replace("%", f"{NARROW_SPACE}%") for one in numbers]
-    return [place, row.name, row.algorithm, *numbers]
+    return [place, row.name, row.algorithm, *(written(one, language) for one in numbers)]
+
+
+def written(number: str, language: Language) -> str:
+    """Returns a number as it is written in a language, from how it is written in English."""
+    if language == "en":
+        return number
+    return number.replace(",", NARROW_SPACE).replace(".", ",").replace("%", f"{NARROW_SPACE}%")
 
 
 def quoted(text: str) -> str:
