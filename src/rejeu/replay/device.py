@@ -256,10 +256,10 @@ class DeviceReplay:
 
     def goal_positions(self, ring: DeviceRing, key: Array, rows: DeviceRows) -> Array:
         """Returns the positions of the rows whose achieved goals become the new goals of ``rows``, by the strategy."""
-        oldest, newest, numbers = self.oldest(ring)[rows.env], ring.head[rows.env], count()
+        newest, numbers = ring.head[rows.env], count()
 
         def episode(times: Array) -> Array:
-            return self.positions(rows.env, ring.episode[self.positions(rows.env, jnp.maximum(times, oldest))])
+            return self.positions(rows.env, ring.episode[self.positions(rows.env, jnp.maximum(times, steps.oldest))])
 
         def integers(low: Array, high: Array) -> Array:
             shape = jnp.broadcast_shapes(jnp.shape(low), jnp.shape(high))
@@ -269,9 +269,9 @@ class DeviceReplay:
             jnp,
             rows.env,
             rows.time,
-            oldest,
             newest,
-            lambda times: jnp.maximum(ring.begins[episode(times)], oldest),
+            self.rows,
+            lambda times: jnp.maximum(ring.begins[episode(times)], steps.oldest),
             lambda times: jnp.minimum(ring.ends[episode(times)], newest),
             integers,
             lambda: self.draw_rows(ring, key, len(rows.time))[:2],

@@ -55,10 +55,10 @@ class HindsightSteps:
     """Their environments."""
     time: Any
     """Times of the observations; ``time + 1`` is that of the next ones."""
-    oldest: Any
-    """Times of the oldest observations of the same environments that are stored."""
     newest: Any
-    """Times of the newest ones."""
+    """Times of the newest observations of the same environments."""
+    rows: int
+    """How many observations of an environment are stored at most."""
     begin: Callable[[Any], Any]
     """``begin(times)`` returns the times of the first observations of the episodes at times ``(n,)``, or the oldest stored."""
     end: Callable[[Any], Any]
@@ -71,6 +71,11 @@ class HindsightSteps:
     """Returns positions in the ring, given environments and times."""
     goals_at: tuple[Callable[[Any], Any], Callable[[Any], Any]]
     """Return the achieved and the desired goals at positions."""
+
+    @cached_property
+    def oldest(self) -> Any:
+        """Times of the oldest observations of the same environments that are stored."""
+        return self.np.maximum(self.newest - self.rows + 1, 0)
 
     @cached_property
     def first(self) -> Any:
@@ -305,13 +310,15 @@ class HerReplayBuffer(BaseReplayBuffer):
             step: their records, ``(n,)``, with the :func:`counters` of the strategy: ``until_end`` is the number of steps from
                 ``time`` to the end of the episode, 0 while it runs; ``since_start`` the number since its first observation.
         """
-        ring, oldest, newest = self.ring, self.ring.oldest()[env], self.ring.head[env]
+        ring, newest = self.ring, self.ring.head[env]
 
         def begin(times: np.ndarray) -> np.ndarray:
-            times = np.maximum(times, oldest)
-            return np.maximum(times - ring.since_start[ring.index(env, times)], oldest)  # type: ignore[index]
+            times = np.maximum(times, steps.oldest)
+            return np.maximum(times - ring.since_start[ring.index(env, times)], steps.oldest)  # type: ignore[index]
 
         def end(times: np.ndarray) -> np.ndarray:
+            if times is time:  # whose rows have been read
+                return np.where(step["until_end"], time + step["until_end"], newest)
             position = ring.index(env, times)
             until_end = ring.until_end[position]  # type: ignore[index]
             has_ended = (until_end > 0) | (ring.kind[position] == LAST)
@@ -325,7 +332,7 @@ class HerReplayBuffer(BaseReplayBuffer):
             return ring.draw(rng, len(time))[:2]
 
         goals_at = partial(ring.read_leaf, self.achieved), partial(ring.read_leaf, self.desired)
-        steps = HindsightSteps(np, env, time, oldest, newest, begin, end, integers, drawn, ring.index, goals_at)
+        steps = HindsightSteps(np, env, time, newest, ring.rows, begin, end, integers, drawn, ring.index, goals_at)
         return np.asarray(steps.chosen_by(self.config.goal_selection_strategy))
 
 
