@@ -122,7 +122,8 @@ def is_tie(policy: Policy, inputs: Mapping[str, np.ndarray], row: int) -> bool:
     A policy with memory is taken at the start of an episode, so there only such ties are seen.
     """
     decisive = [one for one in policy.program.operations if one.name in DECISIVE]
-    arrays = [inputs[port.name][row][None] if port.name in inputs else _zeros(value) for port, value in _pairs(policy)]
+    given = {name: array[row][None] for name, array in inputs.items()}
+    arrays = [given.get(port.name, np.zeros((1, *port.shape), port.dtype)) for port in policy.inputs]
     found = policy.program.ending_in([operation.inputs[0] for operation in decisive])(*arrays)
     for operation, value in zip(decisive, map(np.asarray, found), strict=True):
         allowed = LARGEST_DIFFERENCE * max(1.0, float(np.abs(value[np.abs(value) < 1e8]).max(initial=0.0)))
@@ -134,14 +135,6 @@ def is_tie(policy: Policy, inputs: Mapping[str, np.ndarray], row: int) -> bool:
         if (distance < allowed).any():
             return True
     return False
-
-
-def _pairs(policy: Policy) -> Any:
-    return zip(policy.inputs, policy.program.arguments, strict=True)
-
-
-def _zeros(value: Value) -> np.ndarray:
-    return np.zeros([one if one != -1 else 1 for one in value.sizes], value.dtype)
 
 
 def one_by_one(policy: Policy, call: Callable[[dict[str, np.ndarray]], Mapping[str, Any]]) -> Run:

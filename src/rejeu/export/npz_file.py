@@ -12,7 +12,7 @@ from jax.export import is_symbolic_dim
 from rejeu.core import spaces
 from rejeu.export.check import Run, one_by_one
 from rejeu.export.contract import Exportable
-from rejeu.export.numpy_policy import FUNCTIONS, POLICY, NumpyPolicy, parse
+from rejeu.export.numpy_policy import FUNCTIONS, POLICY, parse
 from rejeu.export.program import Operation, TracedProgram, unsupported
 
 
@@ -59,11 +59,6 @@ def content_of(source: Exportable) -> tuple[dict[str, Any], list[np.ndarray]]:
     observations, actions = map(spaces.describe, (source.observation_space, source.action_space))
     content = {"card": source.card, "observation_space": observations, "action_space": actions, "program": program}
     return content, constants
-
-
-def policy_of(source: Exportable) -> NumpyPolicy:
-    """Returns the policy in NumPy, without a file."""
-    return NumpyPolicy(*content_of(source), spaces.MAX_NUMBERS)
 
 
 def files(source: Exportable) -> tuple[tuple[bytes, ...], Run]:

@@ -328,9 +328,7 @@ class HerReplayBuffer(BaseReplayBuffer):
             u = rng.random(np.broadcast_shapes(np.shape(low), np.shape(high)))
             return low + (u * (high - low)).astype(np.int64)
 
-        def drawn() -> tuple[np.ndarray, np.ndarray]:
-            return ring.draw(rng, len(time))[:2]
-
+        drawn = lambda: ring.draw(rng, len(time))[:2]  # noqa: E731
         goals_at = partial(ring.read_leaf, self.achieved), partial(ring.read_leaf, self.desired)
         steps = HindsightSteps(np, env, time, newest, ring.rows, begin, end, integers, drawn, ring.index, goals_at)
         return np.asarray(steps.chosen_by(self.config.goal_selection_strategy))

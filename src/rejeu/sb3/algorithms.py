@@ -694,12 +694,6 @@ def load_agent(kind: type[Original], path: Path, env: Any, changes: Mapping[str,
     return Agent.__dict__["load"].method.__get__(None, kind)(path, env, **changes)
 
 
-def name_in(path: Any) -> str:
-    """Returns the name of the algorithm in a model file."""
-    with readable(path, ".zip") as found:
-        return str(checkpoint.read_header(found, "agent").get("algorithm"))
-
-
 def written(write: Callable[[Path], Path], path: Any, suffix: str) -> Any:
     """Writes to a path, to which ``suffix`` is added if it has none, or to a file object; returns the path."""
     if not isinstance(path, str | Path):
@@ -803,7 +797,9 @@ class MaskablePPO(Original, agents.MaskablePPO):
 
 def load_any(path: Any, device: Any) -> Any:
     """Returns the agent of a model file, whatever its algorithm."""
-    return globals()[name_in(path)].load(path, device=device)
+    with readable(path, ".zip") as file:
+        name = checkpoint.read_header(file, "agent").get("algorithm")
+    return globals()[str(name)].load(path, device=device)
 
 
 policies.BaseModel.load_agent = staticmethod(load_any)
