@@ -133,8 +133,8 @@ def numpy_policy(agent: BaseAgent, source: str) -> NumpyPolicy:
     """Returns the policy of an agent in NumPy, without a file; ``source`` is for the card."""
     policy = policy_for(agent, False, None)
     card = card_of(agent, policy, "npz", source, None)
-    source = Exportable(policy, policy, card, agent.observation_space, agent.action_space)
-    return NumpyPolicy(*npz_file.content_of(source), spaces.MAX_NUMBERS)
+    exportable = Exportable(policy, policy, card, agent.observation_space, agent.action_space)
+    return NumpyPolicy(*npz_file.content_of(exportable), spaces.MAX_NUMBERS)
 
 
 def card_of(agent: BaseAgent, made: Policy, target: str, source: str, duration: float | None) -> dict[str, Any]:
