@@ -66,7 +66,9 @@ def measure(agent: Agent, folder: Path, is_timed: bool) -> dict[str, dict[str, A
         if run is not None:
             runs[target] = run, len(contents[0])
     saved = agent.export(folder / "policy.npz").path
-    acting: dict[str, Any] = {"numpy": load_policy(saved), **({"predict": agent} if is_timed else {})}
+    acting: dict[str, Any] = {"predict": agent} if is_timed else {}
+    if not one.of("state"):  # which predict passes on by itself
+        acting["numpy"] = load_policy(saved)
     structure = spaces.structure(agent.observation_space)
     names = [port.name for port in one.of("observation")]
     for target, policy in acting.items():
