@@ -111,19 +111,29 @@ def last_row(run: Path) -> tuple[float, float]:
     return (float(table.column("step")[-1]), float(table.column("seconds")[-1])) if len(table) else (0.0, 0.0)
 
 
-def speed(run: Path, page: Page) -> float:
-    """Returns the steps a second of a run over a while, which begins after the agent of the page was loaded."""
+def cpu(pid: int) -> float:
+    """Returns the processor time of a process in seconds."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def speed(run: Path, page: Page, pids: tuple[int, int]) -> tuple[float, float, float]:
+    """Returns the steps of a run a second, those a second of its processor time, and the cores that the server takes.
+
+    They are measured over a while, which begins after the agent of the page was loaded.
+    """
     page.wait_for_timeout(1000 * LOADING)
-    before = last_row(run)
+    before, used, began = last_row(run), [cpu(pid) for pid in pids], time.monotonic()
     page.wait_for_timeout(1000 * WHILE)
-    after = last_row(run)
-    return (after[0] - before[0]) / (after[1] - before[1])
+    after, used_now, seconds = last_row(run), [cpu(pid) for pid in pids], time.monotonic() - began
+    steps = after[0] - before[0]
+    return steps / (after[1] - before[1]), steps / (used_now[0] - used[0]), (used_now[1] - used[1]) / seconds
 
 
 def watching(env: str, pairs: int, priority: int) -> None:
     """Prints steps a second with and without somebody who watches, in turns of one run, and the frames a second."""
-    ratios, frames = [], []
-    with tempfile.TemporaryDirectory() as folder, served(Path(folder)) as (_, address):
+    ratios, own, shares, frames = [], [], [], []
+    with tempfile.TemporaryDirectory() as folder, served(Path(folder)) as (server, address):
         process = train(Path(folder), "run", env, 100_000_000)
         run, times = Path(folder) / "run", []  # type: Path, list[float]
         while last_row(run)[1] < LOADING:
@@ -136,17 +146,17 @@ def watching(env: str, pairs: int, priority: int) -> None:
                 for kind in ("alone", "watched") if i % 2 else ("watched", "alone"):
                     page.goto(shown if kind == "watched" else "about:blank")
                     times.clear()
-                    found[kind] = speed(run, page)
+                    found[kind] = speed(run, page, (process.pid, server.pid))
                     frames += [len(times[len(times) // 2 :]) / (times[-1] - times[len(times) // 2])] if times else []
-                ratios.append(found["watched"] / found["alone"])
-                print(
-                    f"{found['alone']:,.0f} steps/s alone, {found['watched']:,.0f} watched, {frames[-1]:.1f} frames/s",
-                    flush=True,
-                )
+                ratios.append(found["watched"][0] / found["alone"][0])
+                own.append(found["watched"][1] / found["alone"][1])
+                shares.append(found["watched"][2])
+                print(f"{ratios[-1]:.3f} of the speed, {own[-1]:.3f} a second of processor time,", end=" ")
+                print(f"the server takes {shares[-1]:.2f} cores, {frames[-1]:.1f} frames/s", flush=True)
         process.terminate()
         process.wait()
-    print(f"watched over alone: median {statistics.median(ratios):.3f}, {min(ratios):.3f} to {max(ratios):.3f}")
-    print(f"frames a second: median {statistics.median(frames):.1f}, least {min(frames):.1f}")
+    for what, values in (("speed", ratios), ("of processor time", own), ("cores", shares), ("frames/s", frames)):
+        print(f"{what}: median {statistics.median(values):.3f}, {min(values):.3f} to {max(values):.3f}")
 
 
 def table(n: int, priority: int) -> None:

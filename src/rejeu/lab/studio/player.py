@@ -218,4 +218,4 @@ def caption(episode: Episode) -> dict[str, Any]:
 def lower_priority() -> None:
     """Lets training go first, where a system has priorities of threads."""
     if sys.platform == "linux":
-        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICE)
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), os.getpriority(os.PRIO_PROCESS, 0) + NICE)
