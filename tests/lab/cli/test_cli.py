@@ -175,7 +175,6 @@ def test_without_the_video_extra_the_run_goes_on_and_says_so(tmp_path, capsys, m
     ("missing", "argv", "extra"),
     [
         ("imageio_ffmpeg", ["train", "Pendulum-v1", "--video-every", "9"], "video"),
-        ("jinja2", ["class", "{models}"], "course"),
         ("highway_env", ["train", "parking-v0"], "parking"),
     ],
 )
