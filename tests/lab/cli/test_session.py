@@ -9,10 +9,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from filelock import FileLock
 
 from rejeu.callbacks.evaluate import Evaluated
 from rejeu.core import xla
-from rejeu.lab.cli import output, session
+from rejeu.lab.cli import main, output, session
 from rejeu.lab.cli.session import TrainingLimits
 from rejeu.lab.reporting import rows, run_list
 from rejeu.logs.evaluation import Evaluation
@@ -81,3 +82,13 @@ def test_status_is_the_mean_of_the_last_hundred_episodes_and_the_time_that_is_le
         101.0,
         pytest.approx(math.nan, nan_ok=True),
     )
+
+
+def test_a_run_in_use_is_not_resumed_and_its_files_stay(tmp_path, capsys):
+    checkpoints = tmp_path / "checkpoints"
+    checkpoints.mkdir()
+    (checkpoints / "lock").touch()
+    with FileLock(checkpoints / "lock"):
+        assert main(["resume", str(tmp_path)]) == 2
+    assert "another process is training in" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["checkpoints"]

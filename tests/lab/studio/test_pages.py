@@ -47,6 +47,19 @@ def test_a_run_that_changes_and_one_that_disappears_are_followed(browser, served
         row.locator("text=its folder is no longer there").wait_for()
 
 
+def check_hints(page):
+    """Checks that the hints of a form keep clear of the fields below, as wide as a phone's and as a desktop's."""
+    page.wait_for_timeout(300)  # the animation of an opened section
+    for width in (400, 1280):
+        page.set_viewport_size({"width": width, "height": 900})
+        boxes = [one.bounding_box() for one in page.locator(".q-field:visible, .q-toggle:visible").all()]
+        hints = [one.bounding_box() for one in page.locator(".q-field__messages:visible").all()]
+        assert len(hints) > 10
+        for hint in hints:
+            below = [box["y"] for box in boxes if box["y"] > hint["y"] and abs(box["x"] - hint["x"]) < 40]
+            assert hint["y"] + hint["height"] <= min(below, default=1e9)
+
+
 @pytest.fixture
 def ended(served):
     """Asks the run that a test has started to end, also if the test has failed."""
@@ -65,6 +78,7 @@ def test_a_run_is_started_from_the_form_watched_stopped_and_resumed(browser, ser
         page.get_by_text("--seed 'x' must be a whole number").wait_for()
         page.get_by_label("seed", exact=True).fill("3")
         page.get_by_text("Output").click()
+        check_hints(page)
         page.get_by_role("switch", name="no report").click()
         page.get_by_role("switch", name="no video").click()
         page.get_by_role("button", name="Start").click()
@@ -79,8 +93,11 @@ def test_a_run_is_started_from_the_form_watched_stopped_and_resumed(browser, ser
         page.locator(".q-badge", has_text="interrupted").wait_for(timeout=60_000)
         steps = run_list.read(served.folder / "mine").steps
         assert 0 < steps < 400_000
-        page.get_by_role("button", name="Resume").click()
+        page.get_by_role("button", name="Resume").dblclick()
+        page.wait_for_selector("button:has-text('Resume'):disabled")
         page.locator(".q-badge", has_text="running").wait_for(timeout=60_000)
         page.get_by_role("button", name="Stop").click()
         page.locator(".q-badge", has_text="interrupted").wait_for(timeout=60_000)
-        assert run_list.read(served.folder / "mine").steps > steps
+        ended = run_list.read(served.folder / "mine")
+        assert ended.steps > steps
+        assert ended.warnings == ()

@@ -17,6 +17,7 @@ from rejeu.agents import Agent
 from rejeu.callbacks import Evaluate, Evaluated
 from rejeu.checkpoints.run_folder import RunFolder
 from rejeu.core import atomic, xla
+from rejeu.core.errors import RunInUseError
 from rejeu.core.interrupt import NAMES
 from rejeu.lab.cli.environment import Environment
 from rejeu.lab.runs.config import DecidedRun
@@ -161,7 +162,8 @@ def noted_in(path: Path) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        note(f"{type(error).__name__}: {error}")
+        if not isinstance(error, RunInUseError):  # the file is that of the run in the other process
+            note(f"{type(error).__name__}: {error}")
         raise
     finally:
         warnings.showwarning = show

@@ -19,6 +19,7 @@ from rejeu.agents import Agent, agent_of_file
 from rejeu.algorithms import config as configs
 from rejeu.checkpoints.run_folder import RunFolder, check_free, create, run_files, step_of
 from rejeu.core import devices
+from rejeu.core.errors import RunInUseError
 from rejeu.core.interrupt import Interrupt
 from rejeu.envs.make import WorkerOptions
 from rejeu.lab.cli import environment as environments, sweep, tune
@@ -27,6 +28,7 @@ from rejeu.lab.cli.output import Stopwatch, echo
 from rejeu.lab.cli.session import Session, TrainingLimits, has_reached_goal, make_evaluation_env
 from rejeu.lab.experiments.folder import is_sweep
 from rejeu.lab.experiments.study import StudyFolder
+from rejeu.lab.reporting.runs import is_locked
 from rejeu.lab.runs import config as configs_of_runs
 from rejeu.lab.runs.config import DecidedRun, Origin, merged, read_folder
 from rejeu.logs.logging import require
@@ -38,6 +40,7 @@ def run_resume(arguments: Resume) -> tuple[int, dict[str, Any]]:
 
     Raises:
         ValueError: for options of a sweep with the folder of a run, or of a run with that of a sweep or a study.
+        RunInUseError: if another process trains there.
     """
     holds_sweep = is_sweep(arguments.run)
     if holds_sweep or StudyFolder(arguments.run).plan.is_file():
@@ -47,6 +50,8 @@ def run_resume(arguments: Resume) -> tuple[int, dict[str, Any]]:
     if arguments.workers is not None:
         raise ValueError(f"{arguments.run} is a single run; --workers is for the folder of a sweep or a study")
     folder = RunFolder(arguments.run)
+    if is_locked(folder.checkpoints / "lock"):  # before the tables are opened, which the other process writes
+        raise RunInUseError(f"another process is training in {folder.path}; wait for it, or stop it")
     return resume(arguments, folder.checkpoints, lambda agent, config: (folder, config), arguments.finish)
 
 

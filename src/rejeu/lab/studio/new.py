@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import re
 import shlex
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -41,7 +42,7 @@ def build(studio: Studio, request: Request) -> None:
     fields: dict[str, Any] = {}
     for topic, listed in lists.items():
         place = ui.element("div") if topic is Topic.FIRST else ui.expansion(topic.capitalize()).classes("w-full")
-        with place.classes("w-full"), ui.element("div").classes("charts"):
+        with place.classes("w-full"), ui.element("div").classes("charts w-full"):
             fields |= {one.field: make_field(one, docs.get(one.field, one.shown.help)) for one in listed}
     fields["env"].value = request.query_params.get("env") or None
     with ui.row().classes("items-center"):
@@ -79,8 +80,17 @@ def make_field(option: Option, about: str) -> Any:
     else:
         made = ui.input(label, validation=lambda text: problem_of(option, text))
     if option.kind is not bool:
-        made.props("dense outlined stack-label bottom-slots").props.update(hint=about)
+        made.props("dense outlined stack-label bottom-slots hide-bottom-space").props.update(hint=in_form(about))
     return made
+
+
+def in_form(about: str) -> str:
+    """Returns the help of an option in the words of the form.
+
+    >>> in_form("With --backend ray: one module; repeat for several.")
+    'With backend ray: one module; several with spaces between them.'
+    """
+    return re.sub(r"--(?=\w)", "", about).replace("repeat for several", "several with spaces between them")
 
 
 def problem_of(option: Option, text: str | None) -> str | None:

@@ -15,6 +15,8 @@ HIDDEN = ".studio"
 """Folder of the logs, beside the run folders."""
 APART: dict[str, Any] = {"creationflags": 0x208} if sys.platform == "win32" else {"start_new_session": True}
 """Options of a process that no signal to this one reaches; on Windows it is detached, and a process group of its own."""
+STARTED: dict[tuple[str, ...], subprocess.Popen[bytes]] = {}
+"""The processes, by their words: what is under way is not started twice."""
 TAIL = 2**16
 """Most bytes of a log that are shown."""
 
@@ -24,13 +26,18 @@ def start(words: Sequence[str], run: Path) -> subprocess.Popen[bytes]:
 
     Raises:
         OSError: if that is impossible.
+        ValueError: if the same command is under way.
     """
+    known = STARTED.get((*words,))
+    if known is not None and known.poll() is None:
+        raise ValueError(f"rejeu {words[0]} is under way for {run.name}; wait until it has ended")
     log = log_of(run)
     log.parent.mkdir(parents=True, exist_ok=True)
     with log.open("ab") as out:
-        return subprocess.Popen(
+        process = STARTED[*words] = subprocess.Popen(
             [sys.executable, "-m", "rejeu", *words], stdin=subprocess.DEVNULL, stdout=out, stderr=out, **APART
         )
+        return process
 
 
 def log_of(run: Path) -> Path:

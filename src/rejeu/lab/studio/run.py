@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from fastapi import Request
 from nicegui import ui
 
 from rejeu.checkpoints.run_folder import RunFolder
+from rejeu.core.records import brief
 from rejeu.lab.experiments.work import HIDDEN
 from rejeu.lab.reporting import run_list
 from rejeu.lab.reporting.report import sections
@@ -150,26 +152,52 @@ def show_actions(page: RunPage, row: Row) -> None:
     folder = RunFolder(page.path)
     is_alone = not (page.path.parent / HIDDEN).is_dir()  # a sweep would continue a run that stops
     if row["state"] == "running" and page.is_ours and is_alone:
-        ui.button("Stop", icon="stop", on_click=lambda: stop(folder)).props("outline dense no-caps padding='2px 10px'")
-    if row["state"] in ("interrupted", "crashed") and page.is_ours:
-        ui.button("Resume", icon="play_arrow", on_click=lambda: resume(page)).props(
+        ui.button("Stop", icon="stop", on_click=lambda event: stop(event.sender, folder)).props(
             "outline dense no-caps padding='2px 10px'"
         )
+    if row["state"] in ("interrupted", "crashed") and page.is_ours:
+        words, text = ["resume", str(page.path)], "The run continues from its newest checkpoint."
+        resume = ui.button(
+            "Resume", icon="play_arrow", on_click=lambda event: command(event.sender, words, page.path, text)
+        )
+        resume.props("outline dense no-caps padding='2px 10px'")
     if page.is_ours:
         branch = ui.button("Branch", icon="call_split", on_click=lambda: open_form(page.studio, page.name, page.path))
         branch.props("outline dense no-caps padding='2px 10px'")
 
 
-def stop(folder: RunFolder) -> None:
+def stop(button: Any, folder: RunFolder) -> None:
     """Asks the run to stop with a checkpoint, as Ctrl-C does."""
-    requests.ask(folder.stop)
-    ui.notify("The run stops after this step, and saves everything.")
+    try:
+        folder.stop.touch()
+    except OSError as error:
+        ui.notify(brief(error), type="negative")
+    else:
+        ui.notify("The run stops after this step, and saves everything.")
+        disable_while(button, folder.stop.exists)
 
 
-def resume(page: RunPage) -> None:
-    """Continues the run in a process of its own."""
-    processes.start(["resume", str(page.path)], page.path)
-    ui.notify("The run continues from its newest checkpoint.")
+def command(button: Any, words: Sequence[str], run: Path, text: str) -> None:
+    """Starts a command about a run in a process of its own, and says so or why not."""
+    try:
+        process = processes.start(words, run)
+    except (OSError, ValueError) as error:
+        ui.notify(brief(error), type="negative")
+    else:
+        ui.notify(text)
+        disable_while(button, lambda: process.poll() is None)
+
+
+def disable_while(button: Any, is_under_way: Callable[[], bool]) -> None:
+    """Disables a button while what it asked for is under way. Other buttons come when the state changes."""
+
+    def look() -> None:
+        if not is_under_way():
+            button.enable()
+            timer.cancel()
+
+    button.disable()
+    timer = ui.timer(EVERY, look)
 
 
 def show_tile(tile: sections.Tile) -> None:
@@ -301,7 +329,9 @@ class Episodes:
         with ui.expansion("Episodes", value=True).classes("w-full"):
             self.title = ui.label().classes("text")
             self.figure = Figure(height="200px", choose=self.choose)
-            self.play = ui.button(f"Play {REPLAYS} episodes", icon="replay", on_click=self.replay)
+            self.play = ui.button(
+                f"Play {REPLAYS} episodes", icon="replay", on_click=lambda event: self.replay(event.sender)
+            )
             self.play.props("outline dense no-caps padding='2px 10px'").set_visibility(False)
             self.table = ui.table(rows=[], columns=EPISODES, row_key="seed", pagination=10).props("flat dense")
             self.table.on("rowClick", lambda event: self.watch(event.args[1]))
@@ -337,8 +367,8 @@ class Episodes:
             self.page.live.choose(BEST, seed)
             ui.notify(f"The best policy acts from the seed {seed}.")
 
-    def replay(self) -> None:
+    def replay(self, button: Any) -> None:
         """Lets the best policy play episodes from known seeds, in a process of its own."""
         path = self.page.path
-        processes.start(["report", str(path), "--replay", str(REPLAYS)], path)
-        ui.notify(f"The best policy plays {REPLAYS} episodes; they are listed here when it has finished.")
+        text = f"The best policy plays {REPLAYS} episodes; they are listed here when it has finished."
+        command(button, ["report", str(path), "--replay", str(REPLAYS)], path, text)

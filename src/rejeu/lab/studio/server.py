@@ -21,7 +21,8 @@ from rejeu.lab.studio.state import Studio
 
 PORTS = 100
 """How many ports are tried."""
-
+RECONNECT = 60.0
+"""Seconds that a page has to connect again with what was typed into it; a computer that trains may be slow to answer."""
 
 PICTURES = {"video.mp4": "video/mp4", "curve.png": "image/png"}
 
@@ -70,7 +71,7 @@ def serve(
         add_files(studio)
         for one in PAGES:
             add(one, studio, links)
-        ui.run_with(server, title="rejeu studio", dark=None, show_welcome_message=False)
+        ui.run_with(server, title="rejeu studio", dark=None, show_welcome_message=False, reconnect_timeout=RECONNECT)
         config = uvicorn.Config(Guard(server, token, own_port), log_level="warning", ws_max_size=2**24, lifespan="on")
         path, query = page
         ready(f"http://{HOST}:{own_port}{path}?{urlencode([*query, ('token', token)])}")
