@@ -109,6 +109,42 @@ def test_a_clone_with_batch_normalization_stays_one_in_training(name: str) -> No
     assert after > before - 1.0
 
 
+def test_normalized_agents_imitate_by_their_own_statistics() -> None:
+    env, shown_to_it = shown("Box")
+    agent = rejeu.PPO("MlpPolicy", env, normalize=True, **SMALL)
+    clone(agent, shown_to_it, 400, learning_rate=1e-2)
+    seen = np.concatenate([episode.observations[:-1] for episode in shown_to_it.episodes])
+    np.testing.assert_allclose(agent.learner.state(agent.run.state).statistics.obs[0].mean, seen.mean(0), atol=1e-5)
+    assert agent.evaluate(20, env=Target(), seed=0).mean_return > -2.0
+
+
+def test_target_networks_follow_a_clone() -> None:
+    env, shown_to_it = shown("Box", 2)
+    agent = rejeu.TD3("MlpPolicy", env, **SMALL)
+    clone(agent, shown_to_it, 3)
+    state = agent.learner.state(agent.run.state)
+    assert eqx.tree_equal(state.actor, state.target_actor)
+
+
+@exhaustive
+@pytest.mark.parametrize(
+    ("name", "normalize"), only_tuples([("SAC", True)], [("SAC", True), ("TD3", False), ("TQC", False)])
+)
+def test_critics_learn_what_was_recorded_while_the_policy_is_kept(name: str, normalize: bool) -> None:
+    """With ``gamma=0`` the value of a recorded action is its reward."""
+    env = Target()
+    mixed = record(Anywhere(env), env, 100, seed=0)
+    agent = getattr(rejeu, name)("MlpPolicy", env, gamma=0.0, learning_rate=3e-3, normalize=normalize, **SMALL)
+    clone(agent, mixed, 3)
+    actor = agent.learner.algorithm.actor(agent.learner.state(agent.run.state))
+    assert learn_offline(agent, mixed, 1500, keep_policy=True).keys() >= {"critic_loss", "actor_loss"}
+    assert eqx.tree_equal(actor, agent.learner.algorithm.actor(agent.learner.state(agent.run.state)))
+    obs = np.concatenate([episode.observations[:-1] for episode in mixed.episodes])
+    actions = np.concatenate([episode.actions for episode in mixed.episodes])
+    rewards = np.concatenate([episode.rewards for episode in mixed.episodes])
+    assert np.corrcoef(agent.q_values(obs, actions), rewards)[0, 1] > 0.9
+
+
 class Corridor(gym.Env):
     """Walk along y = 0. An expert that starts there never shows the way back."""
 
@@ -449,6 +485,35 @@ def test_an_agent_with_masks_is_recorded_with_them() -> None:
     assert np.isfinite(clone(dqn, shown_to_it, 3))
     with pytest.raises(ValueError, match="has no masks"):
         learn_offline(dqn, shown_to_it, 3)
+
+
+def test_demonstrations_are_found_from_another_folder() -> None:
+    assert rejeu.SAC.algorithm.Config(demonstrations="shown").demonstrations == str(Path.cwd() / "shown")
+    with pytest.raises(TypeError, match="must be the folder"):
+        rejeu.SAC.algorithm.Config(demonstrations=shown("Box", 1)[1])
+
+
+def test_dagger_counts_each_step_once_in_the_statistics() -> None:
+    env, recorded = shown("Box", 2)
+    agent = rejeu.PPO("MlpPolicy", env, normalize=True, **SMALL)
+    known = dagger(agent, env.best, env, recorded, rounds=3, steps=10, updates=2)
+    statistics = agent.learner.state(agent.run.state).statistics
+    assert known.n_steps == 40
+    assert statistics.obs[0].n_seen == statistics.returns.n_seen == 40
+    obs = np.concatenate([episode.observations[:-1] for episode in known.episodes])
+    np.testing.assert_allclose(statistics.obs[0].mean, obs.mean(0), atol=1e-5)
+
+
+def test_demonstrations_have_no_infos_of_the_training_environment() -> None:
+    env = Reach()
+    known = record(Anywhere(env), env, 1, seed=0)
+    settings = {"copy_info_dict": True}
+    agent = rejeu.SAC(
+        "MultiInputPolicy", env, replay_buffer_class="HerReplayBuffer", replay_buffer_kwargs=settings, **SMALL
+    )
+    agent.learn(3)
+    infos = agent.replay_of(known, agent.run.env).infos
+    assert [info for info in infos if info] == []
 
 
 def test_an_agent_without_an_environment_does_not_learn_offline(tmp_path: Path) -> None:

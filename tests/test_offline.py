@@ -20,7 +20,7 @@ from rejeu.demonstrations import Demonstrations, keeping_policy, learn_offline, 
 from rejeu.training.learner import Learner, Readings
 from tests.every_agent import KINDS, Kind
 from tests.sharing import shared_learners
-from tests.test_demonstrations import SMALL, Anywhere, Target, by_hand
+from tests.test_demonstrations import SMALL, Anywhere, Target, by_hand, shown
 from tests.tiers import exhaustive
 
 pytestmark = pytest.mark.usefixtures("learners_are_shared")
@@ -61,6 +61,18 @@ def test_a_setting_that_depends_on_the_data_is_named_where_it_was_left_to_its_de
     config = rejeu.AGENTS[name].algorithm.Config
     assert field in config().doubts(1)
     assert config(**{field: 0.1}).doubts(1) == ""
+
+
+def test_the_target_network_of_q_learning_follows_the_updates() -> None:
+    env, known = shown("Discrete", 2)
+    networks = {}
+    for updates in (100, 200):
+        agent = rejeu.DQN("MlpPolicy", env, target_update_interval=100, batch_size=8, **SMALL)
+        learn_offline(agent, known, updates)
+        state = agent.learner.state(agent.run.state)
+        networks[updates] = state.network, state.target_network
+    assert eqx.tree_equal(networks[200][1], networks[100][0])
+    assert not eqx.tree_equal(*networks[200])
 
 
 def clocks_of(agent: rejeu.DQN) -> list[tuple[Any, Any]]:

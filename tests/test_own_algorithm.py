@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 
 import rejeu
-from rejeu.agents import presets
+from rejeu.agents import modules_of, presets
 from rejeu.algorithms.config import OffPolicyConfig, to_json
 from rejeu.callbacks import Checkpoint
-from rejeu.core.algorithm import Transition
+from rejeu.core.algorithm import TD_ERROR, Transition
 from rejeu.core.errors import CheckpointError
 from rejeu.lab.experiments.folder import NOTHING, Plan, open_folder
 from rejeu.lab.experiments.plan import PlanError, read_plan
@@ -158,6 +158,12 @@ def test_plans_and_sweeps_import_no_installed_algorithm_that_they_name(site, tmp
     del sys.modules["awac"]
 
 
+def test_a_preset_is_registered_with_the_algorithm(awac):
+    assert presets.find("Pendulum-v1", "AWAC").hyperparameters["beta"] == 2.0
+    assert "beta: Temperature of the advantage weights." in awac.AWAC.__doc__
+    assert presets.find("Pendulum-v1").algorithm != "AWAC"  # rejeu's own stays the first
+
+
 def test_a_later_registration_replaces_the_earlier_one_but_not_rejeus_own(awac):
     class Other(rejeu.OffPolicyAgent):
         algorithm = awac.AWAC.algorithm
@@ -184,6 +190,17 @@ def test_an_agent_without_a_named_configuration_is_refused(algorithm):
         rejeu.register(Nameless)
 
 
+def test_other_processes_are_told_what_to_import(awac):
+    assert modules_of("SAC", ()) == modules_of("sac", ()) == ()
+    assert modules_of("AWAC", ()) == ("awac",)  # its entry point
+    assert modules_of("AWAC", ["my_awac.py"]) == ("my_awac.py",)
+    with pytest.raises(ValueError, match="no algorithm is called 'Own'"):
+        modules_of("Own", ())
+    rejeu.AGENTS["Own"] = awac.AWAC
+    with pytest.raises(ValueError, match=r"Own is registered in this program only, .*--import my_algorithm\.py"):
+        modules_of("Own", ())
+
+
 def test_a_report_shows_what_differs_and_the_command_that_repeats_the_run(awac):
     saved = to_json(awac.Config(beta=3.0, gamma=0.9))
     run = RunSummary(
@@ -198,6 +215,42 @@ def test_a_report_shows_what_differs_and_the_command_that_repeats_the_run(awac):
     assert run.changed == {"gamma": (0.9, 0.99), "beta": (3.0, 1.0)}
     words = "--import 'my awac.py' --algo AWAC --seed 1 --set gamma=0.9 beta=3.0"
     assert run.command == f"rejeu train Pendulum-v1 {words}"
+
+
+def with_update(awac, change):
+    """An agent whose updates return what ``change`` makes of the state and the metrics."""
+
+    def make(*arguments):
+        algorithm = awac.make(*arguments)
+        return algorithm._replace(update=lambda *inputs: change(*algorithm.update(*inputs)))
+
+    class Changed(rejeu.OffPolicyAgent):
+        algorithm = SimpleNamespace(Config=awac.Config, make=make)
+
+    return Changed
+
+
+def test_prioritized_replay_without_td_errors_is_refused(awac):
+    kind = with_update(awac, lambda state, metrics: (state, {"critic_loss": metrics["critic_loss"]}))
+    with pytest.raises(ValueError, match=r"prioritized replay needs the absolute TD error .* it returned none"):
+        kind("MlpPolicy", "Pendulum-v1", priorities={}, **SMALL).learn(40)
+    kind = with_update(awac, lambda state, metrics: (state, metrics | {TD_ERROR: jnp.float32(1)}))
+    with pytest.raises(ValueError, match=r"TD_ERROR of shape \(batch,\); it returned \(\)"):
+        kind("MlpPolicy", "Pendulum-v1", priorities={}, **SMALL).learn(40)
+
+
+def test_the_file_works_as_a_notebook_cell():
+    pytest.importorskip("IPython")
+    from IPython.core.interactiveshell import InteractiveShell
+
+    shell = InteractiveShell()
+    try:
+        for _ in range(2):  # a cell is run again after a change
+            shell.run_cell(SOURCE.read_text()).raise_error()
+        agent = shell.user_ns["AWAC"]("MlpPolicy", "Pendulum-v1", **SMALL).learn(30)
+        assert agent.n_updates == 10
+    finally:
+        InteractiveShell.clear_instance()
 
 
 def command(site, folder, *arguments):

@@ -258,34 +258,6 @@ def test_episodes_of_envpool_replayed_in_gymnasium_go_the_same_way(env_id):
             assert str(flags) == str(other_flags), (env_id, t)  # as text, for NaN is unequal to itself
 
 
-@pytest.mark.parametrize("env_id", only({*COMPARED} - {"parking-v0"}, COMPARED))
-def test_episodes_begin_alike(env_id):
-    """Every number of the first observation has the same distribution (Kolmogorov and Smirnov's test, p above 0.001)."""
-    starts = []
-    for vector in both(env_id, 10):
-        seen = [jax.tree.leaves(jax.tree.map(np.array, vector.reset()))]
-        seen += [jax.tree.leaves(jax.tree.map(np.array, vector.reset_done(np.ones(10, bool)))) for _ in range(19)]
-        starts.append(np.concatenate([np.concatenate(obs, axis=1) for obs in seen]))
-    one, two = (np.round(start.astype(np.float64), 5) for start in starts)
-    assert one.shape == two.shape
-    for column in range(one.shape[1]):
-        if np.ptp(one[:, column]) < 1e-4:
-            np.testing.assert_allclose(two[:, column], one[0, column], atol=1e-4)
-        else:
-            assert stats.ks_2samp(one[:, column], two[:, column]).pvalue > 1e-3, column
-
-
-# LunarLander.
-
-
-def anything(vector, obs, rng):
-    return (
-        rng.integers(4, size=vector.n_envs)
-        if vector.action_space.shape == ()
-        else rng.uniform(-1, 1, (vector.n_envs, 2)).astype(np.float32)
-    )
-
-
 def test_an_end_in_the_very_step_of_the_time_limit_is_told_by_gymnasium_only():
     """The one difference in flags: EnvPool says truncated, Gymnasium both. See docs/environments.md."""
     told = []
@@ -317,3 +289,95 @@ def test_a_pendulum_at_its_top_speed_turns_further_in_envpool():
         reached += int((np.abs(speed) > 8.1).sum())
         obs = next_obs
     assert reached > 100
+
+
+@pytest.mark.parametrize("env_id", only({*COMPARED} - {"parking-v0"}, COMPARED))
+def test_episodes_begin_alike(env_id):
+    """Every number of the first observation has the same distribution (Kolmogorov and Smirnov's test, p above 0.001)."""
+    starts = []
+    for vector in both(env_id, 10):
+        seen = [jax.tree.leaves(jax.tree.map(np.array, vector.reset()))]
+        seen += [jax.tree.leaves(jax.tree.map(np.array, vector.reset_done(np.ones(10, bool)))) for _ in range(19)]
+        starts.append(np.concatenate([np.concatenate(obs, axis=1) for obs in seen]))
+    one, two = (np.round(start.astype(np.float64), 5) for start in starts)
+    assert one.shape == two.shape
+    for column in range(one.shape[1]):
+        if np.ptp(one[:, column]) < 1e-4:
+            np.testing.assert_allclose(two[:, column], one[0, column], atol=1e-4)
+        else:
+            assert stats.ks_2samp(one[:, column], two[:, column]).pvalue > 1e-3, column
+
+
+# LunarLander.
+
+
+def shaping(obs):
+    """The potential whose increase is LunarLander's reward (its documentation, "Rewards")."""
+    far, fast = np.hypot(obs[:, 0], obs[:, 1]), np.hypot(obs[:, 2], obs[:, 3])
+    return -100 * (far + fast + np.abs(obs[:, 4])) + 10 * (obs[:, 6] + obs[:, 7])
+
+
+def fuel(action):
+    """0.3 for the main engine's power and 0.03 for a side engine's."""
+    if action.ndim == 1:
+        return 0.3 * (action == 2) + 0.03 * ((action == 1) | (action == 3))
+    main, side = action.astype(np.float64).T
+    return 0.3 * np.where(main > 0, 0.5 + 0.5 * main, 0.0) + 0.03 * np.where(np.abs(side) > 0.5, np.abs(side), 0.0)
+
+
+def anything(vector, obs, rng):
+    return (
+        rng.integers(4, size=vector.n_envs)
+        if vector.action_space.shape == ()
+        else rng.uniform(-1, 1, (vector.n_envs, 2)).astype(np.float32)
+    )
+
+
+def nothing(vector, obs, rng):
+    return np.zeros((vector.n_envs, *vector.action_space.shape), np.float32 if vector.action_space.shape else np.int64)
+
+
+class Walk(NamedTuple):
+    obs: np.ndarray
+    action: np.ndarray
+    next_obs: np.ndarray
+    reward: np.ndarray
+    terminated: np.ndarray
+
+
+def walk(vector, policy, n_steps):
+    """So many steps of all environments."""
+    rng, rows, obs = np.random.default_rng(0), [], np.array(vector.reset(), np.float64)
+    for _ in range(n_steps):
+        action = policy(vector, obs, rng)
+        step = vector.step(action)
+        next_obs = np.array(step.obs, np.float64)
+        rows.append((obs, action, next_obs, np.array(step.reward), np.array(step.terminated)))
+        done = step.terminated | step.truncated
+        obs = np.array(vector.reset_done(done), np.float64) if done.any() else next_obs
+    return Walk(*(np.concatenate(part) for part in zip(*rows, strict=True)))
+
+
+@pytest.mark.parametrize("env_id", LANDERS)
+def test_landers_get_the_documented_reward(env_id):
+    for vector in both(env_id, 8):
+        seen = walk(vector, anything, 500)
+        expected = shaping(seen.next_obs) - shaping(seen.obs) - fuel(seen.action)
+        on = ~seen.terminated
+        np.testing.assert_allclose(seen.reward[on], expected[on], rtol=0, atol=1e-3)
+        assert set(seen.reward[seen.terminated].tolist()) <= {-100.0, 100.0}
+
+
+@pytest.mark.parametrize("env_id", LANDERS)
+def test_landers_fall_alike(env_id):
+    """Without engine the state follows from the state before: fitted on the one side, it holds on the other."""
+    falls = []
+    for vector in both(env_id, 8):
+        seen = walk(vector, nothing, 600)
+        high = (seen.next_obs[:, 1] > 0.6) & ~seen.terminated
+        falls.append((np.c_[seen.obs[high, :6], np.ones(high.sum())], seen.next_obs[high, :6]))
+    (before, after), (other_before, other_after) = falls
+    step, *_ = np.linalg.lstsq(before, after, rcond=None)
+    fitted, held = (np.abs(x @ step - y).mean(axis=0) for x, y in ((before, after), (other_before, other_after)))
+    np.testing.assert_array_less(held, 1.5 * fitted + 1e-6)
+    np.testing.assert_allclose(held, 0.0, atol=1e-3)

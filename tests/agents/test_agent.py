@@ -53,6 +53,11 @@ def test_an_impossible_number_of_steps_is_refused(agent, total):
         agent.learn(total)
 
 
+def test_minutes_end_a_run():
+    agent = small_sac(counters(1), learning_starts=NEVER).learn(minutes=0.2 / 60)
+    assert 1 < agent.num_timesteps < 10**6
+
+
 # Updates.
 
 
@@ -80,6 +85,14 @@ def test_gradient_steps_follow_the_steps_after_learning_starts(n_envs, train_fre
     else:
         assert sum(calls) == expected(steps)
     assert agent.n_updates == sum(calls)
+
+
+def test_learning_that_starts_within_a_step_of_many_environments_counts_only_what_is_beyond():
+    """With 8 environments and learning_starts 4, 4 of the first 8 steps are beyond: one update each."""
+    agent = small_sac(counters(8), learning_starts=4, batch_size=2)
+    calls = count_updates(agent)
+    agent.learn(8)
+    assert sum(calls) == 4
 
 
 @pytest.mark.parametrize(("gradient_steps", "updates"), [(-1, 20), (3, 6)])
@@ -116,6 +129,13 @@ def test_training_actions_respect_asymmetrical_bounds_and_reach_both_ends():
     assert (random.min(axis=0) < [2.2, -0.97]).all()
     assert (random.max(axis=0) > [5.8, -0.53]).all()
     assert actions.dtype == np.float32
+
+
+def test_what_is_stored_is_the_action_before_scaling():
+    env = Counter((5,), low=[2.0], high=[6.0])
+    agent = small_sac(env, learning_starts=NEVER).learn(5)
+    stored = agent.replay_buffer.ring.action[:5, 0]
+    np.testing.assert_allclose(np.stack(env.actions)[:, 0], 4.0 + 2.0 * stored, rtol=1e-6)
 
 
 def test_the_first_actions_are_random_and_later_ones_the_policys():
@@ -158,6 +178,29 @@ def test_stored_transitions_are_consecutive_moments_of_one_episode(n_envs):
 # Episodes.
 
 
+def test_episodes_are_recorded_with_return_and_length():
+    agent = small_sac(counters(2, (3, 5)), learning_starts=NEVER).learn(32)
+    assert agent.history["length"].tolist() == [3, 3, 5, 5, 3, 3, 5, 5]
+    assert agent.history["return"].tolist() == [3, 3, 510, 510, 603, 603, 1510, 1510]
+    assert agent.history["env"].tolist() == [0, 1] * 4
+    assert agent.history["step"].tolist() == [6, 6, 16, 16, 22, 22, 32, 32]
+
+
+def test_the_window_of_statistics_keeps_the_last_episodes():
+    agent = small_sac(counters(1, (2,)), learning_starts=NEVER, stats_window_size=3).learn(20)
+    assert [(e["r"], e["l"]) for e in agent.ep_info_buffer] == [(100 * 2 * k + 1, 2) for k in (7, 8, 9)]
+    assert agent.ep_info_buffer.maxlen == 3
+    assert agent.statistics()["rollout/ep_rew_mean"] == pytest.approx(1601.0)
+    assert agent.statistics()["rollout/ep_len_mean"] == 2.0
+    assert "rollout/success_rate" not in agent.statistics()
+    reaching = small_sac(Reach()).learn(40)
+    assert len(reaching.ep_success_buffer) == 4
+    row = reaching.statistics()
+    assert row["rollout/success_rate"] == np.mean(reaching.ep_success_buffer)
+    assert {"train/critic_loss", "train/actor_loss", "train/ent_coef", "train/n_updates"} <= set(row)
+    assert all(isinstance(value, int | float) for value in row.values())
+
+
 @pytest.mark.parametrize("window", [1, 200])
 def test_best_weights_are_kept_from_the_20th_episode_on_whatever_the_window_of_statistics(window):
     """Returns grow with the episode, so the last 20 are always the best so far: at the 25th, those of episodes 5 to 24."""
@@ -166,6 +209,29 @@ def test_best_weights_are_kept_from_the_20th_episode_on_whatever_the_window_of_s
     agent.learn(2 * 6)
     assert agent.best.score == pytest.approx(np.mean([2 * 100 * k + 1 for k in range(5, 25)]))
     assert (agent.best.by, agent.best.step) == ("training", 50)
+
+
+def test_with_a_window_of_one_the_weights_of_the_best_single_episode_are_kept():
+    agent = small_sac("rejeu/Ball-v0", learning_starts=8, best_window=1)
+    kept = []
+    agent.learn(300, lambda agent, turn: kept.append(agent.best.step) if turn.episodes else None)
+    records = agent.history.records()
+    assert 1 < len(records) < len(agent.history)
+    assert sorted({*kept}) == [episode.step for episode in records]
+    assert agent.best.score == agent.history.best_return == records[-1].episode_return
+
+
+def test_of_episodes_that_end_together_the_best_counts():
+    """The first environment returns twice what the second does, and is booked before it."""
+
+    class Twice(gym.RewardWrapper):
+        def reward(self, reward):
+            return 2 * reward
+
+    agent = small_sac(InProcess([Twice(Counter((2,))), Counter((2,))], seed=0), learning_starts=NEVER, best_window=1)
+    agent.learn(4)
+    assert agent.history["return"].tolist() == [2.0, 1.0]
+    assert agent.best.score == 2.0
 
 
 def test_the_best_return_stands_in_every_row_and_records_can_be_printed(capsys):
@@ -246,6 +312,14 @@ def test_deterministic_predictions_repeat_and_others_vary(agent):
 def test_an_observation_of_another_shape_is_refused(agent, obs, words):
     with pytest.raises(ValueError, match=words):
         agent.predict(obs)
+
+
+def test_an_observation_without_a_key_is_refused():
+    agent = small_sac(Reach())
+    with pytest.raises(ValueError, match="observation has the structure"):
+        agent.predict({"observation": np.zeros(1), "achieved_goal": np.zeros(1)})
+    with pytest.raises(ValueError, match=r"observation of 'desired_goal' has shape \(2,\)"):
+        agent.predict({"observation": np.zeros(1), "achieved_goal": np.zeros(1), "desired_goal": np.zeros(2)})
 
 
 # Parameters.
@@ -416,3 +490,12 @@ def test_a_loaded_agent_evaluates_where_it_was_trained(tmp_path):
 )
 def test_a_file_names_no_environment_that_is_imported(said):
     assert model_files.trained_on({"made_from": said}) is None
+
+
+def test_an_agent_of_an_environment_that_was_given_has_none_after_loading(tmp_path):
+    path = small_sac(gym.make("Pendulum-v1")).save(tmp_path / "agent")
+    with pytest.raises(ValueError, match="has no environment; give one"):
+        rejeu.load(path).evaluate(1)
+    (empty := tmp_path / "empty").mkdir()
+    with pytest.raises(FileNotFoundError, match="is a folder without a model"):
+        rejeu.load(empty)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gymnasium as gym
 import jax
 import numpy as np
 import pytest
@@ -60,3 +61,30 @@ def test_what_does_not_fit_changes_nothing(agent):
         agent.gamma = 2.0
     assert agent.config == config
     assert jax.tree.leaves(agent.learner.shapes) == shapes
+
+
+def test_a_class_of_ones_own_may_have_further_attributes():
+    class Mine(rejeu.A2C):
+        pass
+
+    agent = Mine("MlpPolicy", "CartPole-v1", **SMALL)
+    agent.calls = 1
+    agent.gamma = 0.5
+    assert (agent.calls, agent.config.gamma) == (1, 0.5)
+
+
+def test_the_name_of_a_method_of_masks_takes_the_environment_or_nothing():
+    """sb3-contrib calls the method with the environment."""
+    from rejeu.sb3_contrib.common.wrappers import ActionMasker
+
+    class Choice(gym.Env):
+        observation_space, action_space = gym.spaces.Discrete(2), gym.spaces.Discrete(2)
+
+        def given(self, env):
+            return [env is self, False]
+
+        def own(self):
+            return [True, False]
+
+    for name in ("given", "own"):
+        assert ActionMasker(Choice(), name).action_masks().tolist() == [True, False]

@@ -8,14 +8,20 @@ import pytest
 
 import rejeu
 from rejeu.envs.make import InProcess
-from tests.environments import Counter
+from tests.environments import Counter, Reach
 from tests.helpers import assert_same_parameters, small_sac
 
 pytestmark = pytest.mark.usefixtures("learners_are_shared")
 
+HINDSIGHT = {"replay_buffer_class": rejeu.HerReplayBuffer}
+
 
 def counting(n_envs, **settings):
     return small_sac(InProcess([Counter((5, 3)) for _ in range(n_envs)], seed=0), **settings)
+
+
+def reaching(n_envs, **settings):
+    return small_sac(InProcess([Reach() for _ in range(n_envs)], seed=0), **HINDSIGHT, **settings)
 
 
 def assert_same_run(one, two):
@@ -31,6 +37,15 @@ def assert_same_run(one, two):
     assert (one.n_updates, one.run.step) == (two.n_updates, two.run.step)
 
 
+def test_two_runs_with_hindsight_are_the_same_to_the_last_bit_and_so_is_one_in_parts():
+    one, two, parts = (reaching(2) for _ in range(3))
+    for part in (14, 26):
+        parts.learn(part, reset_num_timesteps=False)
+    assert one.learn(40).n_updates == 32
+    assert_same_run(one, two.learn(40))
+    assert_same_run(one, parts)
+
+
 def test_learning_in_parts_is_learning_at_once_with_delayed_updates_and_noise():
     settings = {
         "train_freq": (1, "episode"),
@@ -42,6 +57,23 @@ def test_learning_in_parts_is_learning_at_once_with_delayed_updates_and_noise():
         pieces.learn(part, reset_num_timesteps=False)
     assert whole.n_updates > 20
     assert_same_run(whole, pieces)
+
+
+def test_evaluating_in_other_environments_does_not_change_training():
+    one, two = counting(1), counting(1)
+    one.learn(20)
+    two.learn(10)
+    two.evaluate(2, env=Counter((4,)))
+    two.learn(10, reset_num_timesteps=False)
+    assert_same_run(one, two)
+
+
+def test_a_seed_decides_the_environments_too():
+    """Given by a function, an environment gets its seed from the agent alone."""
+    firsts = [
+        small_sac(lambda: Counter((5,)), seed=seed, learning_starts=99).learn(1).run.obs[0, 2] for seed in (4, 4, 5)
+    ]
+    assert firsts[0] == firsts[1] != firsts[2]
 
 
 @pytest.mark.parametrize("backend", ["gymnasium", "envpool"])

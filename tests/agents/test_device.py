@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import rejeu
+from rejeu.agents import device
 from rejeu.callbacks import TrainingCallback
 from rejeu.lab.cli import main
 from rejeu.sb3.common.callbacks import BaseCallback
@@ -52,6 +53,15 @@ def test_a_callback_that_looks_at_single_steps_is_told_what_to_do() -> None:
     assert agent.learn(30, rewards_of).num_timesteps == 30
 
 
+def test_other_errors_of_callbacks_are_left_alone() -> None:
+    def fails(agent: Any, progress: Any) -> None:
+        raise TypeError("no such option")
+
+    with pytest.raises(TypeError) as raised:
+        make(rejeu.DQN, "jax/CartPole-v1").learn(30, fails)
+    assert not hasattr(raised.value, "__notes__")
+
+
 @pytest.mark.parametrize("callback", only([Rewards3], [Rewards, Rewards3]))
 def test_callbacks_of_every_step_train_on_the_host_and_are_named(callback: Any) -> None:
     agent = make(rejeu.DQN, "jax/CartPole-v1")
@@ -63,9 +73,44 @@ def test_callbacks_of_every_step_train_on_the_host_and_are_named(callback: Any) 
         agent.learn(30, callback())
 
 
+def test_an_agent_that_must_train_on_the_device_says_why_it_cannot() -> None:
+    agent = rejeu.DQN("MlpPolicy", rejeu.make_vector("CartPole-v1"), policy_kwargs={"net_arch": [8]})
+    agent.on_device = True
+    with pytest.raises(ValueError, match="the backend of CartPole-v1 is 'gymnasium', not 'jax'"):
+        agent.learn(30)
+
+
 def test_more_steps_than_32_bits_count_are_refused() -> None:
     with pytest.raises(ValueError, match=r"would end at step 5,000,000,000, and steps are counted up to 4,294,967,294"):
         make(rejeu.DQN, "jax/CartPole-v1").learn(5_000_000_000)
+
+
+def test_the_progress_bar_counts_the_steps_of_a_first_chunk_of_many_turns(capsys: Any) -> None:
+    agent = make(rejeu.DQN, "jax/CartPole-v1")
+    agent.learn(30, progress_bar=True)
+    assert "100%  30/30 steps" in capsys.readouterr().out
+    agent.learn(31, progress_bar=True)
+    assert "100%  31/31 steps" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "limit",
+    only(
+        [{"episodes": 5}],
+        [{"total_timesteps": n} for n in (150, 200, 250)] + [{"episodes": 5}],
+    ),
+    ids=str,
+)
+def test_all_episodes_are_judged_when_learn_reaches_its_limit(limit: Any, monkeypatch: Any) -> None:
+    """Before that, once in 100 turns."""
+    monkeypatch.setattr(device, "MAX_TURNS", 100)
+    monkeypatch.setattr("rejeu.training.compiled.MAX_TURNS", 100)
+    agent = make(rejeu.DQN, "jax/CartPole-v1", learning_starts=10_000, best_window=3).learn(**limit)
+    assert agent.stops is not None
+    means = np.convolve(agent.history["return"], np.full(3, 1 / 3), "valid")
+    assert agent.best is not None
+    assert agent.best.score == pytest.approx(means.max())
+    assert agent.best.step in (100, 200, agent.num_timesteps)
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,8 @@ import pytest
 
 import rejeu
 from rejeu.callbacks import Checkpoint
-from rejeu.envs.make import make_vector
+from rejeu.envs.make import InProcess, make_vector
+from rejeu.sb3.common.callbacks import BaseCallback, EvalCallback
 from rejeu.sb3.common.evaluation import evaluate_policy
 from rejeu.sb3.common.vec_env import DummyVecEnv
 from tests.environments import Counter
@@ -66,6 +67,18 @@ every_way = pytest.mark.parametrize("how", OWN)
 
 
 @every_way
+def test_an_off_policy_agent_may_be_evaluated_in_its_own_environment_while_it_learns(how):
+    env = Counter((5,))
+    agent = small_sac(env, learning_starts=NEVER).learn(23, every(7, lambda agent: OWN[how](agent, env)))
+    assert agent.num_timesteps == agent.replay_buffer.size() == 23
+    batch = agent.replay_buffer.sample(np.random.default_rng(0), (300,))
+    np.testing.assert_array_equal(batch.next_obs[:, 1], batch.obs[:, 1] + 1)
+    np.testing.assert_array_equal(batch.next_obs[:, 0], batch.obs[:, 0])
+    # Turns 7, 14 and 21 cut episodes off two steps after their begin; each evaluation played two.
+    assert [e.length for e in agent.history.episodes] == [5, 5, 5]
+
+
+@every_way
 def test_an_on_policy_agent_may_be_evaluated_in_its_own_environment_while_it_learns(how):
     env, seen = Counter((5,)), []
     agent = rejeu.A2C("MlpPolicy", env, n_steps=12, policy_kwargs={"net_arch": [4]}, seed=0)
@@ -111,6 +124,18 @@ def test_every_loop_goes_on_after_an_evaluation_in_a_callback(name):
     assert agent.history["length"].sum() <= 41
 
 
+def test_callbacks_after_one_that_evaluated_see_observations_of_new_episodes():
+    class Look(BaseCallback):
+        def _on_step(self):
+            seen.append(self.locals["new_obs"][0].tolist())
+            return True
+
+    seen: list[list[float]] = []
+    evaluate = every(3, lambda agent: agent.evaluate(1))
+    small_sac(Counter((5,)), learning_starts=NEVER).learn(4, [evaluate, Look()])
+    assert [obs[:2] for obs in seen] == [[0, 1], [0, 2], [2, 0], [2, 1]]
+
+
 @pytest.mark.parametrize(
     ("kind", "env"),
     crossed(["SAC", "PPO"], [lambda: gym.make("Pendulum-v1"), lambda: make_vector("Pendulum-v1", 1, "envpool")]),
@@ -141,6 +166,13 @@ def test_an_environment_that_breaks_in_an_evaluation_ends_training_with_its_own_
         small_sac(Breaking((5,)), learning_starts=NEVER).learn(9, every(3, lambda agent: agent.evaluate(1)))
 
 
+def test_a_replay_buffer_may_be_loaded_while_the_agent_learns(tmp_path):
+    path = small_sac(Counter((5,)), learning_starts=NEVER).learn(12).save_replay_buffer(tmp_path / "replay")
+    agent = small_sac(Counter((5,)))
+    agent.learn(10, every(6, lambda agent: agent.load_replay_buffer(path)))
+    assert agent.replay_buffer.size() == 12 + 4
+
+
 def test_other_environments_are_refused_while_the_agent_learns_and_the_fix_is_said():
     agent = small_sac(Counter((5,)), learning_starts=NEVER)
     with pytest.raises(RuntimeError, match=r"stop training first .* reset_num_timesteps=False"):
@@ -152,7 +184,85 @@ def test_other_environments_are_refused_while_the_agent_learns_and_the_fix_is_sa
 # Between two calls of learn.
 
 
+@every_way
+def test_training_goes_on_in_new_episodes_after_its_environment_was_played_in(how):
+    env = Counter((5,))
+    agent = small_sac(env, learning_starts=NEVER).learn(7)
+    OWN[how](agent, env)
+    agent.learn(6, reset_num_timesteps=False)
+    assert [e.length for e in agent.history.episodes] == [5, 5]
+
+
+def test_playing_in_other_environments_leaves_running_episodes_alone():
+    agent = small_sac(Counter((5,)), learning_starts=NEVER).learn(7)
+    agent.evaluate(1, env=Counter((5,)))
+    evaluate_policy(agent, Counter((5,)), 1)
+    agent.learn(6, reset_num_timesteps=False)
+    assert [e.length for e in agent.history.episodes] == [5, 5]
+    assert [e.step for e in agent.history.episodes] == [5, 10]
+
+
 # Action masks.
+
+
+class One(gym.Env):
+    """Allows one of ten actions at a time and counts the others; episodes of 6 steps."""
+
+    observation_space = gym.spaces.Box(0.0, 1.0, (1,), np.float32)
+    action_space = gym.spaces.Discrete(10)
+
+    def __init__(self):
+        self.taken = self.illegal = 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.time = 0
+        return self._see()
+
+    def step(self, action):
+        self.taken += 1
+        legal = action == self.allowed
+        self.illegal += not legal
+        self.time += 1
+        obs, info = self._see()
+        return obs, float(legal), False, self.time == 6, info
+
+    def _see(self):
+        self.allowed = int(self.np_random.integers(10))
+        return np.zeros(1, np.float32), {"action_mask": np.arange(10) == self.allowed}
+
+
+@pytest.fixture(scope="module")
+def masked():
+    """An agent that takes masks; tests may train it."""
+    return rejeu.MaskablePPO("MlpPolicy", One(), n_steps=12, batch_size=12, policy_kwargs={"net_arch": [4]}, seed=0)
+
+
+@pytest.mark.parametrize("deterministic", [True, False])
+@pytest.mark.parametrize(
+    "wrap", [lambda env: env, lambda env: DummyVecEnv([lambda: env]), lambda env: InProcess([env])]
+)
+def test_evaluate_policy_keeps_to_the_masks(masked, wrap, deterministic):
+    env = One()
+    mean, _ = evaluate_policy(masked, wrap(env), 3, deterministic)
+    assert (env.taken, env.illegal) == (18, 0)
+    assert mean == 6.0
+
+
+def test_eval_callback_keeps_to_the_masks(masked):
+    env = One()
+    from rejeu.sb3.common.vec_env import VecMonitor
+
+    callback = EvalCallback(VecMonitor(DummyVecEnv([lambda: env])), eval_freq=12, n_eval_episodes=3, verbose=0)
+    masked.learn(24, callback=callback)
+    assert (env.taken, env.illegal) == (36, 0)
+    assert callback.best_mean_reward == 6.0
+
+
+def test_a_masked_agent_may_be_evaluated_in_its_own_environment_while_it_learns(masked):
+    env = masked.env.inner.envs[0].env
+    masked.learn(24, every(7, lambda agent: (agent.evaluate(1, env=env), evaluate_policy(agent, env, 1))))
+    assert env.illegal == 0
 
 
 def test_training_does_not_go_on_from_the_seed_of_an_evaluation():

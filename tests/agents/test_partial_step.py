@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
@@ -162,6 +163,46 @@ def test_success_is_that_of_the_environments_stepped(mode):
         if not active.any():
             obs, active = vector.reset_done(np.ones(2, bool)), np.ones(2, bool)
     assert set(outcomes) == {True, False}
+
+
+def test_a_vector_that_overwrites_its_observations_keeps_those_left_out():
+    vector = GymnasiumVector(SyncVectorEnv(counters(), copy=False, autoreset_mode=AutoresetMode.DISABLED), seed=7)
+    vector.reset()
+    vector.step(no_action(vector))
+    step = vector.step(no_action(vector), np.array([True, False, True]))
+    np.testing.assert_array_equal(step.obs[:, 1], [2, 1, 2])
+
+
+class Ticking(gym.vector.VectorEnv):
+    """Two environments of three steps which reset themselves within the step, and know no masked reset."""
+
+    metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
+    num_envs = 2
+    single_observation_space = gym.spaces.Box(0, 9, (1,), np.float32)
+    single_action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        assert options is None
+        self.time = np.zeros((2, 1), np.float32)
+        return self.time.copy(), {}
+
+    def step(self, action):
+        self.time += 1
+        over = self.time[:, 0] == 3
+        info = {"final_obs": list(self.time.copy())}
+        self.time[over] = 0
+        return self.time.copy(), np.ones(2), np.zeros(2, bool), over, info
+
+
+def test_where_a_vector_resets_itself_those_left_out_begin_anew_only_together():
+    vector = make_vector(Ticking())
+    vector.reset()
+    one = np.array([True, False])
+    np.testing.assert_array_equal(vector.step(no_action(vector), one).obs[:, 0], [1, 0])
+    with pytest.raises(ValueError, match=r"Ticking resets by itself .* reset all, or make it with autoreset_mode"):
+        vector.reset_done(~one)
+    np.testing.assert_array_equal(vector.reset_done(np.ones(2, bool))[:, 0], [0, 0])
+    np.testing.assert_array_equal(vector.step(no_action(vector)).obs[:, 0], [1, 1])
 
 
 @pytest.mark.parametrize(

@@ -3,20 +3,27 @@
 from __future__ import annotations
 
 import gc
+import time
 import tracemalloc
 from types import SimpleNamespace
 
 import gymnasium as gym
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import rejeu
 from rejeu.agents import training
-from rejeu.core import checkpoint
+from rejeu.core import algorithm as core, checkpoint, spaces
 from rejeu.envs.make import InProcess
-from tests.environments import Counter
+from rejeu.logs.logging import Console, CsvFile
+from rejeu.replay.ring import Ring
+from rejeu.replay.uniform import ReplayBuffer
+from tests.algorithms.probes.environments import Probe
+from tests.environments import Counter, Sampled
+from tests.every_agent import env_of, every_kind
 from tests.helpers import small_sac
 from tests.tiers import exhaustive
 
@@ -120,8 +127,84 @@ def test_wrappers_change_final_observations_like_all_others(make):
 
 # Targets.
 
+PICTURE = gym.spaces.Box(0, 255, (8, 8, 1), np.uint8)
+
+
+def parameter_names(kind, observation_space):
+    """The names of everything in a state, by the part they belong to: ``{"critics": {...}, "target_critics": {...}}``."""
+    module = kind.agent.algorithm
+    config = module.Config(policy_kwargs={"net_arch": [4]})
+    init = module.make(config, observation_space, env_of(kind).action_space).init
+    found = {}
+    for name in core.names(jax.eval_shape(init, jax.ShapeDtypeStruct((2,), jnp.uint32))):
+        part, _, rest = name.partition(".")
+        found.setdefault(part, set()).add(rest)
+    return found
+
+
+@every_kind
+def test_networks_and_targets_encode_images_each_by_themselves(kind):
+    names = parameter_names(kind, PICTURE)
+    parts = {part for part in names if part.removeprefix("target_") in ("actor", "critic", "critics", "network")}
+    assert len(parts) > 1
+    for part in parts:
+        assert names[part] == names[part.removeprefix("target_")]
+        assert any("encoder.images" in name for name in names[part]), part
+
+
+@every_kind
+def test_optimizers_hold_the_networks_that_learn_and_no_targets(kind):
+    names = parameter_names(kind, Probe.observation_space)
+    optimizers = {part for part in names if part.endswith("optimizer")}
+    learning = {part for part in ("actor", "critic", "critics", "value", "network", "log_alpha") if part in names}
+    assert len(optimizers) == len(learning)
+    for part in learning:
+        optimizer = {"log_alpha": "alpha_optimizer", "network": "optimizer"}.get(part, f"{part}_optimizer")
+        moments = {f"{moment}.{name}".rstrip(".") for moment in ("mu", "nu") for name in names[part]}
+        assert names[optimizer] == moments | {"count"}
+
 
 # Dtypes.
+
+
+def test_every_part_of_a_dict_observation_keeps_its_dtype_and_value():
+    """All numbers are such that a detour through float32 or a narrower integer would change them."""
+    space = gym.spaces.Dict(
+        {
+            "pixels": gym.spaces.Box(0, 255, (2, 2, 1), np.uint8),
+            "small": gym.spaces.Box(-(2**15), 2**15 - 1, (1,), np.int16),
+            "large": gym.spaces.Box(-(2**31), 2**31 - 1, (1,), np.int64),
+            "real": gym.spaces.Box(-1.0, 1.0, (1,), np.float32),
+            "choice": gym.spaces.Discrete(2**24 + 3),
+        }
+    )
+    shown = {
+        "pixels": np.uint8([[[255], [254]], [[1], [0]]]),
+        "small": np.int16([-32767]),
+        "large": np.int64([2**24 + 1]),
+        "real": np.float32([1 / 3]),
+        "choice": np.int64(2**24 + 1),
+    }
+
+    class Exhibition(Sampled):
+        def reset(self, *, seed=None, options=None):
+            super().reset()
+            return shown, {}
+
+        def step(self, action):
+            return shown, *super().step(action)[1:]
+
+    vector = InProcess([Exhibition(space), Exhibition(space)])
+    replay = ReplayBuffer(Ring(20, 2, spaces.leaves(space), spaces.structure(space), (1,), np.float32), 0.9)
+    replay.begin(vector.reset())
+    step = vector.step(np.zeros((2, 1), np.float32))
+    replay.add(np.zeros((2, 1), np.float32), step.reward, step.terminated, step.obs)
+    batch = replay.sample(np.random.default_rng(0), (3,))
+    for obs in (batch.obs, batch.next_obs):
+        kept = {key: obs[key].dtype.name for key in sorted(shown)}
+        assert kept == {"choice": "int32", "large": "int32", "pixels": "uint8", "real": "float32", "small": "int16"}
+        for key, value in shown.items():
+            np.testing.assert_array_equal(obs[key], np.stack([value] * 3), err_msg=key)
 
 
 # Files.
@@ -170,6 +253,28 @@ def test_loading_a_hundred_times_keeps_no_memory(tmp_path):
 
 
 # Logging.
+
+
+def test_long_names_that_begin_alike_are_all_logged(tmp_path, capsys):
+    metrics = {f"train/{'very_' * 8}long_name_{i}": 0.25 * i for i in (1, 2, 3)}
+    table = CsvFile(tmp_path / "metrics.csv")
+    table.write(7, metrics)
+    table.close()
+    header, row = (tmp_path / "metrics.csv").read_text().splitlines()
+    assert header.split(",") == ["step", *metrics]
+    assert row.split(",") == ["7", "0.25", "0.5", "0.75"]
+    Console().write(7, metrics)
+    printed = capsys.readouterr().out
+    assert [line.split()[-1] for line in printed.splitlines() if "very" in line] == ["0.25", "0.5", "0.75"]
+
+
+def test_a_clock_that_stands_still_does_not_end_a_run(monkeypatch):
+    agent = small_sac(Counter((5,)), learning_starts=NEVER)
+    now = time.perf_counter()
+    monkeypatch.setattr(time, "perf_counter", lambda: now)
+    agent.learn(12)
+    assert agent.num_timesteps == 12
+    assert len(agent.history) == 2
 
 
 @pytest.mark.parametrize(

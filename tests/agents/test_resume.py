@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -21,6 +22,7 @@ from rejeu.envs.functional.gym_env import GymnasiumEnv
 from rejeu.envs.make import InProcess
 from rejeu.sb3.common.callbacks import BaseCallback, EvalCallback
 from tests.bit_flipping import BitFlipping
+from tests.environments import Sampled
 from tests.every_agent import KINDS
 from tests.helpers import small_sac
 from tests.jax_environments import Forbidden
@@ -333,6 +335,21 @@ def test_another_process_is_told_that_the_run_is_in_use(tmp_path):
     small_sac(BALL).learn(20, Checkpoint(tmp_path, every=10))
 
 
+def test_a_replay_buffer_that_was_replaced_is_written_whole(tmp_path):
+    agent = small_sac(BALL).learn(30, Checkpoint(tmp_path / "run", every=10))
+    agent.load_replay_buffer(agent.save_replay_buffer(tmp_path / "replay"))
+    agent.learn(20, Checkpoint(tmp_path / "run", every=10), reset_num_timesteps=False)
+    assert_same(rejeu.SAC.resume(tmp_path / "run").replay_buffer.arrays(), agent.replay_buffer.arrays())
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows does not delete what is open")
+def test_a_folder_that_vanishes_is_filled_anew(tmp_path):
+    folder = tmp_path / "run"
+    clear = lambda agent, turn: shutil.rmtree(folder) if turn.step == 25 else None  # noqa: E731
+    agent = small_sac(BALL).learn(40, [clear, Checkpoint(folder, every=10)])
+    assert_same(facts(rejeu.SAC.resume(folder)), facts(agent))
+
+
 def test_an_error_of_the_environment_leaves_a_checkpoint_of_all_that_was_learnt(tmp_path):
     class Breaking(gym.Wrapper):
         n = 0
@@ -491,3 +508,12 @@ def test_a_rollout_that_waits_for_the_next_learn_is_in_the_checkpoint(name, sett
         assert_same(facts(again), facts(cut_off))
         again.learn(50, reset_num_timesteps=False)
     assert_same(facts(again), facts(whole))
+
+
+def test_observations_of_half_precision_are_saved(tmp_path):
+    env = lambda: Sampled(gym.spaces.Box(-1.0, 1.0, (2,), np.float16))  # noqa: E731
+    agent = small_sac(env(), learning_starts=99).learn(20, Checkpoint(tmp_path))
+    assert agent.replay_buffer.ring.obs_leaves[0].dtype == "float16"
+    with pytest.warns(UserWarning, match="at the start of new episodes"):
+        resumed = rejeu.SAC.resume(tmp_path, env())
+    assert_same(resumed.replay_buffer.arrays(), agent.replay_buffer.arrays())

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import gymnasium as gym
 import jax
 import numpy as np
 import pytest
 
 import rejeu
+from rejeu.algorithms.actor_critic.steps import samples
 from rejeu.envs.make import InProcess, make_vector
 from tests.environments import Counter
 from tests.tiers import only
@@ -91,6 +93,23 @@ def test_what_the_padding_holds_changes_nothing(algorithm):
     assert max(moved) > 1e-4
 
 
+@pytest.mark.parametrize("ends", ["terminated", "truncated"])
+def test_with_lambda_1_advantages_are_returns_to_go_minus_the_value(ends):
+    agent = small(counters(ends=ends), n_episodes=2, n_steps=7, gae_lambda=1.0)
+    (state, rollout), *_ = rollouts_of(agent, 23)
+    data = samples(state.network, rollout, 1.0)
+    advantage, value = (np.float64(x).reshape(14, 3) for x in (data.advantage, data.value))
+    for e, lengths in enumerate(((2, 5), (4, 4), (7, 1))):
+        at = 0
+        for length in lengths:
+            last = rollout.next_obs[at + length - 1, e][None]
+            to_go = float(state.network.value(last)[0]) if ends == "truncated" else 0.0
+            for t in reversed(range(at, at + length)):
+                to_go = float(rollout.reward[t, e]) + 0.9 * to_go
+                assert advantage[t, e] == pytest.approx(to_go - value[t, e], rel=1e-4, abs=1e-3)
+            at += length
+
+
 def test_the_steps_asked_for_are_taken_exactly_and_an_incomplete_rollout_waits():
     agent = small(counters(), n_episodes=1, n_steps=7)
     assert rollouts_of(agent, 11) == []  # 2 + 4 + 7 would be 13; all take 2 steps, two take 2 more, and one is left
@@ -98,6 +117,51 @@ def test_the_steps_asked_for_are_taken_exactly_and_an_incomplete_rollout_waits()
     seen = rollouts_of(agent, 2, reset_num_timesteps=False)
     assert [rollout.valid.sum(axis=0).tolist() for _, rollout in seen] == [[2, 4, 7]]
     assert agent.history["length"].tolist() == [2, 4, 7]
+
+
+def test_episodes_that_an_update_cut_off_do_not_run_on_in_the_history():
+    """The environment of long episodes is cut after 4 steps by n_steps, and begun anew: those 4 count for nothing."""
+    env = counters(((3,), (50,), (4, 4)))
+    agent = small(env, n_episodes=1, n_steps=4).learn(11)
+    env.envs[1].lengths = (2,)
+    agent.learn(9)
+    second = [(e.length, e.episode_return) for e in agent.history.episodes if e.env == 1]
+    assert second == [(2, 100.0 + 101.0)]
+
+
+def test_a_run_that_stopped_within_an_episode_goes_on_with_it():
+    env = counters(((6,), (6,)))
+    agent = small(env, n_episodes=1, n_steps=6).learn(4).learn(8)
+    assert [(e.length, e.episode_return) for e in agent.history.episodes] == [(6, 15.0)] * 2
+    assert agent.n_updates == 1
+
+
+def test_a_rollout_of_whole_episodes_begins_again_where_new_episodes_must_begin():
+    env = counters(((6,), (6,)))
+    agent = small(env, n_episodes=1, n_steps=6).learn(4)
+    agent.evaluate(1)  # in the same environments
+    (_, rollout), *_ = rollouts_of(agent, 12)
+    assert rollout.valid.sum(axis=0).tolist() == [6, 6]
+    assert rollout.ended[:, 0].tolist() == [False] * 5 + [True]
+
+
+class Coin(Counter):
+    """Ends with probability 0.2 after each step."""
+
+    def _over(self):
+        if not hasattr(self, "coins") or self.time == 0:
+            self.coins = self.np_random.random(500) < 0.2
+        return bool(self.coins[: self.time].any())
+
+
+def test_long_episodes_are_not_lost():
+    """Lengths are geometric with mean 5 and deviation sqrt(20): stopping at the first to end would shorten them."""
+    env = InProcess([Coin() for _ in range(8)], seed=3)
+    agent = small(env, n_episodes=1, n_steps=200).learn(episodes=400)
+    lengths = [e.length for e in agent.history.episodes]
+    assert np.mean(lengths) == pytest.approx(5.0, abs=4 * np.sqrt(20 / 400))
+    per_env = np.bincount([e.env for e in agent.history.episodes])
+    assert per_env.max() - per_env.min() <= 1
 
 
 def test_normalisation_does_not_see_who_waits():
@@ -126,3 +190,17 @@ def test_it_works_where_episodes_end_by_themselves(backend):
     assert sum(e.length for e in agent.history.episodes) == agent.num_timesteps
     assert agent.state.n_rollouts == 3
     assert all(e.episode_return == e.length for e in agent.history.episodes)
+
+
+def test_a_time_limit_sets_how_long_a_rollout_may_be():
+    env = InProcess([gym.wrappers.TimeLimit(Counter((50,)), 9) for _ in range(2)], seed=0)
+    env.max_episode_steps = 9
+    agent = small(env, n_episodes=2, n_steps=4).learn(36)
+    assert [e.length for e in agent.history.episodes] == [9] * 4
+    assert agent.n_updates == 1
+
+
+def test_without_a_time_limit_n_steps_says_how_long_a_rollout_may_be():
+    """EnvPool's CliffWalking-v0 has none; 8 GiB were once reserved for it."""
+    agent = small(make_vector("CliffWalking-v0", 1, "envpool", seed=0), n_episodes=2, n_steps=8).learn(40)
+    assert agent.run.replay.n_steps == 2 * 8

@@ -19,8 +19,9 @@ from rejeu.core.algorithm import Masked, Transition
 from rejeu.envs.functional.bit_flipping import BitFlipping
 from rejeu.envs.make import InProcess
 from rejeu.sb3 import DQN
-from rejeu.sb3_contrib import MaskableRecurrentPPO
+from rejeu.sb3_contrib import MaskablePPO, MaskableRecurrentPPO
 from tests.helpers import assert_same_parameters
+from tests.jax_environments import Forbidden
 from tests.tiers import exhaustive, only
 from tests.worker_environments import Rules
 
@@ -45,6 +46,7 @@ KINDS = {
         rejeu.RecurrentPPO, **{**ON, "policy_kwargs": {"net_arch": [4], "lstm_hidden_size": 4}}
     ),
 }
+PLACES = [(name, on_device) for name in ("DQN", "QRDQN", "SAC", "RecurrentPPO") for on_device in (True, False)]
 
 
 def vector(all_at_end=True, kind="discrete"):
@@ -62,6 +64,28 @@ def test_what_is_forbidden_is_never_done_and_nothing_becomes_infinite(name):
     assert all(np.isfinite(value).all() for value in agent.get_parameters().values())
     floats = [value for value in agent.get_parameters().values() if value.dtype.kind == "f"]
     assert max(np.abs(value).max() for value in floats) < 1e6
+
+
+class Lenient(Forbidden):
+    """Allows everything."""
+
+    def action_mask(self, state):
+        return jnp.ones(3, bool)
+
+
+@exhaustive
+@pytest.mark.parametrize(("name", "on_device"), PLACES)
+def test_masks_that_allow_everything_change_nothing(name, on_device):
+    agents = []
+    for masks in (True, False):
+        kind = KINDS[name]
+        settings = {**kind.keywords, "action_masks": masks}
+        if name == "SAC":
+            settings["target_entropy"] = 0.3
+        agent = kind.func("MlpPolicy", rejeu.make_vector(Lenient(), 2, seed=0), **settings)
+        agent.on_device = on_device
+        agents.append(agent.learn(100))
+    assert_same_parameters(*agents)
 
 
 def batch_of(rng, n=6, n_actions=4):
@@ -226,6 +250,16 @@ def test_masks_and_hindsight_go_together(on_device):
     np.testing.assert_array_equal(
         batch.reward, (batch.next_obs.obs["achieved_goal"] == batch.next_obs.obs["desired_goal"]).all(axis=1) - 1.0
     )
+
+
+@exhaustive
+def test_maskable_ppo_is_ppo_with_masks():
+    agents = [
+        kind("MlpPolicy", vector(kind="multi"), **{**ON, "batch_size": 16}).learn(64)
+        for kind in (rejeu.PPO, rejeu.MaskablePPO, MaskablePPO)
+    ]
+    assert_same_parameters(agents[0], agents[1])
+    assert_same_parameters(agents[0], agents[2])
 
 
 @exhaustive

@@ -122,6 +122,17 @@ def test_a_learn_that_ends_in_a_part_of_a_step_cuts_no_episode(found):
     assert agent.num_timesteps == 40
 
 
+def test_an_iteration_that_begins_again_begins_with_the_first_direction():
+    """After an evaluation in the environments of training the numbers of episodes start again with the rollout."""
+    env = Lasting(10)
+    agent = rejeu.ARS("MlpPolicy", env, n_delta=2, n_steps=50, seed=0)
+    agent.learn(25)
+    assert agent.run.carry.episode.tolist() == [3]
+    agent.evaluate(episodes=1, env=env)
+    agent.learn(5, reset_num_timesteps=False)
+    assert agent.run.carry.episode.tolist() == [1]
+
+
 def test_forward_and_backward_are_opposite_and_directions_are_standard_normals():
     _, _, state = make(zero_policy=False)
     base = parameters(state.actor.network)
@@ -162,6 +173,11 @@ def test_cart_pole_is_solved():
     settings = {"learning_rate": 0.05, "delta_std": 0.1, "normalize": {"norm_reward": False}}
     agent = rejeu.ARS("MlpPolicy", rejeu.make_vector("CartPole-v1", 4), seed=3, **settings).learn(60_000)
     assert agent.evaluate(episodes=30).mean_return > 450
+
+
+def test_no_more_directions_can_be_the_best_than_there_are():
+    with pytest.raises(ValueError, match="n_top"):
+        ars.Config(n_top=9)
 
 
 def test_environments_that_cannot_share_the_episodes_are_refused_before_the_first_step():

@@ -50,6 +50,22 @@ def test_projection_equals_the_loops_of_the_paper_on_every_platform(n, platform,
     np.testing.assert_allclose(given.sum(axis=-1), 1.0, atol=1e-6)
 
 
+def test_projection_keeps_the_mean_of_values_within_the_atoms():
+    values, probabilities = distributions((5,), 7, 0.5)
+    assert values.min() > V_MIN
+    assert values.max() < V_MAX
+    atoms = make_atoms(V_MIN, V_MAX, N_ATOMS)
+    given = np.float64(project(jnp.asarray(values), jnp.asarray(probabilities), atoms)) @ np.float64(atoms)
+    np.testing.assert_allclose(given, (np.float64(values) * probabilities).sum(axis=-1), atol=1e-5)
+
+
+def test_atoms_project_to_themselves():
+    atoms = make_atoms(V_MIN, V_MAX, N_ATOMS)
+    np.testing.assert_allclose(
+        project(jnp.tile(atoms, (N_ATOMS, 1)), jnp.eye(N_ATOMS), atoms), np.eye(N_ATOMS), atol=1e-6
+    )
+
+
 @pytest.mark.usefixtures("strict_dtypes")
 def test_mean_cross_entropy_and_its_gradient_equal_numpy():
     """The gradient of the cross-entropy by the logits is the predicted minus the target probability."""

@@ -49,6 +49,13 @@ def test_a_config_survives_json(settings):
     assert hash(again) == hash(config)
 
 
+def test_numbers_that_are_whole_may_be_written_as_floats():
+    config = Config(buffer_size=1e6, learning_starts=1e2, train_freq=4.0)
+    assert (config.buffer_size, config.learning_starts, config.train_freq) == (1_000_000, 100, 4)
+    assert Config(train_freq=(4, "step")).train_freq == 4
+    assert all(type(n) is int for n in (config.buffer_size, config.learning_starts, config.train_freq))
+
+
 @pytest.mark.parametrize("given", [rejeu.HerReplayBuffer, "HerReplayBuffer"])
 def test_a_replay_buffer_is_given_by_class_or_name(given):
     assert Config(replay_buffer_class=given).hindsight == HindsightConfig()

@@ -1,6 +1,9 @@
 """Functions of an algorithm that return something else than they must are errors in one line."""
 
 import re
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +12,7 @@ import pytest
 from gymnasium import spaces
 
 import rejeu
+from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.algorithms.contract import checked
 from rejeu.core.algorithm import TD_ERROR, Clock
 
@@ -79,3 +83,22 @@ def test_what_is_right_is_returned_unchanged():
     for space, action in ((BOX, jnp.zeros((4, 2))), (DISCRETE, jnp.zeros(4, int))):
         assert algorithm(space, action).explore(STATE, OBS, KEY, CLOCK) is action
         assert algorithm(space, action).exploit(STATE, {"a": OBS, "b": OBS}) is action
+
+
+@pytest.mark.parametrize("base", [OffPolicyConfig, rejeu.PPO.algorithm.Config])
+def test_a_configuration_that_does_not_check_its_base_is_refused(base):
+    @dataclass(frozen=True, kw_only=True)
+    class Careless(base):
+        name: ClassVar[str] = "Careless"
+
+        def __post_init__(self):
+            pass
+
+    class Agent(rejeu.OffPolicyAgent):
+        algorithm = SimpleNamespace(Config=Careless, make=None)
+
+    message = (
+        r"Careless\.__post_init__ of Careless does not call super\(\)\.__post_init__\(\), .*; begin it with this call"
+    )
+    with pytest.raises(TypeError, match=message):
+        Agent("MlpPolicy", "CartPole-v1")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +12,8 @@ import pytest
 
 from rejeu.algorithms import crossq
 from rejeu.core.algorithm import TD_ERROR
+from rejeu.demonstrations import with_targets
+from rejeu.sb3.policy import BasePolicy
 from tests.algorithms.batches import ACTION_DIM, BOX as ACTION_SPACE, CLOCK, OBS_SPACE, box_batch, noise_of
 from tests.networks.test_batch_renorm import NumpyRenorm, numpy_torso
 from tests.numpy_networks import squashed_sample
@@ -160,6 +163,17 @@ def test_actor_and_temperature_learn_every_policy_delay_th_update_and_the_critic
     assert int(state.n_updates) == 6
 
 
+def test_running_statistics_move_only_with_the_loss_of_their_own_network():
+    """Once per update for the critics and once per actor step for the actor, whoever else passes through them."""
+    update, state = make(policy_delay=3)
+    for seed in range(7):
+        state, _ = update(state, random_batch(seed), CLOCK)
+    for norm in state.critics.torso.norms:
+        np.testing.assert_array_equal(norm.n_batches, [7.0] * N_CRITICS)
+    for norm in state.actor.torso.norms:
+        assert float(norm.n_batches) == 2.0
+
+
 def test_a_skipped_actor_step_is_a_branch_that_is_not_taken():
     """All products of the actor's loss stand inside a cond, so that a scan does not compute them when they are not due."""
     algorithm = crossq.make(crossq.Config(**SMALL), OBS_SPACE, ACTION_SPACE)
@@ -171,3 +185,23 @@ def test_a_skipped_actor_step_is_a_branch_that_is_not_taken():
     assert min(products[0]) == 0
     # forward and backward through the actor (2 layers and a head) and the critics
     assert max(products[0]) >= 2 * (3 + 3)
+
+
+def test_a_policy_acts_on_each_observation_by_itself():
+    _, state = make()
+    algorithm = crossq.make(crossq.Config(**SMALL), OBS_SPACE, ACTION_SPACE)
+    obs = random_batch().obs
+    np.testing.assert_allclose(
+        algorithm.exploit(state.actor, obs)[:1], algorithm.exploit(state.actor, obs[:1]), atol=1e-6
+    )
+
+
+def test_a_state_without_target_critics_stays_without():
+    _, state = make()
+    assert state.target_critics is None
+    assert jax.tree.structure(with_targets(state)) == jax.tree.structure(state)
+    learner, spaces = SimpleNamespace(shapes=state), {"observation_space": OBS_SPACE, "action_space": ACTION_SPACE}
+    policy = BasePolicy.of(SimpleNamespace(learner=learner, **spaces))
+    assert policy.critic is not None
+    with pytest.raises(AttributeError, match="critic_target"):
+        _ = policy.critic_target

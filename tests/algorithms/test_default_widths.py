@@ -11,6 +11,8 @@ import rejeu
 from rejeu.algorithms import config as configs, crossq, ppo
 from rejeu.algorithms.actor_critic.network import ActorCritic
 from rejeu.core.spaces import leaves
+from tests.environments import Sampled
+from tests.tiers import exhaustive
 
 IMAGE = gym.spaces.Box(0, 255, (8, 8, 1), np.uint8)
 VECTOR = gym.spaces.Box(-1.0, 1.0, (3,), np.float32)
@@ -59,6 +61,20 @@ def test_default_widths_are_those_of_stable_baselines3(name):
 @pytest.mark.parametrize(("space", "expected"), [(STACK, []), (DICT, [64, 64]), (TINY, [64, 64])])
 def test_a_stack_of_images_is_an_image_and_a_dict_or_an_image_too_small_to_convolve_is_not(space, expected):
     assert widths_of(*networks_of("DQN", space)) == expected
+
+
+@pytest.mark.parametrize("shape", [{"net_arch": [5]}, {"pi": [7], "qf": [5]}, {"critic_layers": [5]}])
+def test_widths_that_are_asked_for_are_built_on_images_too(shape):
+    assert widths_of(*networks_of("DQN", IMAGE, policy_kwargs=shape)) == [5]
+
+
+@exhaustive
+def test_a_network_without_hidden_layers_learns():
+    agent = rejeu.PPO("CnnPolicy", Sampled(IMAGE, DISCRETE), n_steps=10, batch_size=10, n_epochs=1, seed=0)
+    before = agent.get_parameters()
+    agent.learn(10)
+    after = agent.get_parameters()
+    assert all((before[key] != after[key]).any() for key in before if key.startswith("network."))
 
 
 def test_a_file_says_the_widths_so_that_no_other_default_changes_them():

@@ -169,6 +169,13 @@ def test_epsilon_greedy_draws_each_row_by_itself():
     np.testing.assert_allclose(shares, [0.075, 0.775, 0.075, 0.075], atol=5 * np.sqrt(0.775 * 0.225 / 30_000))
 
 
+def test_linear_epsilon_reaches_its_end_at_the_fraction():
+    """From 0.9 by 0.8 over 0.2 of the run: a quarter of the way at 0.05, the end from 0.2 on."""
+    settings = {"exploration_initial_eps": 0.9, "exploration_final_eps": 0.1, "exploration_fraction": 0.2}
+    epsilon = dqn.Config(**settings).epsilon
+    assert [at(epsilon, p) for p in (0.0, 0.05, 0.2, 1.0)] == pytest.approx([0.9, 0.7, 0.1, 0.1])
+
+
 def test_exponential_epsilon_falls_by_one_factor_an_episode():
     """As the exercise has it: epsilon is multiplied by (end / start)^(1 / n) after each of n episodes."""
     settings = {"exploration_initial_eps": 0.9, "exploration_final_eps": 0.01, "exploration_fraction": 1.0}
@@ -190,6 +197,13 @@ def test_moves_due_counts_the_multiples_in_between(last, step, interval, expecte
     counted = sum(1 for s in range(last + 1, step + 1) if s % interval == 0)
     assert counted == expected
     assert int(dqn.moves_due(jnp.uint32(last), np.uint32(step), interval)) == expected
+
+
+def test_several_soft_moves_at_once_equal_as_many_in_turn():
+    target, online = {"w": jnp.array([0.0, 8.0])}, {"w": jnp.array([8.0, 0.0])}
+    moved = dqn.moved_target(target, online, jnp.int32(3), 0.5)["w"]  # 0 -> 4 -> 6 -> 7
+    np.testing.assert_allclose(moved, [7.0, 1.0])
+    np.testing.assert_array_equal(dqn.moved_target(target, online, jnp.int32(0), 0.5)["w"], target["w"])
 
 
 def test_target_takes_the_network_from_before_the_gradient_step():
@@ -249,6 +263,33 @@ def test_values_of_a_chain_are_learnt(settings):
     )
     state = learn_chain(dqn.make(config, Chain.observation_space, Chain.action_space), 2_000)
     np.testing.assert_allclose(state.network(np.arange(5, dtype=np.int32)), Chain().values(), atol=0.02)
+
+
+class Bandit(gym.Env):
+    """One state, actions 5, 6 and 7; 6 pays 1, the others nothing. Ten steps an episode; refuses any other action."""
+
+    observation_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
+    action_space = gym.spaces.Discrete(3, start=5)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.time = 0
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        assert self.action_space.contains(action), action
+        self.time += 1
+        return np.zeros(1, np.float32), float(action == 6), False, self.time == 10, {}
+
+
+@pytest.mark.parametrize("n_envs", only([3], [1, 3, 8]))
+def test_discrete_actions_of_any_start_are_learnt(n_envs):
+    env = rejeu.make_vector(Bandit, n_envs)
+    settings = {"gamma": 0.0, "learning_rate": 1e-2, "train_freq": 2, "learning_starts": 50}
+    agent = rejeu.DQN("MlpPolicy", env, seed=0, policy_kwargs={"net_arch": [8]}, **settings).learn(400)
+    assert agent.num_timesteps == 400
+    action, _ = agent.predict(np.zeros(1, np.float32), deterministic=True)
+    assert action == 6
 
 
 BIT_FLIPPING = {

@@ -5,16 +5,19 @@ from __future__ import annotations
 import os
 import signal
 
+import gymnasium as gym
 import jax
 import numpy as np
 import pytest
 
 import rejeu
+from rejeu.envs.make import InProcess
 from tests import every_agent, on_policy_agents
 from tests.algorithms.probes.environments import Probe
+from tests.environments import Sampled
 from tests.every_agent import LEARNING, env_of
 from tests.helpers import assert_same_parameters, same_parameters
-from tests.sharing import shared_learners
+from tests.sharing import forget_learners, shared_learners
 from tests.tiers import only
 
 OFF, ON = every_agent.KINDS, on_policy_agents.KINDS
@@ -137,6 +140,14 @@ def test_two_runs_with_one_seed_are_the_same_to_the_last_bit_and_another_seed_di
     assert (one.history["return"] != other.history["return"]).any()
 
 
+@kinds(["SAC"])
+def test_functions_compiled_apart_give_the_same_bits(kind):
+    """Agents of these tests share compiled functions; those of users do not."""
+    shared = start(kind).learn(40)
+    forget_learners()
+    assert_same_parameters(shared, start(kind).learn(40))
+
+
 @pytest.mark.parametrize("n_envs", [1, 3])
 @kinds(["SAC", "PPO, MultiDiscrete"])
 def test_learning_in_parts_is_learning_at_once(kind, n_envs):
@@ -232,6 +243,16 @@ def test_a_loaded_agent_predicts_the_same_bits_and_goes_on_learning_all_its_part
         assert ("log_alpha" in before) == kind.has_temperature
 
 
+@kinds(["SAC", "PPO, MultiDiscrete"])
+def test_another_number_of_environments_may_follow(kind):
+    agent = start(kind).learn(21)
+    agent.set_env(kind.envs(Wanderer, 3))
+    agent.learn(50)
+    assert agent.num_timesteps == 50
+    assert agent.n_updates == int(agent.state.n_updates)
+    assert all(np.isfinite(array).all() for array in agent.get_parameters().values())
+
+
 @kinds(["CrossQ", "PPO, MultiDiscrete"])
 def test_batches_of_one_transition_are_learnt_from(kind):
     """Stable-Baselines3 1.1.0 and 1.6.1 mended them."""
@@ -287,3 +308,72 @@ def test_critics_start_different_and_targets_share_no_memory_with_the_networks(k
     if hasattr(state, "critics"):
         first, second = np.asarray(state.critics.head.weight)
         assert (first != second).any()
+
+
+class Precise(Wanderer):
+    """Has bounds that float32 cannot write, and refuses actions of another dtype or beyond them."""
+
+    action_space = gym.spaces.Box(-0.1, 0.3, (1,), np.float64)
+
+    def step(self, action):
+        assert action.dtype == np.float64
+        assert self.action_space.contains(action), action
+        return super().step(action)
+
+
+BOXES = {
+    name: kind for name, kind in ALL.items() if name.endswith("Box") or (kind in OFF.values() and not kind.discrete)
+}
+
+
+@kinds(["SAC", "PPO, Box"], BOXES)
+def test_float64_actions_reach_the_environment_as_such_within_their_bounds(kind, tmp_path):
+    """Stable-Baselines3 2.1.0 mended float64 Box actions."""
+    agent = kind.small(Precise(), **({"learning_starts": 16} if is_off_policy(kind) else {})).learn(24)
+    assert agent.n_updates > 0
+    with shared_learners():
+        loaded = rejeu.load(agent.save(tmp_path / "model"), env=Precise())
+    for one in (agent, loaded, loaded.learn(6)):
+        action, _ = one.predict(1e6 * OBS)
+        assert action.dtype == np.float64
+        assert all(Precise.action_space.contains(a) for a in action)
+
+
+NESTED = gym.spaces.Dict(
+    {
+        "camera": gym.spaces.Box(0, 255, (4, 4, 3), np.uint8),
+        "place": gym.spaces.Tuple([gym.spaces.Discrete(3, start=5), gym.spaces.Box(-1.0, 1.0, (2,), np.float64)]),
+        "bits": gym.spaces.MultiBinary(4),
+    }
+)
+
+
+@pytest.mark.parametrize("agent", only([rejeu.PPO], [rejeu.PPO, rejeu.A2C, rejeu.PQN]))
+def test_observations_of_any_structure_are_learnt_from_and_saved(agent, tmp_path):
+    envs = InProcess([Sampled(NESTED, gym.spaces.Discrete(2)) for _ in range(2)], seed=0)
+    one = agent("MultiInputPolicy", envs, n_steps=4, policy_kwargs={"net_arch": [4]}, seed=0)
+    before = networks(one)["network"]
+    after = networks(one.learn(19))["network"]
+    assert (before["torso.layers.0.weight"] != after["torso.layers.0.weight"]).any()
+    obs = NESTED.sample()
+    two = rejeu.load(one.save(tmp_path / "model"))
+    assert one.predict(obs, deterministic=True)[0] == two.predict(obs, deterministic=True)[0]
+
+
+class Broken(Probe):
+    """Its fifth reward is no number."""
+
+    length = 9
+
+    def earn(self, action):
+        return float("nan") if self.time == 4 else 1.0
+
+
+@every_on_policy
+def test_a_reward_that_is_no_number_ends_training_before_anything_is_learnt_from_it(kind):
+    agent = kind.small(kind.envs(Broken), n_steps=50)
+    before = agent.get_parameters()
+    with pytest.raises(rejeu.core.errors.BadEnvironmentError, match=r"returned the reward nan .* after 4 steps"):
+        agent.learn(20)
+    for name, array in agent.get_parameters().items():
+        np.testing.assert_array_equal(array, before[name])

@@ -18,6 +18,7 @@ from rejeu.core.normalization import NormalizationConfig, normalizer_of
 from rejeu.networks.layers import RMSNorm
 from rejeu.networks.projected import UnitLinear
 from tests.algorithms.batches import BOX, CLOCK, DISCRETE, OBS_SPACE, box_batch, noise_of
+from tests.environments import Reach
 from tests.networks.test_projected import numpy_torso
 from tests.tiers import exhaustive, only
 
@@ -168,6 +169,17 @@ AGENT = {
     "seed": 0,
     "n_bins": 11,
 }
+
+
+@exhaustive
+@pytest.mark.parametrize("kind", [rejeu.FlashSAC, rejeu.XQC])
+def test_it_learns_from_hindsight_from_priorities_and_on_the_device(kind):
+    her = kind("MultiInputPolicy", Reach(), replay_buffer_class="HerReplayBuffer", **AGENT).learn(60)
+    first = kind("MlpPolicy", "Pendulum-v1", priorities={}, n_steps=3, **AGENT).learn(60)
+    device = kind("MlpPolicy", "jax/Pendulum-v1", **AGENT).learn(60)
+    for agent in (her, first, device):
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(agent.run.state))
+        assert agent.run.n_updates == 40 * (2 if kind is rejeu.XQC else 1)
 
 
 def test_what_it_has_not_is_refused():

@@ -11,10 +11,17 @@ import numpy as np
 import pytest
 
 import rejeu
-from rejeu.algorithms import dqn
+from rejeu.algorithms import dqn, td3
+from rejeu.algorithms.config import RndConfig
+from rejeu.algorithms.rnd import with_rnd
+from rejeu.algorithms.sac import continuous as sac, discrete as discrete_sac
+from rejeu.core.algorithm import Masked, Sequences, Transition
+from rejeu.core.spaces import Leaf, leaves
 from rejeu.envs.make import InProcess
-from tests.algorithms.test_recurrent_ppo import dense, numpy_empty, numpy_step
-from tests.tiers import only
+from rejeu.replay.ring import Ring
+from rejeu.replay.uniform import ReplayBuffer
+from tests.algorithms.test_recurrent_ppo import Recall, dense, numpy_empty, numpy_step
+from tests.tiers import exhaustive, only, only_tuples
 
 SIZE = 4
 OBS_SPACE = gym.spaces.Box(-5.0, 5.0, (3,), np.float32)
@@ -184,6 +191,44 @@ def test_burn_in_brings_no_gradient_and_the_rest_does():
     assert np.any(without.cell.recurrent)
 
 
+def one_step(batch, n_numbers):
+    """The same transitions as sequences of one step without a memory from before."""
+
+    def sequences(obs):
+        n = len(obs)
+        zeros = np.zeros((n, n_numbers), np.float32)
+        return Sequences(obs[:, None], np.zeros((n, 1), bool), np.zeros(n, np.int32), zeros, np.zeros((n, 1), np.int32))
+
+    return batch._replace(obs=sequences(batch.obs), next_obs=sequences(batch.next_obs))
+
+
+def transitions(action_space):
+    rng, n = np.random.default_rng(0), 6
+    obs, next_obs = rng.normal(size=(2, n, 3)).astype(np.float32)
+    is_box = isinstance(action_space, gym.spaces.Box)
+    action = rng.uniform(-1, 1, (n, 2)).astype(np.float32) if is_box else np.int32([0, 1, 2, 0, 1, 2])
+    return Transition(obs, action, rng.normal(size=n).astype(np.float32), next_obs, np.float32([0.0, 1, 1, 0.9, 1, 1]))
+
+
+@pytest.mark.parametrize(
+    ("module", "action_space"),
+    only_tuples(
+        [(td3, BOX)], [(sac, BOX), (td3, BOX), (discrete_sac, gym.spaces.Discrete(3)), (dqn, gym.spaces.Discrete(3))]
+    ),
+)
+def test_sequences_of_one_step_are_transitions_whose_observations_begin_episodes(module, action_space):
+    config = {sac: sac.Config, td3: td3.Config, discrete_sac: sac.Config, dqn: dqn.Config}[module]
+    config = config(policy_kwargs={**MEMORY, "sequence_length": 1, "burn_in": 0})
+    algorithm = with_rnd(module.make(config, OBS_SPACE, action_space), leaves(OBS_SPACE), RndConfig())
+    state, batch = algorithm.init(jax.random.PRNGKey(0)), transitions(action_space)
+    n_numbers = algorithm.explorer.init(algorithm.actor(state), 1).shape[1]
+    clock = rejeu.core.algorithm.Clock(np.uint32(4), np.uint32(0), np.float32(0.0))
+    plain, metrics = algorithm.update(state, batch, clock)
+    unrolled, same_metrics = algorithm.update(state, one_step(batch, n_numbers), clock)
+    for one, other in zip(jax.tree.leaves((plain, metrics)), jax.tree.leaves((unrolled, same_metrics)), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-6)
+
+
 def test_the_targets_of_double_dqn_with_memory_are_those_of_numpy():
     """Of an update after the weights have changed: burn-in with the new ones, from the memory that the old ones left."""
     agent, env = filled(rejeu.DQN, action_space=gym.spaces.Discrete(3), double_q=True, n_steps=2)
@@ -222,6 +267,30 @@ def numpy_relu(reader, x):
     for layer in reader.torso.layers:
         x = np.maximum(dense(layer, x), 0.0)
     return dense(reader.head, x)
+
+
+def test_masks_go_with_the_rows_that_are_read():
+    kinds = (Leaf("obs", "continuous", (1,), "float32"), Leaf("mask", "continuous", (3,), "bool"))
+    ring = Ring(100, 2, kinds, jax.tree.structure(Masked(0, 0)), (), np.int32, memory_size=2)
+    buffer = ReplayBuffer(ring, 0.9, sequence=(4, 2))
+    seen = lambda t: Masked(np.float32([[t], [t]]), np.arange(3)[None].repeat(2, 0) == t % 3)  # noqa: E731
+    buffer.begin(seen(0))
+    for t in range(1, 40):
+        buffer.add(np.zeros(2, np.int32), np.zeros(2, np.float32), np.zeros(2, bool), seen(t))
+    batch = buffer.sample(np.random.default_rng(0), (40,))
+    for obs in (batch.obs, batch.next_obs):
+        times = np.take_along_axis(obs.obs.obs[..., 0], obs.obs.reads, axis=1).ravel()
+        np.testing.assert_array_equal(obs.mask, np.arange(3)[None] == times[:, None] % 3)
+
+
+@exhaustive
+def test_dqn_with_memory_solves_what_only_memory_can(tmp_path):
+    shape = {"net_arch": [16], "lstm_hidden_size": 8, "sequence_length": 4, "burn_in": 4}
+    settings = {"learning_rate": 1e-2, "gamma": 0.9, "learning_starts": 100, "target_update_interval": 50, "seed": 0}
+    envs = lambda seed: InProcess([Recall() for _ in range(4)], seed=seed)  # noqa: E731
+    agent = rejeu.DQN("MlpPolicy", envs(0), policy_kwargs=shape, batch_size=64, **settings).learn(4000)
+    assert agent.evaluate(40, env=envs(1)).mean_return >= 0.95
+    assert rejeu.load(agent.save(tmp_path / "model")).evaluate(20, env=envs(2)).mean_return >= 0.95
 
 
 def test_predict_remembers_and_leaves_out_the_noise_of_training():

@@ -19,6 +19,7 @@ from rejeu.algorithms.sac import mixed
 from rejeu.core.algorithm import Clock, Transition
 from rejeu.core.distributions import Bernoulli, Categorical, Joint, MultiCategorical, Normal, TanhNormal
 from rejeu.core.spaces import action_width, random_action, rows, scale_action
+from rejeu.envs.functional import FunctionalEnv
 from tests.helpers import assert_same_parameters
 from tests.tiers import exhaustive, only, only_tuples
 
@@ -34,6 +35,7 @@ NESTED = spaces.Dict(
 SPACES = {"nested": NESTED, "tuple": spaces.Tuple([spaces.Discrete(4), spaces.Box(-1.0, 1.0, (2,))])}
 ON = {"policy_kwargs": {"net_arch": [8]}, "n_steps": 16, "seed": 0}
 CONFIG = rejeu.SAC.algorithm.Config(policy_kwargs={"net_arch": [8]})
+MANY = spaces.Dict({"bits": spaces.MultiBinary(12)})
 KINDS = {
     "SAC": functools.partial(
         rejeu.SAC, policy_kwargs={"net_arch": [8]}, learning_starts=20, batch_size=8, buffer_size=200, n_steps=2, seed=0
@@ -87,6 +89,61 @@ def test_the_environment_is_given_actions_of_its_space(name, space, tmp_path):
         np.testing.assert_array_equal, loaded.predict(np.zeros((5, 2), np.float32), deterministic=True)[0], batch
     )
     loaded.learn(16)
+
+
+@exhaustive
+@pytest.mark.parametrize("backend", only(["gymnasium-async"], ["gymnasium", "gymnasium-async"]))
+def test_on_every_backend(backend):
+    vector = rejeu.make_vector(functools.partial(Strict, "nested"), 2, backend, seed=0)
+    try:
+        agent = rejeu.PPO("MlpPolicy", vector, n_episodes=1, **{**ON, "n_steps": 8}).learn(32)
+        assert agent.num_timesteps == 32
+        action = scale_action(NESTED, random_action(NESTED, 2, np.random.default_rng(0)))
+        vector.reset()
+        step = vector.step(action, np.array([True, False]))
+        assert step.reward[1] == 0.0
+    finally:
+        vector.close()
+
+
+class Functional(FunctionalEnv):
+    """Pays for the gear 2, and for steering to the right."""
+
+    max_episode_steps: int | None = 8
+
+    @property
+    def observation_space(self):
+        return spaces.Box(-1.0, 1.0, (2,))
+
+    @property
+    def action_space(self):
+        return NESTED
+
+    def reset(self, key):
+        return jnp.int32(0), jnp.zeros(2)
+
+    def step(self, key, state, action):
+        reward = (action["gear"] == 2).astype(jnp.float32) + 0.1 * action["steer"][0] + 0.1 * action["arm"][2][0, 0]
+        return state + 1, jnp.zeros(2), reward, jnp.bool(False), state + 1 >= 8
+
+
+@exhaustive
+def test_the_device_trains_as_the_host_does():
+    agents = []
+    for on_device in (True, False):
+        agent = KINDS["PPO"]("MlpPolicy", rejeu.make_vector(Functional(), 2, seed=0))
+        agent.on_device = on_device
+        agents.append(agent.learn(64))
+    np.testing.assert_allclose(*(agent.history["return"] for agent in agents), rtol=1e-4, atol=1e-5)
+    for one, other in zip(*(agent.get_parameters().values() for agent in agents), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-3, atol=1e-4)
+
+
+@exhaustive
+def test_it_learns():
+    env = rejeu.make_vector(Functional(), 8, seed=0)
+    agent = rejeu.PPO("MlpPolicy", env, **{**ON, "learning_rate": 0.01}).learn(4096)
+    assert agent.evaluate(8, seed=1).mean_return > 0.85 * 8 * 1.3
 
 
 def test_numbers_go_to_the_parts_in_the_order_of_sorted_keys():
@@ -172,6 +229,15 @@ def test_what_does_not_take_them_says_so(kind, settings, message):
         kind("MlpPolicy", Strict(), **settings)
 
 
+def test_what_is_not_possible_with_them_says_so():
+    with pytest.raises(ValueError, match=r"SAC\.q_values has no critics"):
+        rejeu.SAC("MlpPolicy", Strict()).q_values(np.zeros(2))
+    with pytest.raises(ValueError, match="at most 1,024 combinations of choices, got 4,096"):
+        mixed.make(CONFIG, Strict.observation_space, MANY)
+    with pytest.raises(ValueError, match="Dict or Tuple actions cannot be exported"):
+        rejeu.PPO("MlpPolicy", Strict(), **ON).export("policy.onnx")
+
+
 # SAC
 
 
@@ -213,6 +279,35 @@ def test_the_equations_of_sac_with_choices_and_components():
     entropies = np.array([metrics["entropy"], metrics["entropy_box"]])
     np.testing.assert_allclose(np.sign(after.log_alpha), np.sign(targets - entropies))
     np.testing.assert_allclose(np.abs(after.log_alpha), 3e-4, rtol=1e-3)  # Adam's first step, from log 1
+
+
+def test_the_critic_learns_the_value_of_the_combination_that_was_taken():
+    rng = np.random.default_rng(1)
+    algorithm = mixed.make(CONFIG, Strict.observation_space, NESTED)
+    state, batch = algorithm.init(jax.random.PRNGKey(0)), batch_of(rng)
+    # columns: two bits, choices of 2 and 3, a component, a gear of 3, two components
+    index = np.ravel_multi_index(batch.action[:, [0, 1, 2, 3, 5]].astype(int).T, (2, 2, 2, 3, 3))
+    box, rows_ = batch.action[:, [4, 6, 7]], np.arange(16)
+    values = np.asarray(jax.vmap(lambda critic: critic(batch.obs, box))(state.critics))[:, rows_, index]
+    _, metrics = algorithm.update(state, batch, Clock(np.uint32(0), np.uint32(0), np.float32(0)))
+    np.testing.assert_allclose(metrics["q_value"], values.mean(), rtol=1e-4)
+    action = np.asarray(algorithm.explore(state.actor, np.zeros((400, 2), np.float32), jax.random.PRNGKey(0), None))
+    for column, size in {0: 2, 1: 2, 2: 2, 3: 3, 5: 3}.items():
+        assert set(action[:, column].tolist()) == {*map(float, range(size))}
+    assert (np.abs(action[:, [4, 6, 7]]) <= 1).all()
+
+
+@exhaustive
+@pytest.mark.parametrize("on_device", [True, False])
+def test_sac_learns_choices_and_components(on_device):
+    agent = rejeu.SAC(
+        "MlpPolicy",
+        rejeu.make_vector(Functional(), 1, seed=0),
+        **{**KINDS["SAC"].keywords, "learning_rate": 0.01, "batch_size": 64, "buffer_size": 2000, "gamma": 0.5},
+    )
+    agent.on_device = on_device
+    agent.learn(700)
+    assert agent.evaluate(8, seed=1).mean_return > 0.8 * 8 * 1.3
 
 
 @exhaustive

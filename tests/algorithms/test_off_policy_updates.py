@@ -223,6 +223,12 @@ def test_log_std_is_clipped_to_its_range():
     np.testing.assert_array_equal(sac.continuous.policy(actor, jnp.zeros((1, OBS_DIM))).log_std, [[2.0, -20.0]])
 
 
+@pytest.mark.parametrize(("ent_coef", "alpha"), [("auto", 1.0), ("auto_0.1", 0.1), (0.25, 0.25)])
+def test_temperature_starts_where_ent_coef_says(ent_coef, alpha):
+    algorithm = sac.make(sac.Config(**SETTINGS, ent_coef=ent_coef), OBS_SPACE, BOX)
+    assert float(jnp.exp(jax.jit(algorithm.init)(jax.random.PRNGKey(1)).log_alpha)) == pytest.approx(alpha)
+
+
 # What is refused.
 
 

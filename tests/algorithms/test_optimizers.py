@@ -12,12 +12,13 @@ import numpy as np
 import optax
 import pytest
 
-from rejeu.algorithms import optimizers, sac
+from rejeu.algorithms import a2c, crossq, optimizers, sac
 from rejeu.algorithms.config import rebuild, to_json
 from rejeu.core.algorithm import descend
 from rejeu.core.errors import CheckpointError
 from tests.tiers import exhaustive
 
+SETTINGS = {"learning_starts": 8, "batch_size": 4, "buffer_size": 100, "seed": 0}
 OWN = [optax.lamb, partial(optax.adamw, weight_decay=1e-2), optax.chain(optax.clip(1.0), optax.adabelief(1.0))]
 
 
@@ -52,6 +53,15 @@ def test_a_name_gives_optaxs_optimizer(name, reference):
     np.testing.assert_allclose(given["w"], expected["w"], rtol=1e-6)
 
 
+@pytest.mark.parametrize("name", list(optimizers.OPTIMIZERS))
+def test_a_dict_of_a_name_alone_gives_what_the_name_gives(name):
+    params, gradients = {"w": jnp.array([1.0, -2.0])}, {"w": jnp.array([0.5, 0.25])}
+    for extra in ({}, {"momentum": 0.0}):
+        both = [optimizers.parse("optimizer", given) for given in (name, {"name": name, **extra})]
+        one, other = (stepped(optimizers.make(given), 0.1, params, gradients) for given in both)
+        np.testing.assert_allclose(one["w"], other["w"], rtol=1e-6)
+
+
 def test_an_optimizer_of_the_users_own_is_scaled_by_the_learning_rate():
     params, gradients = jnp.array([1.0]), jnp.array([2.0])
     for own in (optax.sgd, optax.sgd(1.0)):
@@ -62,6 +72,13 @@ def test_an_optimizer_of_the_users_own_is_scaled_by_the_learning_rate():
 def test_what_is_not_an_optimizer_is_refused(given, error):
     with pytest.raises(error, match="optimizer="):
         sac.Config(optimizer=given)
+
+
+def test_algorithms_keep_their_own_settings_of_adam():
+    assert optimizers.make(crossq.Config().optimizer, b1=0.5).init(jnp.zeros(1)).mu.shape == (1,)
+    assert isinstance(a2c.optimizer_of(a2c.Config()).init(jnp.zeros(1)), optax.ScaleByRmsState)
+    assert isinstance(a2c.optimizer_of(a2c.Config(use_rms_prop=False)).init(jnp.zeros(1)), optax.ScaleByAdamState)
+    assert isinstance(a2c.optimizer_of(a2c.Config(optimizer="adam")).init(jnp.zeros(1)), optax.ScaleByAdamState)
 
 
 @pytest.mark.parametrize("optimizer", OWN)

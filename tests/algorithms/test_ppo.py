@@ -243,6 +243,12 @@ def test_an_order_holds_every_step_once_the_valid_ones_first(n, n_valid):
         assert len({tuple(order) for order in orders.tolist()}) == 5, "every epoch has its own"
 
 
+def test_every_step_comes_first_equally_often():
+    """1200 orders of 6 steps: each is expected first 200 times, with a deviation of 13."""
+    orders = np.asarray(shuffled(nth(jax.random.PRNGKey(1), 0), jnp.ones(6, bool), 1200, 0))
+    assert np.abs(np.bincount(orders[:, 0], minlength=6) - 200).max() < 5 * 13
+
+
 @pytest.mark.parametrize("n", [81, 100, 121])
 def test_permutations_that_are_not_sorted_are_uniform(n):
     """Chi-square over 20,000 orders: of the number at each place, of neighbors, and of the distance between neighbors."""
@@ -336,6 +342,19 @@ def test_policy_and_value_have_the_widths_asked_for():
 
 OBS = np.random.default_rng(0).normal(size=(5, OBS_DIM)).astype(np.float32)
 PIXELS = np.random.default_rng(0).integers(256, size=(5, 8, 8, 3), dtype=np.uint8)
+
+
+SHARING = [{}, {"share_layers": True}, {"share_features_extractor": False}]
+
+
+@pytest.mark.parametrize("shape", only(SHARING[1:2], SHARING))
+def test_policy_and_value_at_once_are_what_each_is_alone(shape):
+    network = bold(build(IMAGES, **shape))
+    (policy, value), policy_alone, value_alone = jax.jit(lambda n: (n.both(PIXELS), n.policy(PIXELS), n.value(PIXELS)))(
+        network
+    )
+    np.testing.assert_allclose(value, value_alone, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(policy.mean, policy_alone.mean, rtol=1e-5, atol=1e-6)
 
 
 def moves(of, network):
@@ -474,3 +493,23 @@ def test_squashed_actions_lie_within_the_bounds_without_being_clipped():
 
 
 # Settings.
+
+
+@pytest.mark.parametrize(
+    "shape", [{"net_arch": {"pi": [8], "vf": [8]}}, {"pi": [8]}, {"net_arch": None, "actor_layers": [8]}]
+)
+def test_shared_layers_may_have_the_widths_of_both_or_of_the_policy(shape):
+    network = build(OBS_SPACE, share_layers=True, **shape)
+    assert network.head.weight.shape[0] == network.value_head.weight.shape[0] == 8
+
+
+@pytest.mark.parametrize("algorithm", only([rejeu.A2C], [rejeu.PPO, rejeu.A2C]))
+def test_a_rate_of_the_values_own_needs_convolutions_of_its_own(algorithm):
+    """Shared ones would follow one of the two optimizers, and the gradients of both."""
+    env = Sampled(IMAGES)
+    with pytest.raises(ValueError, match=r"critic_learning_rate .*share_features_extractor=False") as caught:
+        algorithm("CnnPolicy", env, critic_learning_rate=1e-3)
+    assert "\n" not in str(caught.value)
+    make, config = algorithm.algorithm.make, algorithm.algorithm.Config
+    make(config(critic_learning_rate=1e-3, policy_kwargs={"share_features_extractor": False}), IMAGES, env.action_space)
+    make(config(critic_learning_rate=1e-3), OBS_SPACE, env.action_space)

@@ -121,6 +121,14 @@ def with_last(ended):
     return np.concatenate([ended[:-1], np.ones_like(ended[:1])])
 
 
+def test_a_terminal_state_is_worth_nothing_and_a_time_limit_what_it_was_reached_in():
+    """Four steps with lambda 1 and gamma 1/2: a terminal state after the second, a time limit after the fourth."""
+    reward, next_value = np.float32([[1], [2], [3], [4]]), np.float32([[100], [100], [100], [8]])
+    discount, ended = np.float32([[0.5], [0], [0.5], [0.5]]), np.array([[False], [True], [False], [True]])
+    given = returns(reward, next_value, discount, ended, np.float32(1.0))
+    np.testing.assert_allclose(given[:, 0], [1 + 0.5 * 2, 2, 3 + 0.5 * (4 + 0.5 * 8), 4 + 0.5 * 8])
+
+
 @pytest.mark.usefixtures("strict_dtypes")
 def test_targets_bootstrap_from_the_highest_value_in_the_true_successor():
     """Also where the rollout ends and where padding follows: there the step is the last that counts."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import itertools
+import shutil
 from typing import Any
 
 import jax
@@ -15,6 +16,7 @@ import rejeu
 from rejeu.algorithms import dqn, iqn, qrdqn
 from rejeu.algorithms.quantile_loss import quantile_huber_loss
 from rejeu.core.algorithm import TD_ERROR, Masked
+from rejeu.export import c_file
 from tests.algorithms.test_categorical import by_loops
 from tests.algorithms.test_dqn import (
     ACTION_SPACE,
@@ -22,16 +24,21 @@ from tests.algorithms.test_dqn import (
     CLOCK,
     N_ACTIONS,
     OBS_SPACE,
+    Chain,
     affine,
+    dueling_parts,
     forward,
+    learn_chain,
     random_batch,
 )
+from tests.tiers import exhaustive, only_tuples
 
 pytestmark = pytest.mark.usefixtures("learners_are_shared")
 
 ATOMS = np.linspace(-3.0, 5.0, 9)
 C51 = {"distribution": "categorical", "v_min": -3.0, "v_max": 5.0, "n_atoms": 9}
 IQN = {"n_quantiles": 5, "n_target_quantiles": 6, "n_policy_quantiles": 7, "n_cosines": 4}
+EVERY = {"double_q": True, "dueling": True, "noisy": True, "munchausen_alpha": 0.9}
 SMALL = {"policy_kwargs": {"net_arch": [5, 4]}}
 
 
@@ -80,6 +87,15 @@ def test_the_loss_of_c51_is_the_cross_entropy_and_its_error_the_divergence():
     np.testing.assert_allclose(np.asarray(values)[np.arange(BATCH), batch.action], predicted @ ATOMS, atol=1e-5)
 
 
+def test_the_streams_of_a_distribution_are_joined_for_each_atom():
+    _, state = make(dueling=True, **C51)
+    obs = random_batch().obs
+    value, advantage = dueling_parts(state.network.outputs, np.float64(obs))
+    advantage = advantage.reshape(BATCH, N_ACTIONS, 9)
+    expected = value[:, None] + advantage - advantage.mean(axis=1, keepdims=True)
+    np.testing.assert_allclose(state.network(obs), expected, atol=1e-5)
+
+
 # Munchausen.
 
 
@@ -123,6 +139,21 @@ def test_munchausen_mixes_descriptions_of_the_return_by_the_policy():
     policy = softmax(quantiles.mean(axis=2) / 0.5)
     mixed = (policy[..., None] * (quantiles - 0.5 * np.log(policy)[..., None])).sum(axis=1)
     np.testing.assert_allclose(given, batch.reward[:, None] + batch.discount[:, None] * mixed, atol=1e-5)
+
+
+@exhaustive
+def test_munchausen_values_of_a_chain_are_those_of_its_own_iteration():
+    """The fixed point of ``Q = r + alpha tau log pi + d sum pi (Q - tau log pi)``, ``pi = softmax(Q / tau)``, by iteration."""
+    alpha, tau, chain = 0.5, 0.1, Chain()
+    settings = {"munchausen_alpha": alpha, "munchausen_temperature": tau, "munchausen_clip": -10.0}
+    config = dqn.Config(learning_rate=3e-3, target_update_interval=50, policy_kwargs={"net_arch": [32]}, **settings)
+    state = learn_chain(dqn.make(config, chain.observation_space, chain.action_space), 4_000)
+    values, (room, action, reward, following, discount, *_) = np.zeros((5, 2)), chain.transitions()
+    for _ in range(500):
+        log_policy = np.log(softmax(values / tau))
+        soft = (np.exp(log_policy) * (values - tau * log_policy)).sum(axis=1)
+        values[room, action] = reward + alpha * tau * log_policy[room, action] + discount * soft[following]
+    np.testing.assert_allclose(state.network(np.arange(5, dtype=np.int32)), values, atol=0.02)
 
 
 # IQN.
@@ -253,6 +284,73 @@ def test_noise_on_weights_of_two_kinds_is_refused():
 
 
 # Together.
+
+KINDS = {"DQN": (dqn, {}), "C51": (dqn, C51), "QRDQN": (qrdqn, {"n_quantiles": 5}), "IQN": (iqn, IQN)}
+
+
+PARTS = [{}, {"noisy": True}, {"dueling": True, "double_q": True}]
+
+
+@pytest.mark.parametrize(
+    ("kind", "settings"),
+    only_tuples([("C51", PARTS[2])], [(kind, part) for kind in KINDS for part in PARTS]),
+)
+def test_values_of_a_chain_are_learnt_by_every_kind(kind, settings):
+    module, own = KINDS[kind]
+    own = {**own, "v_min": -0.5, "v_max": 1.5, "n_atoms": 21} if kind == "C51" else own
+    widths = [32]
+    if kind == "IQN":  # whose hidden layers read features and fractions apart
+        own, widths = {"n_quantiles": 16, "n_target_quantiles": 16, "n_cosines": 16}, [32, 32]
+    config = module.Config(
+        learning_rate=3e-3, target_update_interval=50, policy_kwargs={"net_arch": widths}, **own, **settings
+    )
+    algorithm = module.make(config, Chain.observation_space, Chain.action_space)
+    state = learn_chain(algorithm, 2_000)
+    values = algorithm.action_values(state, jnp.arange(5, dtype=jnp.int32), None)[0]
+    np.testing.assert_allclose(values, Chain().values(), atol=0.1 if settings.get("noisy") else 0.04)
+
+
+AGENTS = {"DQN": {}, "C51": C51, "QRDQN": {"n_quantiles": 5}, "IQN": IQN}
+MEMORY = {"lstm_hidden_size": 4, "sequence_length": 4, "burn_in": 2}
+PLACES = {
+    "host": ("CartPole-v1", {"priorities": {}, "n_steps": 3}),
+    "device": ("jax/CartPole-v1", {"priorities": {}, "n_steps": 3}),
+    "memory": ("CartPole-v1", {"policy_kwargs": {"net_arch": [8], **MEMORY}, "n_steps": 2}),
+}
+
+
+@exhaustive
+@pytest.mark.parametrize(
+    ("kind", "place"),
+    only_tuples([("C51", "host")], [(kind, place) for kind in AGENTS for place in PLACES]),
+)
+def test_all_parts_together_learn_save_and_load(kind, place, tmp_path):
+    env, settings = PLACES[place]
+    run = {"learning_starts": 20, "batch_size": 8, "train_freq": 2, "target_update_interval": 10, "seed": 0}
+    cls = getattr(rejeu, "DQN" if kind == "C51" else kind)
+    agent = cls("MlpPolicy", env, **{**run, "policy_kwargs": {"net_arch": [8]}, **AGENTS[kind], **EVERY, **settings})
+    agent.learn(60)
+    agent.save(tmp_path / "model")
+    obs = np.random.default_rng(0).normal(size=(30, 4)).astype(np.float32)
+    np.testing.assert_array_equal(rejeu.load(tmp_path / "model").predict(obs)[0], agent.predict(obs)[0])
+    assert agent.evaluate(2).mean_return >= 8.0
+
+
+@exhaustive
+@pytest.mark.parametrize(
+    ("kind", "suffix"),
+    only_tuples([("IQN", "onnx")], [("C51", "onnx"), ("IQN", "onnx"), ("IQN", "c"), ("C51", "stablehlo")]),
+)
+def test_an_exported_policy_acts_as_predict(kind, suffix, tmp_path):
+    if suffix == "c" and not any(map(shutil.which, c_file.COMPILERS)):
+        pytest.skip("there is no C compiler")
+    cls = rejeu.IQN if kind == "IQN" else rejeu.DQN
+    settings = {"policy_kwargs": {"net_arch": [8]}, "seed": 0, **AGENTS[kind], **EVERY}
+    agent = cls("MlpPolicy", "CartPole-v1", **settings)
+    assert agent.export(tmp_path / f"policy.{suffix}").check.difference == 0
+    obs = np.random.default_rng(0).normal(size=(50, 4)).astype(np.float32)
+    policy = rejeu.load_policy(agent.save(tmp_path / "model"))
+    np.testing.assert_array_equal(policy.predict(obs)[0], agent.predict(obs, deterministic=True)[0])
 
 
 def test_a_range_of_returns_is_not_empty():

@@ -22,6 +22,7 @@ from rejeu.core.spaces import leaves
 from rejeu.envs.make import InProcess
 from tests.algorithms.probes.environments import Probe
 from tests.environments import Counter
+from tests.helpers import assert_same_parameters, same_parameters
 from tests.tiers import exhaustive, only, only_tuples
 
 CLOCK = Clock(np.uint32(0), np.uint32(0), np.float32(0.0))
@@ -106,6 +107,7 @@ def made(kind="lstm", shared=False, **settings):
 KINDS = pytest.mark.parametrize("kind", ["lstm", "gru"])
 LSTM = pytest.mark.parametrize("kind", only(["lstm"], ["lstm", "gru"]))
 """For tests that compile much."""
+RNG = np.random.default_rng(0)
 
 
 @KINDS
@@ -480,6 +482,17 @@ def test_evaluation_carries_memory_and_begins_anew_with_each_episode(bold):
                 obs, _ = twin.reset()
 
 
+@exhaustive
+def test_a_shared_memory_is_one():
+    one, two = small(policy_kwargs={**SMALL["policy_kwargs"], "shared_lstm": True}), small()
+    assert len(one.state.network.cells) == 1
+    assert len(two.state.network.cells) == 2
+    obs = np.zeros((5, 3), np.float32)
+    assert len(jax.tree.leaves(one.predict(obs)[1])) == 2
+    assert len(jax.tree.leaves(two.predict(obs)[1])) == 4
+    assert one.learn(12).n_updates > 0
+
+
 @pytest.mark.parametrize(
     "state",
     [
@@ -521,3 +534,34 @@ def test_policy_and_value_may_read_images_through_convolutions_of_their_own():
     weights = [n.encoder.images[0].linear.weight for n in (network, shared)]
     np.testing.assert_array_equal(*weights)
     assert not np.array_equal(network.value_encoder.images[0].linear.weight, weights[0])
+
+
+@exhaustive
+def test_learning_is_determined_by_the_seed(agent):
+    assert_same_parameters(agent, small().learn(12))
+    assert not same_parameters(agent, small(seed=1).learn(12))
+
+
+@exhaustive
+@LSTM
+def test_a_file_keeps_all_of_it(kind, tmp_path):
+    agent = small(policy_kwargs={**SMALL["policy_kwargs"], "cell": kind, "shared_lstm": True}).learn(6)
+    loaded = rejeu.load(agent.save(tmp_path / "model"))
+    assert loaded.config == agent.config
+    assert_same_parameters(agent, loaded)
+    observations = np.random.default_rng(3).normal(size=(5, 3)).astype(np.float32)
+    for one, other in zip(
+        jax.tree.leaves(walk(agent, observations)), jax.tree.leaves(walk(loaded, observations)), strict=True
+    ):
+        assert np.array_equal(one, other)
+
+
+def test_the_network_reads_through_the_encoder():
+    """A Discrete observation is one-hot encoded before the cell."""
+    shape = RecurrentConfig(lstm_hidden_size=SIZE, net_arch=(5,))
+    kind = action_kind(gym.spaces.Discrete(2))
+    network = RecurrentActorCritic(jax.random.PRNGKey(0), leaves(gym.spaces.Discrete(7)), kind, shape)
+    assert network.cells[0].inputs.shape == (7, 4 * SIZE)
+    memory = network.remember(network.empty(2), np.int32([0, 6]), np.zeros(2, bool))
+    expected = remembered(network, [np.eye(7)[6]])[0][0][0]
+    np.testing.assert_allclose(memory[0][0][1], expected, atol=1e-6)

@@ -13,6 +13,7 @@ from rejeu.core.algorithm import TD_ERROR
 from rejeu.networks import action_values, with_dropout
 from tests.algorithms.batches import BOX, CLOCK, OBS_SPACE, box_batch, noise_of
 from tests.numpy_networks import squashed_sample
+from tests.tiers import exhaustive, only
 
 pytestmark = pytest.mark.usefixtures("learners_are_shared")
 
@@ -59,6 +60,13 @@ def test_dropout_equals_numpy_and_each_critic_and_layer_has_its_own():
     assert with_dropout(state.critics, None) is state.critics
 
 
+def test_the_mean_over_dropouts_of_a_linear_layer_is_the_layer_without():
+    layer = rejeu.networks.layers.Dropout(jax.random.PRNGKey(0), RATE)
+    found = layer(jnp.full((40_000,), 2.0))
+    assert float(found.mean()) == pytest.approx(2.0, abs=0.03)
+    assert sorted(set(np.asarray(found).tolist())) == pytest.approx([0.0, 2.0 / (1 - RATE)])
+
+
 def test_every_pass_of_an_update_drops_units_of_the_critics():
     """Target, critics and what judges the actor, each with masks of its own, in float64 with the keys of the update."""
     config, algorithm, state = made()
@@ -81,6 +89,23 @@ def test_every_pass_of_an_update_drops_units_of_the_critics():
     assert (
         len({tuple(np.asarray(key).tolist()) for key in (learning, judging, config.dropout_keys(target_key)[1])}) == 3
     )
+
+
+@exhaustive
+@pytest.mark.parametrize("agent", only([rejeu.SAC], [rejeu.SAC, rejeu.TQC]))
+def test_droq_learns_resumes_equal_and_acts_without_dropout(agent, tmp_path):
+    settings = {**DROQ, "gradient_steps": 4, "policy_delay": 4, "learning_starts": 10, "batch_size": 8, "seed": 0}
+    whole = agent("MlpPolicy", "Pendulum-v1", **settings).learn(40)
+    half = agent("MlpPolicy", "Pendulum-v1", **settings)
+    half.learn(25, rejeu.callbacks.Checkpoint(tmp_path / "checkpoints", every=25))
+    again = agent.resume(tmp_path / "checkpoints", "Pendulum-v1").learn(15, reset_num_timesteps=False)
+    for one, two in zip(jax.tree.leaves(whole.run.state), jax.tree.leaves(again.run.state), strict=True):
+        np.testing.assert_array_equal(one, two)
+    path = whole.save(tmp_path / "droq")
+    loaded = rejeu.load(path)
+    obs, action = np.zeros((2, 3), np.float32), np.zeros((2, 1), np.float32)
+    np.testing.assert_array_equal(whole.q_values(obs, action), loaded.q_values(obs, action))
+    assert whole.q_values(obs, action).shape == (2,)
 
 
 def test_settings_that_cannot_be_are_refused():

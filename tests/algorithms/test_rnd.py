@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gymnasium as gym
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,11 +11,12 @@ import pytest
 import rejeu
 from rejeu.algorithms import rnd
 from rejeu.algorithms.config import RndConfig
+from rejeu.callbacks import Checkpoint
 from rejeu.core.algorithm import Algorithm, Clock, Rollout, Transition
 from rejeu.core.spaces import leaves
 from tests.every_agent import KINDS
 from tests.helpers import assert_same_parameters, same_parameters
-from tests.tiers import only
+from tests.tiers import exhaustive, only
 
 pytestmark = pytest.mark.usefixtures("learners_are_shared")
 
@@ -91,6 +93,22 @@ def test_of_a_rollout_only_the_steps_that_exist_count():
     assert float(after.moments.returns.n_seen) == 5
 
 
+def test_the_error_shrinks_where_the_agent_has_been_and_not_elsewhere():
+    rng = np.random.default_rng(2)
+    algorithm = rnd.with_rnd(
+        seeing(), leaves(rejeu.make_vector("Pendulum-v1").observation_space), RndConfig(learning_rate=1e-3)
+    )
+    state, update = algorithm.init(jax.random.PRNGKey(0)), jax.jit(algorithm.update)
+    known, unknown = np.array([[[0.0, 0.0, 0.0]], [[0.0, 0.0, 4.0]]], np.float32)  # the last number never varies
+    before = [rnd.errors(state.predictor, state.target, x).mean() for x in (known, unknown)]
+    for _ in range(300):
+        near = rng.normal(0.0, 0.3, (6, 3)).astype(np.float32) * np.array([[1, 1, 0]], np.float32)
+        state, _ = update(state, transitions(rng)._replace(next_obs=near), CLOCK)
+    after = [rnd.errors(state.predictor, state.target, x).mean() for x in (known, unknown)]
+    assert after[0] < 0.05 * before[0]
+    assert after[1] > 0.2 * before[1]
+
+
 @pytest.mark.parametrize("name", only((), KINDS))
 def test_every_off_policy_algorithm_takes_it(name, tmp_path):
     kind = KINDS[name]
@@ -109,6 +127,19 @@ def test_every_on_policy_algorithm_takes_it(name, tmp_path):
     check(lambda **more: rejeu.AGENTS[name]("MlpPolicy", "CartPole-v1", **settings, **more), tmp_path)
 
 
+@exhaustive
+def test_it_goes_with_memory_and_masks(tmp_path):
+    from tests.worker_environments import Rules
+
+    memory = {"net_arch": [4], "lstm_hidden_size": 4, "sequence_length": 4, "burn_in": 2}
+    settings = {**OFF, "policy_kwargs": memory, "action_masks": True, "rnd": 0.5}
+    env = Rules()
+    agent = rejeu.DQN("MlpPolicy", env, **settings).learn(80)
+    assert env.taken == 80
+    assert float(agent.run.metrics["rnd_bonus"]) > 0
+    assert_same_parameters(agent, rejeu.load(agent.save(tmp_path / "model")))
+
+
 def check(make, tmp_path):
     agent = make(rnd=0.5, normalize={"norm_reward": False}).learn(70)
     assert {"rnd_bonus", "rnd_loss"} <= {*agent.run.metrics}
@@ -122,6 +153,34 @@ def check(make, tmp_path):
     if not agent.learner.algorithm.recall:
         numpy_policy = rejeu.load_policy(tmp_path / "model")
         np.testing.assert_allclose(numpy_policy.predict(obs)[0], one, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", only(["PPO"], ["DQN", "PPO"]))
+def test_a_run_that_is_cut_off_goes_on_as_if_it_had_not_been(name, tmp_path):
+    settings = OFF if name == "DQN" else ON
+    make = lambda: rejeu.AGENTS[name]("MlpPolicy", gym.make("CartPole-v1"), rnd=0.5, **settings)  # noqa: E731
+    whole = make().learn(120)
+    make().learn(120, [lambda agent, turn: turn.step < 61, Checkpoint(tmp_path, every=1000)])
+    again = rejeu.AGENTS[name].resume(tmp_path, gym.make("CartPole-v1"))
+    assert again.resumed.exact
+    assert_same_parameters(whole, again.learn())
+    assert {"predictor", "target", "moments"} <= {key.split(".")[0] for key in again.get_parameters()}
+
+
+@exhaustive
+@pytest.mark.parametrize("name", only(["PPO"], ["DQN", "PPO"]))
+def test_it_trains_on_the_device(name):
+    settings = OFF if name == "DQN" else ON
+    make = lambda: rejeu.AGENTS[name]("MlpPolicy", rejeu.make_vector("jax/CartPole-v1", 2, seed=0), rnd=1.0, **settings)  # noqa: E731
+    agents = []
+    for on_device in (True, False):
+        agent = make()
+        agent.on_device = on_device
+        agents.append(agent.learn(96))
+    if name == "PPO":  # which draws no batches
+        for one, other in zip(*(a.get_parameters().values() for a in agents), strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-3, atol=1e-4)
+    assert np.isfinite(float(agents[0].run.metrics["rnd_bonus"]))
 
 
 def test_no_weight_means_none_and_other_values_are_refused():

@@ -5,7 +5,7 @@ import math
 import pytest
 
 from rejeu import AGENTS
-from rejeu.algorithms.search import HINDSIGHT, OFF_POLICY, Integers, LogUniform, NearOne, Uniform
+from rejeu.algorithms.search import HINDSIGHT, OFF_POLICY, Choice, Integers, LogUniform, NearOne, Uniform
 from rejeu.core import validation
 
 
@@ -60,3 +60,13 @@ def test_the_settings_of_hindsight_are_understood():
 def test_a_range_that_cannot_be_searched_is_refused(kind, ends, message):
     with pytest.raises(ValueError, match=message):
         kind(*ends)
+
+
+def test_contains():
+    assert Uniform(0, 1).contains(0.5)
+    assert not Uniform(0, 1).contains(True)
+    assert not Uniform(0, 1).contains("lin_0.5")
+    assert Integers(1, 5).contains(3)
+    assert not Integers(1, 5).contains(3.5)
+    assert Choice(([64, 64], [256])).contains((64, 64))
+    assert not Choice((1, 2)).contains(None)

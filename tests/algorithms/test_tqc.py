@@ -45,6 +45,15 @@ def test_the_table_of_all_pairs_is_never_in_memory():
     assert needed < 8 * 30 * 40 * 4, needed
 
 
+def test_the_quantile_huber_loss_is_least_at_the_quantiles_of_the_samples():
+    """Two quantiles, at 1/4 and 3/4, of the numbers 0 to 100, with a kappa too small to matter: 25 and 75."""
+    samples = jnp.arange(101.0)[None]
+    grid = jnp.arange(0.0, 101.0, 5.0)
+    lower = [float(quantile_huber_loss(jnp.array([[q, 75.0]]), samples, 1e-3)[0]) for q in grid]
+    upper = [float(quantile_huber_loss(jnp.array([[25.0, q]]), samples, 1e-3)[0]) for q in grid]
+    assert (float(grid[np.argmin(lower)]), float(grid[np.argmin(upper)])) == (25.0, 75.0)
+
+
 def test_truncation_is_of_all_quantiles_together_not_of_each_critic():
     """The second critic says nothing below 10: one quantile dropped per critic, and both of its own go."""
     quantiles = jnp.array([[[3.0, 1.0]], [[20.0, 10.0]]])

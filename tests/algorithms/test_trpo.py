@@ -158,3 +158,9 @@ def test_the_update_counts_its_gradient_steps_and_fits_the_value():
     best = np.linalg.lstsq(inputs, target, rcond=None)[0]
     fitted = np.asarray(after.network.value(data.obs))[keep]
     assert np.mean((fitted - target) ** 2) < 1.1 * np.mean((inputs @ best - target) ** 2) + 1e-3
+
+
+def test_a_factor_that_leaves_environments_out_is_warned_of():
+    with pytest.warns(UserWarning, match="takes 2 of 4 environments only"):
+        trpo.warn_of_unused(2, 4)
+    trpo.warn_of_unused(3, 4)

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 import rejeu
+from rejeu.envs.make import InProcess
 from tests.algorithms.probes.environments import Probe
 from tests.algorithms.test_every_algorithm import OBS
+from tests.environments import Reach
 from tests.every_agent import KINDS, env_of, every_kind, small
 from tests.helpers import small_sac
 from tests.numpy_networks import forward, layers
@@ -42,6 +44,12 @@ def test_of_discrete_actions_all_are_rated_at_once_in_the_order_of_the_space(kin
     assert agent.q_values(OBS[0], critics="all").shape == (getattr(agent.config, "n_critics", 1), space.n)
 
 
+def test_the_best_rated_action_of_dqn_is_the_one_it_takes():
+    agent = small(KINDS["DQN"], env_of(KINDS["DQN"]))
+    best = agent.action_space.start + agent.q_values(OBS).argmax(axis=1)
+    np.testing.assert_array_equal(agent.predict(OBS, deterministic=True)[0], best)
+
+
 def test_actions_are_in_the_environments_own_range():
     """Pendulum's are from -2 to 2: the critic, here in float64, is given a half of them."""
     agent = rejeu.TD3("MlpPolicy", "Pendulum-v1", policy_kwargs={"net_arch": [8]}, seed=0)
@@ -52,6 +60,27 @@ def test_actions_are_in_the_environments_own_range():
         expected = forward(layers(agent.state.critics, i), np.concatenate([obs, actions / 2], axis=1))[:, 0]
         np.testing.assert_allclose(given[i], expected, atol=1e-5)
     assert not np.allclose(given[0], given[1])
+
+
+def test_observations_are_scaled_as_in_training():
+    agent = small_sac(Probe(), normalize=True, learning_starts=8).learn(30)
+    state = agent.state
+    moments = state.statistics.obs[0]
+    mean, variance = np.float64(moments.mean), np.float64(moments.variance)
+    obs, actions = np.float32([[0.4], [-3.0]]), np.float32([[0.5], [2.0]])
+    config = agent.config.normalize
+    scaled = ((obs - mean) / np.sqrt(variance + config.epsilon)).clip(-config.clip_obs, config.clip_obs)
+    inputs = np.concatenate([scaled, actions - 1.0], axis=1)  # the probe's actions are from 0 to 2
+    expected = [forward(layers(state.learner.critics, i), inputs)[:, 0] for i in range(2)]
+    np.testing.assert_allclose(agent.q_values(obs, actions, critics="all"), expected, rtol=1e-3, atol=1e-4)
+
+
+def test_observations_may_be_dicts():
+    agent = small_sac(InProcess([Reach()]))
+    obs = {key: np.linspace(-1, 1, 4, dtype=np.float32)[:, None] for key in agent.observation_space}
+    batch = agent.q_values(obs, np.zeros((4, 1)))
+    single = agent.q_values({key: value[1] for key, value in obs.items()}, np.zeros(1))
+    np.testing.assert_allclose(single, batch[1], rtol=1e-5)
 
 
 def test_pqn_rates_all_actions_and_the_value_is_that_of_the_best():
@@ -87,6 +116,11 @@ def test_the_value_of_a_policy_with_a_memory_depends_on_what_it_remembers():
     later = agent.value(OBS, memory)
     assert not np.allclose(later, fresh)
     np.testing.assert_allclose(agent.value(OBS, memory, np.ones(N, bool)), fresh, rtol=1e-5)
+
+
+def test_masks_in_observations_are_passed_over():
+    agent = rejeu.MaskablePPO("MlpPolicy", ON_POLICY["PPO, Discrete"].wrapper(Probe()), seed=0)
+    assert agent.value(OBS).shape == (N,)
 
 
 def test_what_cannot_be_rated_is_refused_in_one_line():

@@ -65,6 +65,36 @@ def test_callbacks_are_called_in_the_given_order_and_those_that_run_last_after_t
     ]
 
 
+def test_an_error_is_told_to_all_callbacks_that_had_started():
+    notes = []
+    with pytest.raises(RuntimeError, match="stopped by the test"):
+        small_sac(BALL).learn(9, [Noting(notes, "a"), Noting(notes, "b", raise_at=2)])
+    assert notes[-2:] == [("a", "after", "RuntimeError"), ("b", "after", "RuntimeError")]
+
+
+def test_a_callback_that_fails_to_start_is_not_told_of_the_end():
+    class Failing(Noting):
+        def before_training(self, agent):
+            raise RuntimeError("it cannot start")
+
+    notes = []
+    with pytest.raises(RuntimeError, match="it cannot start"):
+        small_sac(BALL).learn(9, [Noting(notes, "a"), Failing(notes, "b"), Noting(notes, "c")])
+    assert notes == [("a", "before", 0), ("a", "after", "RuntimeError")]
+
+
+def test_a_callback_reads_the_limits_of_the_call():
+    seen = []
+
+    class Reading(Noting):
+        def before_training(self, agent):
+            seen.append((agent.training_call.n_steps, agent.training_call.last_step))
+
+    agent = small_sac(BALL).learn(3, Reading([], "a"))
+    agent.learn(4, Reading([], "a"), reset_num_timesteps=False)
+    assert seen == [(3, 3), (4, 7)]
+
+
 def stopped_run(folder):
     agent = small_sac(BALL)
     agent.learn(40, [Counting(), Checkpoint(folder, every=10), lambda agent, progress: progress.step < 20])
@@ -77,6 +107,14 @@ def test_the_checkpoint_at_the_start_of_a_resumed_run_contains_the_restored_stat
     agent.learn(callback=[Counting(), Checkpoint(tmp_path / "two", every=1000), stop])
     again = type(agent).resume(tmp_path / "two")
     assert again.saved_callbacks == [("Counting", {"n": 21})]
+
+
+def test_callbacks_of_older_checkpoints_are_restored_under_their_present_names(tmp_path):
+    agent = type(stopped_run(tmp_path)).resume(tmp_path)
+    first, second = Counting(), Counting()
+    agent.saved_callbacks = [("CallbackList", {"self": {}, "inside": [["Counting", {"n": 7}], ["Counting", {"n": 8}]]})]
+    agent.learn(callback=[first, second, lambda agent, progress: False])
+    assert (first.n, second.n) == (8, 9)
 
 
 @pytest.mark.parametrize("state", [{"n": 7}, None, {"inside": 3}, {"inside": [["Counting"]]}, np.zeros(2)])

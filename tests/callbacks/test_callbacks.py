@@ -1,5 +1,6 @@
 import io
 import math
+import time
 from collections import deque
 from types import SimpleNamespace
 
@@ -15,7 +16,9 @@ from rejeu.callbacks import (
     ProgressBar,
     RecordVideo,
     stop_on_return,
+    stop_on_success,
 )
+from rejeu.callbacks.base import crossed
 from rejeu.callbacks.evaluate import better
 from rejeu.core.failed_writes import FailedWrites
 from rejeu.logs.evaluation import Evaluation
@@ -121,11 +124,40 @@ def test_evaluate_refuses_the_environments_of_training():
         agent.learn(10, Evaluate(env, every=5, episodes=1))
 
 
+def test_evaluate_leaves_open_the_environment_that_it_was_given():
+    env = rejeu.make_vector("Pendulum-v1", 1, "gymnasium", 0)
+    evaluate = Evaluate(env, every=5, episodes=1)
+    evaluate.close()
+    env.reset()
+
+
+def test_the_saved_best_model_acts_as_the_agent_did_then(tmp_path):
+    evaluate = Evaluate("Pendulum-v1", every=20, episodes=1, best_path=tmp_path / "best.safetensors", seed=0)
+    agent = pendulum().learn(20, evaluate)
+    evaluate.close()
+    obs = np.array([1.0, 0.0, 0.5], np.float32)
+    loaded = rejeu.load(tmp_path / "best.safetensors")
+    np.testing.assert_array_equal(loaded.predict(obs, deterministic=True)[0], agent.predict(obs, deterministic=True)[0])
+
+
+def test_crossed_sees_a_multiple_that_a_step_jumps_over():
+    assert crossed(8, 16, 10)
+    assert not crossed(10, 18, 10)
+    assert not crossed(0, 9, 10)
+
+
 def test_stop_on_return_waits_for_enough_episodes():
     stop = stop_on_return(5, episodes=2)
     assert stop(*finished([10])) is True
     assert stop(*finished([1, 4])) is True
     assert stop(*finished([0, 4, 6])) is False
+
+
+def test_stop_on_success_counts_the_last_episodes():
+    stop = stop_on_success(0.75, episodes=4)
+    assert stop(*finished([0] * 5, [0, 1, 1, 1, 0])) is False
+    assert stop(*finished([0] * 5, [1, 1, 1, 0, 0])) is True
+    assert stop_on_success(0.0, episodes=1)(*finished([0])) is True  # unknown
 
 
 NO_TIME = dict.fromkeys(("env", "replay", "update", "total"), 0.0)
@@ -150,6 +182,13 @@ def test_progress_bar_prints_a_line_every_ten_seconds_without_a_terminal(monkeyp
     assert "0/s" in lines[0]
 
 
+def test_progress_bar_draws_a_bar_on_a_terminal():
+    console = Console(file=io.StringIO(), force_terminal=True, width=100, _environ={"TERM": "xterm"})
+    text = shown(100, None, range(1, 101), console)
+    assert "━" in text
+    assert "100%" in text
+
+
 @pytest.mark.parametrize("is_terminal", [False, True])
 def test_progress_bar_says_that_a_large_function_is_compiled(is_terminal):
     console = Console(file=io.StringIO(), force_terminal=is_terminal, width=100, _environ={"TERM": "xterm"})
@@ -166,6 +205,26 @@ def test_progress_bar_says_that_a_large_function_is_compiled(is_terminal):
     assert "compiling" not in console.file.getvalue()
 
 
+def steps_that_grow_slower(step):
+    """Of each of the first 20 steps' seconds the environment takes all, of each later one's the update three quarters."""
+    early, late = min(step, 20), max(step - 20, 0)
+    return {"env": early + 0.1 * late, "replay": 0.05 * late, "update": 0.75 * late, "total": float(step)}
+
+
+def test_progress_bar_says_what_the_time_went_into_lately(monkeypatch):
+    clock = [0.0]
+    monkeypatch.setattr("time.perf_counter", lambda: clock[0])
+
+    def spent(step):
+        clock[0] = float(step)
+        return steps_that_grow_slower(step)
+
+    console = Console(file=io.StringIO(), force_terminal=False, width=200)
+    lines = shown(60, None, range(1, 61), console, spent).splitlines()
+    assert lines[0].endswith("env 100% · replay 0% · update 0% · rest 0%")
+    assert lines[-1].endswith("env 10% · replay 5% · update 75% · rest 10%")
+
+
 def test_shares_of_time_are_rows_of_statistics_and_sum_to_one():
     rows = []
     sink = SimpleNamespace(write=lambda step, metrics: rows.append(metrics), close=lambda: None)
@@ -175,6 +234,23 @@ def test_shares_of_time_are_rows_of_statistics_and_sum_to_one():
         shares = [row[f"time/{part}_share"] for part in ("env", "replay", "update", "rest")]
         assert sum(shares) == pytest.approx(1.0)
         assert all(0.0 < share < 1.0 for share in shares)
+
+
+def test_progress_bar_counts_time_where_only_time_ends_the_run():
+    console = Console(file=io.StringIO(), force_terminal=False, width=200)
+    text = shown(None, 1e6, range(1, 5), console)
+    assert text.startswith("  0%  4 steps")
+    assert "277:46:40 left" in text
+
+
+def test_progress_bar_costs_microseconds_between_refreshes():
+    bar = ProgressBar(10**9, None, Console(file=io.StringIO(), force_terminal=False))
+    agent = SimpleNamespace(n_envs=1, ep_info_buffer=[], ep_success_buffer=[], seconds=NO_TIME)
+    turns = [Progress(step, [], None) for step in range(1, 10_001)]
+    began = time.perf_counter()
+    for turn in turns:
+        bar(agent, turn)
+    assert time.perf_counter() - began < 0.1  # 10 us a call; it takes well below 1
 
 
 def test_videos_by_steps_do_not_change_training(tmp_path):
@@ -187,6 +263,12 @@ def test_videos_by_steps_do_not_change_training(tmp_path):
     assert all(path.stat().st_size > 0 for path in video.paths)
     for name, array in other.get_parameters().items():
         np.testing.assert_array_equal(array, filmed.get_parameters()[name])
+
+
+def test_videos_by_episodes(tmp_path):
+    video = RecordVideo(tmp_path, every_episodes=3, env=lambda: Pictured(Counter((5,))))
+    small_sac(Counter((5,))).learn(40, video)  # 8 episodes of 5 steps
+    assert [path.name for path in video.paths] == ["step_000000015.mp4", "step_000000030.mp4"]
 
 
 @pytest.mark.parametrize("settings", [{}, {"every": 5, "every_episodes": 2}])

@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import errno
 import os
+import stat
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings, strategies as st
 from hypothesis.extra import numpy as npst
-from safetensors.numpy import save_file
+from safetensors.numpy import load_file, save_file
 
 import rejeu
 from rejeu.core import atomic, checkpoint
 from rejeu.core.errors import CheckpointError
 from tests import hostile_files
-from tests.environments import Counter, Reach
+from tests.environments import Counter, Reach, Sampled
 from tests.helpers import assert_same_parameters, small_sac
 
 
@@ -25,6 +27,12 @@ def trained(tmp_path_factory):
     """An agent after a few updates, and its file."""
     agent = small_sac(Counter((5,)), ent_coef="auto_0.5", learning_rate=rejeu.Linear(1e-2, 1e-3)).learn(20)
     return agent, agent.save(tmp_path_factory.mktemp("saved") / "model")
+
+
+@pytest.fixture(scope="module")
+def buffer_file(tmp_path_factory):
+    agent = small_sac(Counter((5,)), learning_starts=10**6).learn(20)
+    return agent, agent.save_replay_buffer(tmp_path_factory.mktemp("saved") / "buffer")
 
 
 def observations(n=6):
@@ -68,6 +76,32 @@ def test_a_suffix_is_added_where_there_is_none_and_that_of_stable_baselines3_sta
         rejeu.SAC.load(tmp_path / "third.zip")
 
 
+def test_settings_may_be_changed_when_loading(trained):
+    loaded = rejeu.SAC.load(trained[1], learning_rate=1e-5, seed=7, stats_window_size=3)
+    assert (loaded.config.learning_rate, loaded.seed, loaded.ep_info_buffer.maxlen) == (1e-5, 7, 3)
+    assert loaded.config.tau == trained[0].config.tau
+
+
+def test_agents_of_nested_observations_survive(tmp_path):
+    inner = gym.spaces.Tuple([gym.spaces.MultiBinary(3), gym.spaces.MultiDiscrete([2, 3])])
+    box = gym.spaces.Box(-np.inf, np.inf, (2,))
+    env = Sampled(gym.spaces.Dict({"c": inner, "b": gym.spaces.Discrete(3, start=-1), "a": box}))
+    agent = small_sac(env)
+    loaded = rejeu.SAC.load(agent.save(tmp_path / "nested"))
+    obs = env.reset(seed=3)[0]
+    np.testing.assert_array_equal(loaded.predict(obs, deterministic=True)[0], agent.predict(obs, deterministic=True)[0])
+
+
+def test_a_replay_buffer_survives(buffer_file, tmp_path):
+    agent, path = buffer_file
+    other = small_sac(Counter((5,)), learning_starts=10**6)
+    other.load_replay_buffer(path)
+    assert other.replay_buffer.size() == agent.replay_buffer.size() == 20
+    one, two = (a.replay_buffer.sample(np.random.default_rng(0), (64,)) for a in (agent, other))
+    for left, right in zip(one[:5], two[:5], strict=True):
+        np.testing.assert_array_equal(left, right)
+
+
 def test_a_hindsight_buffer_survives_with_its_episodes(tmp_path):
     make = lambda: small_sac(Reach(), replay_buffer_class=rejeu.HerReplayBuffer, learning_starts=10**6)  # noqa: E731
     agent = make().learn(37)
@@ -76,6 +110,13 @@ def test_a_hindsight_buffer_survives_with_its_episodes(tmp_path):
     one, two = (a.replay_buffer.sample(np.random.default_rng(0), (64,)) for a in (agent, other))
     np.testing.assert_array_equal(one.obs["desired_goal"], two.obs["desired_goal"])
     np.testing.assert_array_equal(one.reward, two.reward)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="permissions of this kind are POSIX's")
+def test_a_file_may_be_read_by_whoever_may_read_new_files(trained):
+    plain = trained[1].with_name("plain")
+    plain.touch()
+    assert stat.S_IMODE(trained[1].stat().st_mode) == stat.S_IMODE(plain.stat().st_mode)
 
 
 @given(
@@ -103,6 +144,12 @@ def test_any_arrays_and_any_header_come_back_as_they_were(tmp_path, arrays, head
     for name, array in arrays.items():
         assert (found[name].dtype, found[name].shape) == (array.dtype, array.shape)
         assert found[name].tobytes() == array.tobytes()
+
+
+def test_the_library_of_the_format_reads_what_is_written(trained):
+    library = load_file(trained[1])
+    for name, value in trained[0].get_parameters().items():
+        np.testing.assert_array_equal(library[name], value, err_msg=name)
 
 
 def test_arrays_in_another_order_of_bytes_and_memory_come_back_as_numbers(tmp_path):
@@ -161,6 +208,25 @@ def test_numbers_beyond_reason_are_refused_as_such(trained, tmp_path, change, wo
     path = rewrite(trained[1], tmp_path / "other.safetensors", change)
     with pytest.raises((CheckpointError, MemoryError), match=words):
         rejeu.SAC.load(path, env=Counter())
+
+
+def test_another_environment_or_another_kind_of_file_is_refused_when_loading(trained, buffer_file):
+    with pytest.raises(ValueError, match=r"given environment has the observation space .* this agent was made for"):
+        rejeu.SAC.load(trained[1], env=Reach())
+    with pytest.raises(ValueError, match="given environment has the action space"):
+        rejeu.SAC.load(trained[1], env=Counter(low=[-2.0], high=[2.0]))
+    agent, path = buffer_file
+    with pytest.raises(CheckpointError, match="holds 'replay', expected 'agent'"):
+        rejeu.SAC.load(path)
+    with pytest.raises(CheckpointError, match="holds 'agent', expected 'replay'"):
+        agent.load_replay_buffer(trained[1])
+
+
+def test_a_replay_buffer_of_another_environment_is_refused_and_nothing_changes(buffer_file):
+    other = small_sac(Sampled(gym.spaces.Box(-1.0, 1.0, (2,))), learning_starts=10**6).learn(7)
+    with pytest.raises(CheckpointError, match=r"it is of the observation space .*, and this agent was made for Box"):
+        other.load_replay_buffer(buffer_file[1])
+    assert other.replay_buffer.size() == 7
 
 
 # Damage.
@@ -232,6 +298,15 @@ def test_the_file_is_on_disk_before_it_takes_the_old_ones_place_and_its_name_aft
     assert order == ["sync", "replace", "sync"] if os.name == "posix" else ["sync", "replace"]
 
 
+def test_a_folder_that_cannot_be_brought_to_disk_is_no_error(tmp_path, monkeypatch):
+    """Some network file systems cannot; the file itself is there."""
+    real = os.fsync
+    monkeypatch.setattr(
+        atomic.os, "fsync", lambda f: fails_with(errno.EINVAL)() if stat.S_ISDIR(os.fstat(f).st_mode) else real(f)
+    )
+    assert checkpoint.read(checkpoint.write(tmp_path / "a", "rows", {}, {"n": 1}), "rows")[0]["n"] == 1
+
+
 def test_what_a_killed_process_left_behind_goes_with_the_next_write(tmp_path):
     old, new = tmp_path / ".a.safetensors.0123abcd.tmp", tmp_path / ".a.safetensors.4567cdef.tmp"
     others = [
@@ -246,6 +321,16 @@ def test_what_a_killed_process_left_behind_goes_with_the_next_write(tmp_path):
     os.utime(new)
     checkpoint.write(tmp_path / "a", "rows", {}, {})
     assert {p.name for p in tmp_path.iterdir()} == {"a.safetensors", new.name, *others}
+
+
+def test_a_path_that_is_a_folder_or_no_file_is_refused(trained, tmp_path):
+    with pytest.raises(FileNotFoundError, match="there is no run folder or model file nowhere"):
+        rejeu.SAC.load("nowhere")
+    (tmp_path / "model.safetensors").mkdir()
+    words = r"model.safetensors could not be written: there is a folder.* not a folder"
+    with pytest.raises(IsADirectoryError, match=words):
+        trained[0].save(tmp_path / "model")
+    assert [p.name for p in tmp_path.iterdir()] == ["model.safetensors"]
 
 
 @pytest.mark.parametrize(

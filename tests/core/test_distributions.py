@@ -43,6 +43,11 @@ def test_normal_entropy_equals_scipy():
     np.testing.assert_allclose(Normal(jnp.zeros((1, 3)), jnp.float32(log_std)).entropy(), expected, rtol=1e-6)
 
 
+def test_tanh_mode_is_the_squashed_mean():
+    mean = np.array([[0.3, -4.0]])
+    np.testing.assert_allclose(TanhNormal(jnp.float32(mean), jnp.zeros((1, 2))).mode(), np.tanh(mean), rtol=1e-6)
+
+
 @pytest.mark.parametrize("scale", [0.1, 1.0, 5.0, 20.0, 80.0])
 def test_log_slope_of_tanh_is_exact_also_where_it_saturates(scale):
     u = scale * np.linspace(-1.0, 1.0, 41, dtype=np.float32)
@@ -70,13 +75,47 @@ def test_log_prob_gradient_is_finite_and_right_where_tanh_saturates(u):
     assert float(gradient) == pytest.approx(-2.0 * np.tanh(u), abs=1e-6)
 
 
+@pytest.mark.parametrize("mean", [20.0, -20.0])
+def test_gradient_of_a_saturated_sample_is_finite(mean):
+    """With std 1 the log-density's derivative by the mean is 2 tanh(u): the Gaussian part does not depend on it."""
+
+    def log_prob(m):
+        return jnp.sum(TanhNormal(m, jnp.zeros((1, 1))).sample_and_log_prob(jax.random.PRNGKey(0))[1])
+
+    gradient = jax.grad(log_prob)(jnp.array([[mean]]))
+    np.testing.assert_allclose(gradient, [[2.0 * np.sign(mean)]], atol=1e-6)
+
+
+def test_samples_stay_within_the_bounds_for_extreme_parameters():
+    sample = TanhNormal(jnp.array([[50.0, -50.0]]), jnp.array([[2.0, 2.0]])).sample(jax.random.PRNGKey(0))
+    assert (np.abs(sample) <= 1.0).all()
+
+
+@pytest.mark.parametrize("std", [1e-3, 0.4, 7.0])
+def test_normal_samples_are_normally_distributed(std):
+    n = 20_000
+    normal = Normal(jnp.full((n, 1), 1.5, jnp.float32), jnp.full((1, 1), np.log(std), jnp.float32))
+    sample = np.asarray(normal.sample(jax.random.PRNGKey(1)), np.float64)[:, 0]
+    assert stats.kstest(sample, stats.norm(1.5, std).cdf).pvalue > 0.01
+
+
 # The density of a squashed action, given the action.
+
+INSIDE = np.tanh(np.linspace(-3.0, 3.0, 13))
 
 
 def tanh_log_density(action, mean, std):
     """By the change of variables in float64: the density of atanh(a), times d atanh(a) / da = 1 / (1 - a^2)."""
     action = np.float64(action)
     return stats.norm.logpdf(np.arctanh(action), mean, std) - np.log1p(-(action**2))
+
+
+@pytest.mark.parametrize(("mean", "log_std"), [(0.0, 0.0), (1.0, -0.5), (-2.0, 1.0), (4.0, -2.0)])
+def test_the_log_prob_of_a_squashed_action_equals_float64(mean, log_std):
+    action = np.stack([INSIDE, INSIDE[::-1]], axis=1).astype(np.float32)
+    given = TanhNormal(jnp.full((13, 2), mean), jnp.array([[log_std, 0.3]])).log_prob(jnp.array(action))
+    expected = tanh_log_density(action, mean, np.exp([log_std, 0.3])).sum(axis=1)
+    np.testing.assert_allclose(given, expected, rtol=1e-4, atol=1e-4)
 
 
 def test_squashed_samples_follow_their_density():
@@ -100,6 +139,35 @@ def test_the_log_prob_at_the_edge_is_that_near_it_with_finite_gradients(action):
 # One choice.
 
 LOGITS = np.random.default_rng(0).normal(scale=2.0, size=(6, 5))
+PROBABILITIES = np.exp(LOGITS) / np.exp(LOGITS).sum(axis=1, keepdims=True)
+
+
+def test_a_choice_may_have_several_leading_axes_or_none():
+    choice = np.arange(6, dtype=np.int32).reshape(2, 3) % 5
+    expected = np.log(PROBABILITIES[np.arange(6), choice.ravel()]).reshape(2, 3)
+    deep = Categorical(jnp.float32(LOGITS.reshape(2, 3, 5)))
+    np.testing.assert_allclose(deep.log_prob(jnp.array(choice)), expected, rtol=1e-5)
+    assert deep.entropy().shape == deep.mode().shape == deep.sample(jax.random.PRNGKey(0)).shape == (2, 3)
+    flat = Categorical(jnp.float32(LOGITS[4])).log_prob(jnp.int32(4))
+    assert float(flat) == pytest.approx(expected[1, 1], rel=1e-5)
+
+
+def test_the_mode_of_a_choice_is_the_likeliest_and_the_first_of_equals():
+    np.testing.assert_array_equal(Categorical(jnp.float32(LOGITS)).mode(), PROBABILITIES.argmax(axis=1))
+    assert int(Categorical(jnp.array([[0.0, 2.0, 2.0]])).mode()[0]) == 1
+
+
+def chi_square(counts, probabilities):
+    """How likely counts at least so far from what was expected are, if they follow the probabilities."""
+    expected = np.float64(probabilities).ravel() / np.sum(probabilities) * counts.sum()
+    return stats.chisquare(counts.ravel(), expected).pvalue
+
+
+def test_sampled_choices_have_their_probabilities():
+    n = 50_000
+    sample = Categorical(jnp.broadcast_to(jnp.float32(LOGITS[0]), (n, 5))).sample(jax.random.PRNGKey(3))
+    assert sample.dtype == jnp.int32
+    assert chi_square(np.bincount(sample, minlength=5), PROBABILITIES[0]) > 0.01
 
 
 # Several choices.
@@ -122,6 +190,21 @@ def several(rows=slice(None)):
 def test_log_probs_of_several_choices_are_those_of_the_joint_distribution():
     given = np.array([several().log_prob(jnp.tile(one, (6, 1))) for one in COMBINATIONS]).T
     np.testing.assert_allclose(given, np.log(joint_probabilities()), rtol=1e-5)
+
+
+def test_entropy_and_mode_of_several_choices_are_those_of_the_joint_distribution():
+    np.testing.assert_allclose(several().entropy(), stats.entropy(joint_probabilities(), axis=1), rtol=1e-5)
+    np.testing.assert_array_equal(several().mode(), COMBINATIONS[joint_probabilities().argmax(axis=1)])
+
+
+def test_several_sampled_choices_have_their_joint_probabilities():
+    """A key that two choices of one size share would make them go together."""
+    n = 50_000
+    parts = tuple(Categorical(jnp.broadcast_to(jnp.float32(part[0]), (n, part.shape[1]))) for part in PARTS)
+    sample = np.asarray(MultiCategorical(parts).sample(jax.random.PRNGKey(4)))
+    assert (sample.shape, sample.dtype) == ((n, 3), np.int32)
+    counts = np.bincount(np.ravel_multi_index(tuple(sample.T), SIZES), minlength=len(COMBINATIONS))
+    assert chi_square(counts, joint_probabilities()[0]) > 0.01
 
 
 # Bits.
@@ -148,6 +231,14 @@ def test_entropy_and_mode_of_bits_are_those_of_the_joint_distribution():
     bernoulli = Bernoulli(jnp.float32(ODDS))
     np.testing.assert_allclose(bernoulli.entropy(), stats.entropy(probabilities_of_bits(), axis=1), rtol=1e-5)
     np.testing.assert_array_equal(bernoulli.mode(), BITS[probabilities_of_bits().argmax(axis=1)])
+
+
+def test_sampled_bits_have_their_joint_probabilities():
+    n = 50_000
+    sample = Bernoulli(jnp.broadcast_to(jnp.float32(ODDS[0]), (n, 3))).sample(jax.random.PRNGKey(6))
+    assert (sample.shape, sample.dtype) == ((n, 3), jnp.int32)
+    counts = np.bincount(np.asarray(sample) @ [4, 2, 1], minlength=8)
+    assert chi_square(counts, probabilities_of_bits()[0]) > 0.01
 
 
 # Forbidden choices, and logits far from 0.
@@ -208,6 +299,18 @@ def test_a_forbidden_bit_is_never_1_and_leaves_the_others_as_they_are():
     np.testing.assert_allclose(by_entropy[allowed], -ODDS[0][allowed] * p * (1.0 - p), atol=1e-6)  # dH/dz = -z p (1-p)
     np.testing.assert_allclose(by_log_prob[allowed], [1.0, 0.0] - p, atol=1e-6)
     assert by_entropy[1] == by_log_prob[1] == 0.0
+
+
+def test_a_forbidden_possibility_of_one_choice_leaves_the_other_choices_alone():
+    mask = np.array([False, True, True])
+    parts = (Categorical(jnp.where(mask, jnp.float32(PARTS[0]), jnp.float32(FORBIDDEN))), *several().parts[1:])
+    masked = MultiCategorical(parts)
+    first = special.softmax(PARTS[0][:, mask], axis=1)
+    rest = [special.softmax(part, axis=1) for part in PARTS[1:]]
+    expected = sum(stats.entropy(p, axis=1) for p in (first, *rest))
+    np.testing.assert_allclose(masked.entropy(), expected, rtol=1e-5)
+    given = masked.log_prob(jnp.tile(np.array([2, 1, 2], np.int32), (6, 1)))
+    np.testing.assert_allclose(given, np.log(first[:, 1] * rest[0][:, 1] * rest[1][:, 2]), rtol=1e-5)
 
 
 @pytest.mark.parametrize("scale", [1e4, 1e8])

@@ -44,6 +44,13 @@ def test_everything_comes_back_as_what_it_was(value):
     assert same(records.decode(json.loads(text), arrays), value)
 
 
+def test_arrays_are_copies():
+    array, arrays = np.zeros(3), {}
+    records.encode([array], arrays, "x")
+    array[0] = 1
+    assert arrays["x.0"].tolist() == [0, 0, 0]
+
+
 @pytest.mark.parametrize("value", [object(), {1: 2}, {"a": {3}}, np.array(["text"]), np.array([None]), 1j, b"bytes"])
 def test_other_things_are_refused_with_their_place(value):
     with pytest.raises(TypeError, match=r"^x\.1.* expected numbers, strings"):

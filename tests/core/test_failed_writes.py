@@ -5,8 +5,10 @@ from __future__ import annotations
 import csv
 import errno
 import math
+import warnings
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -16,6 +18,7 @@ from rejeu.checkpoints.run_folder import run_files
 from rejeu.core import failed_writes
 from rejeu.core.failed_writes import FailedWrites
 from rejeu.logs.logging import CsvFile, TensorBoard
+from rejeu.sb3.common.callbacks import CheckpointCallback, EvalCallback
 from tests.full_disk import FullDisk
 from tests.helpers import small_sac
 
@@ -152,6 +155,22 @@ def test_the_best_model_is_written_late_as_it_was_when_it_was_the_best(tmp_path,
     assert not all(np.array_equal(saved[key], value) for key, value in agent.get_parameters().items())
 
 
+def test_hooks_that_cannot_write_do_not_end_training(tmp_path, disk):
+    paths = {"log_path": tmp_path, "best_model_save_path": tmp_path}
+    hooks = [
+        CheckpointCallback(10, tmp_path, save_replay_buffer=True),
+        EvalCallback(gym.make(BALL), n_eval_episodes=1, eval_freq=15, verbose=0, **paths),
+    ]
+    agent = small_sac(BALL)
+    with pytest.warns(UserWarning, match="No space left") as record:
+        agent.learn(40, [full_between(disk, 14, 25), *hooks])
+    for name in ("rl_model_20_", "rl_model_replay", "evaluations.npz", "best_model"):
+        assert name in str(warned(record))
+    assert (tmp_path / "rl_model_30_steps.zip").exists()
+    assert np.load(tmp_path / "evaluations.npz")["timesteps"].tolist() == [15, 30]
+    assert rejeu.load(tmp_path / "best_model")
+
+
 def test_rows_for_tensorboard_that_failed_are_complete_later(tmp_path, disk):
     accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
     agent = small_sac(BALL)
@@ -161,6 +180,20 @@ def test_rows_for_tensorboard_that_failed_are_complete_later(tmp_path, disk):
     events = accumulator.EventAccumulator(str(tmp_path)).Reload()
     ended = agent.history["step"]
     assert [one.step for one in events.Scalars("time/episodes")] == np.unique(ended).astype(int).tolist()
+
+
+def test_a_monitor_writes_its_rows_when_it_can(tmp_path, disk):
+    env = rejeu.Monitor(gym.make("CartPole-v1"), tmp_path / "run")
+    with pytest.warns(UserWarning, match="No space left"):  # noqa: PT031
+        for episode in range(4):
+            disk.full = episode in (1, 2)
+            env.reset(seed=episode)
+            while not any(env.step(0)[2:4]):
+                pass
+        env.close()
+    lines = env.path.read_text().splitlines()
+    assert [int(line.split(",")[1]) for line in lines[2:]] == env.get_episode_lengths()
+    assert len(lines) == 6
 
 
 def test_of_too_many_rows_the_newest_are_kept_and_the_loss_is_reported(monkeypatch):
@@ -180,3 +213,11 @@ def test_of_too_many_rows_the_newest_are_kept_and_the_loss_is_reported(monkeypat
     assert written == [3, 4, 5]
     assert not failed.complete
     assert failed.summary().startswith("not written (only 3 wait): the first 3 rows that failed")
+
+
+def test_other_errors_of_a_write_are_raised():
+    def write():
+        raise TypeError("a defect")
+
+    with warnings.catch_warnings(), pytest.raises(TypeError, match="a defect"):
+        FailedWrites().attempt("the table", write)

@@ -64,6 +64,25 @@ def test_control_groups_limit_memory_and_cores(files, machine):
     assert hardware.cores() == 2
 
 
+def test_without_limits_the_machine_counts(machine):
+    machine({"membership": "0::/\n", "cgroups/cpu.max": "max 100000\n", "cgroups/memory.max": "max\n"})
+    assert (hardware.physical_memory(), hardware.free_memory()) == (4096 * MIB, 3072 * MIB)
+    assert hardware.cores() == 8
+
+
+def test_where_the_system_does_not_say_what_is_free_all_of_it_counts(machine):
+    machine({"meminfo": ""})
+    assert hardware.free_memory() == 4096 * MIB
+
+
+def test_the_environment_limits_the_cores(monkeypatch):
+    monkeypatch.setenv(hardware.CORES, "1")
+    assert hardware.cores() == 1
+    for text in ("", "many", "0"):
+        monkeypatch.setenv(hardware.CORES, text)
+        assert hardware.cores() >= 1
+
+
 def test_a_buffer_for_which_too_little_memory_is_free_is_refused(machine):
     machine({})
     check_memory(3072 * MIB, 1000)

@@ -51,6 +51,13 @@ def test_an_interrupt_within_another_tells_it_and_the_second_signal_acts_at_once
     assert (inner.signal, outer.signal) == (signal.SIGTERM, signal.SIGTERM)
 
 
+def test_handlers_are_put_back():
+    before = signal.getsignal(signal.SIGTERM)
+    with Interrupt(), interrupt.leaving():
+        assert signal.getsignal(signal.SIGTERM) != before
+    assert signal.getsignal(signal.SIGTERM) == before
+
+
 @pytest.mark.parametrize(("number", "status"), [("SIGINT", 130), ("SIGTERM", 143), ("SIGHUP", 129)])
 def test_a_signal_within_a_callback_of_the_garbage_collector_is_not_swallowed(number, status):
     script = f"""if True:
@@ -122,6 +129,26 @@ def test_a_signal_during_imports_is_one_line(number, status, tmp_path):
     assert (done.returncode, done.stdout, done.stderr) == (status, "", "rejeu: interrupted\n")
 
 
+def test_importing_the_package_elsewhere_leaves_signals_alone():
+    assert not interrupt.is_command()
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+@pytest.mark.parametrize(
+    ("program", "is_command"),
+    [
+        ("/usr/bin/rejeu", True),
+        ("Scripts/rejeu.exe", True),
+        (str(SOURCE.parents[1] / "__main__.py"), True),  # python -m rejeu, once it runs
+        ("train.py", False),
+        ("other/__main__.py", False),
+    ],
+)
+def test_the_command_is_known_by_the_program_that_runs(program, is_command, monkeypatch):
+    monkeypatch.setattr(sys, "argv", [program, "list"])
+    assert interrupt.is_command() == is_command
+
+
 def test_a_signal_after_training_ends_the_command_and_keeps_the_models(tmp_path, monkeypatch):
     ends, out = [], tmp_path / "run"
 
@@ -161,3 +188,25 @@ def test_a_signal_while_filming_leaves_nothing_of_the_file(tmp_path):
         rejeu.record_video(Still(), tmp_path / "video.mp4", "CartPole-v1", episodes=1)
     assert stopped.value.signal == signal.SIGTERM
     assert not [*tmp_path.iterdir()]
+
+
+def test_a_film_made_while_training_is_completed_after_a_signal(tmp_path):
+    with Interrupt() as training:
+        path = rejeu.record_video(Still(), tmp_path / "video.mp4", "CartPole-v1", episodes=1)
+    assert training.requested
+    assert [*tmp_path.iterdir()] == [path]
+
+
+def test_a_command_that_a_signal_ended_ignores_further_ones(monkeypatch):
+    """While Python shuts down it restores the default handlers, so a second signal would change the exit status."""
+    monkeypatch.setattr(interrupt, "is_command", lambda: True)
+    monkeypatch.setattr(cli, "run_command", lambda argv: argv[0])
+    before = {number: signal.getsignal(number) for number in interrupt.NAMES}
+    try:
+        for status in (0, 2):
+            assert cli.main([status]) == status
+            assert all(signal.getsignal(number) is not signal.SIG_IGN for number in before)
+        assert cli.main([143]) == 143
+        assert all(signal.getsignal(number) is signal.SIG_IGN for number in before)
+    finally:
+        interrupt.restore(before)

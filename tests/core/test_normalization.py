@@ -12,7 +12,8 @@ from hypothesis import given, strategies as st
 import rejeu
 from rejeu.algorithms.catalog import CATALOG
 from rejeu.core.algorithm import Algorithm, Clock, Masked, Rollout, Transition
-from rejeu.core.normalization import NormalizationConfig, merged, no_moments, normalized
+from rejeu.core.errors import CheckpointError
+from rejeu.core.normalization import MAX_COUNT, Moments, NormalizationConfig, merged, no_moments, normalized
 from rejeu.core.spaces import leaves, scale_action
 from rejeu.envs.make import InProcess
 from rejeu.exploration import explorer as exploration
@@ -20,7 +21,7 @@ from rejeu.exploration.parameter_space import ParameterNoise
 from tests.algorithms.probes.environments import Discretely, Later
 from tests.environments import Counter, Reach
 from tests.helpers import assert_same_parameters, small_sac
-from tests.tiers import only
+from tests.tiers import exhaustive, only
 
 pytestmark = pytest.mark.usefixtures("learners_are_shared")
 
@@ -62,6 +63,16 @@ def test_moments_are_numpys_however_the_values_come(sizes, seed, offset, share):
         return
     np.testing.assert_allclose(moments.mean, seen.mean(axis=0), rtol=1e-5, atol=1e-5)
     np.testing.assert_allclose(moments.variance, seen.var(axis=0), rtol=2e-4, atol=1e-5)
+
+
+def test_long_runs_forget_rather_than_stand_still():
+    """Beyond 2^24 float32 no longer counts by ones: the share of a new value must not vanish."""
+    before = Moments(jnp.float32(0.0), jnp.float32(1.0), jnp.float32(MAX_COUNT))
+    after = merge(before, np.full(WIDTH, 1e6, np.float32), np.ones(WIDTH, np.float32))
+    share = WIDTH / (MAX_COUNT + WIDTH)
+    assert float(after.n_seen) == MAX_COUNT
+    assert float(after.mean) == pytest.approx(share * 1e6, rel=1e-6)
+    assert float(after.variance) == pytest.approx((1 - share) + (1 - share) * share * 1e12, rel=1e-5)
 
 
 # What is scaled: the normalized form of an algorithm that shows what it is given.
@@ -314,6 +325,15 @@ def assert_moments(moments, values):
     np.testing.assert_allclose(moments.variance, values.var(axis=0), rtol=1e-3, atol=1e-4)
 
 
+def test_off_policy_statistics_are_those_of_what_came():
+    """Every step brings the observation that is acted on next; the returns run on until their episode ends."""
+    envs = [Noted(1), Noted(2)]
+    agent = rejeu.SAC("MlpPolicy", InProcess(envs), normalize=True, **OFF).learn(40)
+    statistics = agent.state.statistics
+    assert_moments(statistics.returns, np.concatenate([env.running_returns(0.9) for env in envs]))
+    assert_moments(statistics.obs[0], [obs for env in envs for kind, obs in env.shown[1:] if kind != "end"])
+
+
 @pytest.mark.parametrize("name", only(["A2C"], ["A2C", "PPO"]))
 def test_on_policy_statistics_are_those_of_what_was_acted_on(name):
     envs = [Noted(1), Noted(2)]
@@ -322,6 +342,15 @@ def test_on_policy_statistics_are_those_of_what_was_acted_on(name):
     assert_moments(statistics.returns, np.concatenate([env.running_returns(0.9) for env in envs]))
     acted_on = [[obs for kind, obs in env.shown if kind != "end"][:18] for env in envs]
     assert_moments(statistics.obs[0], np.concatenate(acted_on))
+
+
+def test_the_policy_of_a_rollout_keeps_its_statistics_until_it_has_been_learnt_from():
+    seen = []
+    agent = rejeu.A2C("MlpPolicy", env := Noted(), normalize=True, **ON)
+    agent.learn(18, lambda agent, _: seen.append(float(agent.state.statistics.obs[0].n_seen)) and None)
+    assert seen == [0.0] * 5 + [6.0] * 6 + [12.0] * 6 + [18.0]
+    sums = [env.rewards[a:b].sum() for a, b in ((0, 3), (3, 8), (8, 10), (10, 13), (13, 18))]
+    assert [e.episode_return for e in agent.history.episodes] == pytest.approx(sums, rel=1e-5)  # the environment's own
 
 
 class Allowing(Discretely):
@@ -388,6 +417,25 @@ def test_predict_takes_raw_observations(name):
         assert not np.allclose(given, scale_action(agent.action_space, unscaled), atol=1e-3)
 
 
+def test_an_agent_with_statistics_does_not_take_a_file_without_them(tmp_path):
+    plain = rejeu.SAC("MlpPolicy", Noted(), **OFF)
+    path = plain.save(tmp_path / "plain")
+    with pytest.raises(CheckpointError):
+        normalising("SAC").set_parameters(path)
+    with pytest.raises(CheckpointError):
+        rejeu.load(path, normalize=True)
+
+
+def test_the_best_weights_come_back_with_their_statistics():
+    agent = normalising("SAC")
+    kept = agent.get_parameters()
+    agent.remember_best(1.0)
+    agent.learn(20)
+    assert float(agent.state.statistics.returns.n_seen) == 44.0
+    agent.restore_best()
+    assert all(np.array_equal(value, kept[key]) for key, value in agent.get_parameters().items())
+
+
 # Exploration.
 
 
@@ -428,6 +476,11 @@ def reaching(n_steps):
         policy_kwargs={"net_arch": [32, 32]},
         seed=0,
     ).learn(n_steps)
+
+
+@exhaustive
+def test_hindsight_learns_on_scaled_goals():
+    assert reaching(1600).evaluate(40, env=InProcess([Reach() for _ in range(4)], seed=1)).success_rate >= 0.9
 
 
 def test_hindsight_relabels_raw_goals():

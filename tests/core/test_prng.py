@@ -37,3 +37,27 @@ def test_the_hash_gives_its_authors_known_answers():
     """From the file of known answers of Random123: threefry2x32, 20 rounds, key and counter 0."""
     high, low = threefry(jnp.zeros(2, jnp.uint32), jnp.zeros((), jnp.uint32))
     assert (hex(int(high)), hex(int(low))) == ("0x6b200159", "0x99ba4efe")
+
+
+def test_wide_numbers_are_those_of_jax():
+    """As in environments in JAX and algorithms that draw in the default dtype with ``jax_enable_x64``."""
+    with jax.enable_x64(True):
+        expected = jax.random.uniform(jax.random.fold_in(jax.random.key(3, impl="threefry2x32"), np.uint32(5)), (7,))
+        found = jax.random.uniform(nth(jax.random.PRNGKey(3), 5), (7,))
+        assert found.dtype == np.float64
+        np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="of XLA on CPUs")
+def test_numbers_that_several_kernels_read_are_hashed_once():
+    """XLA repeats what is elementwise in each of them; repeated hashes once doubled the time to compile an update."""
+
+    def rotations(n_readers):
+        def readers(key, scales):
+            noise = jax.random.normal(nth(key, 0), (64, 2))
+            return [jnp.sum(jnp.exp(scales[i] * noise), axis=i % 2) for i in range(n_readers)]
+
+        lowered = jax.jit(readers).lower(jax.random.PRNGKey(0), jnp.arange(1.0, 6.0))
+        return lowered.compile().as_text().count(" shift-left(")
+
+    assert 0 < rotations(5) <= rotations(1)

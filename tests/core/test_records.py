@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import msgspec
+import numpy as np
 import pytest
 
-from rejeu.core.records import Malformed, parse_json
+from rejeu.core.errors import CheckpointError
+from rejeu.core.records import Count, EnvCount, Malformed, Seed, convert, parse_json
 
 
 @pytest.mark.parametrize(
@@ -24,3 +27,41 @@ from rejeu.core.records import Malformed, parse_json
 def test_json_that_is_not_strict_is_refused(text, words):
     with pytest.raises(Malformed, match=words):
         parse_json(text)
+
+
+def test_long_integers_and_nesting_within_the_limits_are_read():
+    assert parse_json("[" * 100 + "]" * 100)
+    assert float(parse_json("9" * 300)) == 1e300
+
+
+class Inner(msgspec.Struct):
+    n_envs: EnvCount
+    seeds: list[Seed]
+
+
+class Record(msgspec.Struct):
+    inner: Inner
+    array: np.ndarray
+    counts: dict[str, Count] = {}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"inner": {"n_envs": 5000, "seeds": []}}, "inner.n_envs=5000: expected `int` <= 4096"),
+        ({"inner": {"n_envs": True, "seeds": []}}, "inner.n_envs=True: expected `int`, got `bool`"),
+        ({"inner": {"n_envs": 1, "seeds": [0, -1]}}, "inner.seeds[1]=-1: expected `int` >= 0"),
+        ({"inner": {"n_envs": 1}}, "inner={'n_envs': 1}: object missing required field `seeds`"),
+        ({"array": [1]}, "array=[1]: expected `numpy.ndarray`, got `list`"),
+        ({"counts": {"a": "x"}}, "counts[...]: expected `int`, got `str`"),
+        ({"counts": {1: 2}}, "key in $.counts: expected `str`, got `int`"),
+    ],
+)
+def test_an_error_says_what_was_received_and_expected(change, message):
+    good = {"inner": {"n_envs": 1, "seeds": [0]}, "array": np.zeros(2), "later": 3}
+    assert convert(good, Record).inner.seeds == [0]
+    with pytest.raises(CheckpointError) as caught:
+        convert({**good, **change}, Record)
+    assert str(caught.value) == message
+    with pytest.raises(CheckpointError, match=r"^object missing required field `inner`$"):
+        convert({}, Record)

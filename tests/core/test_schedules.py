@@ -16,9 +16,11 @@ import pytest
 import rejeu
 from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.algorithms.rollout_config import RolloutConfig
+from rejeu.callbacks import Checkpoint
 from rejeu.core.algorithm import TD_ERROR, Algorithm
 from rejeu.core.schedules import Exponential, Linear, at, parse, to_json
 from rejeu.replay.prioritized import PriorityConfig
+from rejeu.training.run import TrainingCall
 from tests.environments import Counter
 from tests.helpers import small_sac
 
@@ -30,6 +32,18 @@ def test_linear_is_a_line_to_its_fraction_and_constant_after(progress, value):
     assert Linear(1.0, 0.1, fraction=0.5)(progress) == pytest.approx(value)
     assert at(Linear(1.0, 0.1, fraction=0.5), progress) == pytest.approx(value)
     assert at(0.3, progress) == 0.3
+
+
+@pytest.mark.parametrize(("progress", "value"), [(0.0, 1.0), (0.25, 0.1), (0.5, 0.01), (1.0, 0.01)])
+def test_exponential_falls_by_the_same_factor_for_the_same_stretch(progress, value):
+    assert Exponential(1.0, 0.01, fraction=0.5)(progress) == pytest.approx(value)
+
+
+@pytest.mark.parametrize("schedule", [Linear(3e-4, 1e-5, 0.7), Exponential(3e-4, 1e-5, 0.7)])
+def test_traced_progress_gives_what_a_number_gives(schedule):
+    progress = np.linspace(-0.1, 1.1, 13, dtype=np.float32)
+    traced = jax.jit(jax.vmap(schedule))(progress)
+    np.testing.assert_allclose(traced, [schedule(float(p)) for p in progress], rtol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -70,6 +84,12 @@ def test_what_is_no_schedule_is_refused_by_name(given, error, words):
         parse("learning_rate", given)
 
 
+@pytest.mark.parametrize("make", [lambda: Linear(1.0, 0.0, fraction=0.0), lambda: Linear(1.0, 0.0, fraction=1.5)])
+def test_a_fraction_outside_the_run_is_refused(make):
+    with pytest.raises(ValueError, match=r"fraction=.* must be above 0 and at most 1"):
+        make()
+
+
 @pytest.mark.parametrize("ends", [(0.0, 1.0), (1.0, 0.0), (-1.0, 1.0)])
 def test_an_exponential_needs_positive_ends(ends):
     with pytest.raises(ValueError, match="exponential schedule needs positive ends"):
@@ -107,6 +127,47 @@ def test_schedules_continue_over_learn_as_in_stable_baselines3():
     for got, wanted in zip(told, expected, strict=True):
         np.testing.assert_allclose(got, wanted[-len(got) :], rtol=1e-6)
         assert len(got) >= len(wanted) - 1  # nothing can be drawn in the first turn
+
+
+def test_schedules_follow_training_time_likewise(monkeypatch):
+    monkeypatch.setattr("time.perf_counter", lambda: 100.0)
+    call = TrainingCall(None, None, 60.0, 0, 0, 4, 0, seconds_before=20.0)
+    assert call.progress(5, 1) == 20 / 80
+    monkeypatch.setattr("time.perf_counter", lambda: 130.0)
+    assert call.progress(5, 1) == 50 / 80
+    monkeypatch.setattr("time.perf_counter", lambda: 160.0)
+    assert call.progress(5, 1) == 1.0
+    rejeu.core.xla.enable_cache()
+    jax.monitoring.record_event_duration_secs("/jax/core/compile/backend_compile_duration", 40.0)
+    assert call.progress(5, 1) == pytest.approx(40 / 80)  # compilation takes none of it
+    agent = small_sac(Counter()).learn(8)
+    spent = agent.seconds["total"]
+    agent.learn(minutes=1, callback=lambda *_: False, reset_num_timesteps=False)
+    assert agent.training_call.seconds_before == spent
+
+
+def test_a_resumed_call_keeps_its_progress_and_its_schedules_continue_after_it(tmp_path):
+    make = lambda: rejeu.make_vector("Pendulum-v1", 1, "gymnasium", seed=0)  # noqa: E731
+    agent = small_sac(make(), learning_starts=0).learn(20)
+    stop = lambda agent, turn: turn.step < 50  # noqa: E731
+    agent.learn(60, [stop, Checkpoint(tmp_path, every=1000)], reset_num_timesteps=False)
+    agent = rejeu.SAC.resume(tmp_path, make())
+    more = {"total_timesteps": 20, "reset_num_timesteps": False}
+    rest, after = progress_of_updates(agent, {}, more)
+    np.testing.assert_allclose(rest, np.arange(51, 81) / 80, rtol=1e-6)
+    np.testing.assert_allclose(after, np.arange(81, 101) / 100, rtol=1e-6)
+
+
+def test_schedules_of_a_loaded_agent_continue_by_the_steps_and_episodes_of_its_file(tmp_path):
+    agent = small_sac(Counter(lengths=(1,)), learning_starts=0).learn(10)
+    agent.learn(20).save(tmp_path / "agent")
+    agent = rejeu.SAC.load(tmp_path / "agent", Counter(lengths=(1,)))
+    by_steps, by_episodes = progress_of_updates(
+        agent, {"total_timesteps": 20, "reset_num_timesteps": False}, {"episodes": 10, "reset_num_timesteps": False}
+    )
+    np.testing.assert_allclose(by_steps[-1], 40 / 40)
+    np.testing.assert_allclose(by_steps[0], (20 + 21 - len(by_steps)) / 40, rtol=1e-6)
+    np.testing.assert_allclose(by_episodes, (40 + np.arange(1, 11)) / 50, rtol=1e-6)
 
 
 def test_any_function_of_the_progress_is_a_schedule(tmp_path):

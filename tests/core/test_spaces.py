@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import OrderedDict
 
 import jax
 import numpy as np
@@ -34,6 +35,22 @@ EVERY = [
 ]
 
 
+def test_leaves_stand_in_the_order_of_jax():
+    observation = spaces.cast(NESTED, spaces.leaves(NESTED), NESTED.sample())
+    paths = [
+        jax.tree_util.keystr(path, simple=True, separator=".") for path, _ in jax.tree.leaves_with_path(observation)
+    ]
+    assert [leaf.path for leaf in spaces.leaves(NESTED)] == paths == ["a", "m.bits", "m.many", "z.0", "z.1"]
+
+
+@pytest.mark.parametrize("space", EVERY, ids=str)
+def test_leaves_have_the_shapes_and_dtypes_of_cast_observations(space):
+    leaves = spaces.leaves(space)
+    arrays = jax.tree.leaves(spaces.cast(space, leaves, space.sample()))
+    assert [(a.shape, a.dtype.name) for a in arrays] == [(leaf.shape, leaf.dtype) for leaf in leaves]
+    assert jax.tree.structure(spaces.plain(space, space.sample())) == spaces.structure(space)
+
+
 @pytest.mark.parametrize(
     ("dtype", "kept"),
     [
@@ -49,6 +66,23 @@ EVERY = [
 )
 def test_only_what_has_64_bits_is_narrowed(dtype, kept):
     assert spaces.narrow(np.dtype(dtype)) == kept
+
+
+def test_features_count_one_hot_places():
+    features = {leaf.path: (leaf.kind, leaf.n_features) for leaf in spaces.leaves(NESTED)}
+    assert features == {
+        "a": ("continuous", 2),
+        "m.bits": ("binary", 4),
+        "m.many": ("categorical", 5),
+        "z.0": ("categorical", 3),
+        "z.1": ("image", 48),
+    }
+
+
+def test_plain_takes_values_by_key_not_by_place():
+    space = gym_spaces.Dict({"a": BOX, "b": gym_spaces.Tuple([BOX, BOX])})
+    given = OrderedDict([("b", [2, 3]), ("a", 1)])
+    assert jax.tree.leaves(spaces.plain(space, given)) == [1, 2, 3]
 
 
 # Actions.
@@ -80,6 +114,25 @@ def test_scaled_actions_never_leave_bounds_that_float32_rounds():
     assert all(space.contains(a) for a in spaces.scale_action(space, action))
 
 
+def test_a_whole_number_of_one_value_is_an_action():
+    """Of RubiksCube in EnvPool, the depth of the slice to turn."""
+    space = gym_spaces.Box(np.int32([0, 0]), np.int32([5, 0]), dtype=np.int32)
+    assert spaces.check_box_action(space, "SAC") is space
+    scaled = spaces.scale_action(space, np.float32([[-1.0, -1.0], [1.0, 1.0]]))
+    np.testing.assert_array_equal(scaled, [[0, 0], [5, 0]])
+    np.testing.assert_array_equal(spaces.unscale_action(space, scaled)[:, 1], [0, 0])
+
+
+def test_random_actions_fill_the_range_of_the_algorithm():
+    action = spaces.random_action(ASYMMETRIC, 2000, np.random.default_rng(0))
+    assert (action.shape, action.dtype) == ((2000, 3), np.float32)
+    assert (np.abs(action) <= 1).all()
+    assert (action.min(axis=0) < -0.99).all()
+    assert (action.max(axis=0) > 0.99).all()
+    discrete = spaces.random_action(gym_spaces.Discrete(3, start=4), 100, np.random.default_rng(0))
+    assert set(discrete.tolist()) == {0, 1, 2}
+
+
 # Descriptions in files.
 
 
@@ -90,6 +143,13 @@ def test_a_space_survives_its_description_as_json(space):
     assert spaces.describe(again) == spaces.describe(space)
     assert spaces.leaves(again) == spaces.leaves(space)
     assert jax.tree.structure(spaces.plain(again, again.sample())) == spaces.structure(space)
+
+
+def test_bounds_of_a_box_survive_exactly():
+    low, high = np.float32([0.1, -np.inf]), np.float32([1 / 3, np.inf])
+    again = spaces.rebuild(spaces.describe(gym_spaces.Box(low, high)))
+    np.testing.assert_array_equal(again.low, low)
+    np.testing.assert_array_equal(again.high, high)
 
 
 @pytest.mark.parametrize(
@@ -151,3 +211,46 @@ GOALS = dict(GOAL_OBSERVATION.spaces)
 def test_a_space_that_does_not_fit_is_refused(check, space, error, words):
     with pytest.raises(error, match=words):
         check(space, *(["SAC"] if check in (spaces.check_action, spaces.check_box_action) else []))
+
+
+def test_what_fits_passes_and_a_missing_key_does_not():
+    spaces.check_goal_space(GOAL_OBSERVATION)
+    with pytest.raises(KeyError, match="b"):
+        spaces.plain(gym_spaces.Dict({"a": BOX, "b": BOX}), {"a": 1})
+
+
+def test_observation_bounds_do_not_tell_spaces_apart_and_action_bounds_do():
+    one, two = gym_spaces.Box(-1.0, 1.0, (2,)), gym_spaces.Box(-2.0, 2.0, (2,))
+    assert spaces.same(one, two, bounds=False)
+    assert not spaces.same(one, two, bounds=True)
+    assert not spaces.same(one, gym_spaces.Box(-1.0, 1.0, (3,)), bounds=False)
+    assert not spaces.same(gym_spaces.Dict({"a": BOX}), gym_spaces.Dict({"b": BOX}), bounds=False)
+
+
+def test_actions_of_both_precisions_are_the_same_and_other_bounds_are_not():
+    low, high = np.float32(-0.4), np.float32(0.4)
+    one, two = gym_spaces.Box(low, high, (2,)), gym_spaces.Box(-0.4, 0.4, (2,), np.float64)
+    assert spaces.same(one, two, bounds=True)
+    assert spaces.same(gym_spaces.Tuple([one, BOX]), gym_spaces.Tuple([two, BOX]), bounds=True)
+    assert not spaces.same(one, gym_spaces.Box(-0.4, 0.5, (2,), np.float64), bounds=True)
+
+
+def test_flat_keys_are_those_of_dicts_of_arrays_alone():
+    box = gym_spaces.Box(-1.0, 1.0, (2,))
+    flat = gym_spaces.Dict({"z": box, "a.b": gym_spaces.Discrete(3), "m": box})
+    assert spaces.flat_keys(spaces.structure(flat)) == [leaf.path for leaf in spaces.leaves(flat)] == ["a.b", "m", "z"]
+    for other in (box, gym_spaces.Tuple([box]), gym_spaces.Dict({"a": gym_spaces.Dict({"b": box})})):
+        assert spaces.flat_keys(spaces.structure(other)) is None
+
+
+def test_every_whole_number_of_a_box_of_integers_gets_an_equal_part_of_the_range():
+    space = gym_spaces.Box(np.array([0, -2], np.int64), np.array([3, 2], np.int64), dtype=np.int64)
+    spread = np.linspace(-1.0, 1.0, 2001, dtype=np.float32)
+    actions = spaces.scale_action(space, np.stack([spread, spread], axis=1))
+    assert actions.dtype == np.int64
+    for column, numbers in enumerate((np.arange(4), np.arange(-2, 3))):
+        found, counts = np.unique(actions[:, column], return_counts=True)
+        np.testing.assert_array_equal(found, numbers)
+        np.testing.assert_allclose(counts, 2001 / len(numbers), atol=2)
+    assert spaces.scale_action(space, np.float32([[-7.0, 7.0]])).tolist() == [[0, 2]]
+    assert space.contains(actions[0])

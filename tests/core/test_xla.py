@@ -17,6 +17,17 @@ def test_what_runs_once_is_computed_also_where_xla_does_not_know_the_options(mon
     assert xla.run_once(lambda x: 2.0 * x)(jnp.float32(3.0)) == 6.0
 
 
+def test_other_errors_of_the_device_are_not_hidden():
+    def broken(x):
+        def raises(_):
+            raise RuntimeError("the cause")
+
+        return jax.pure_callback(raises, x, x)
+
+    with pytest.raises(jax.errors.JaxRuntimeError, match="the cause"):
+        jax.block_until_ready(xla.run_once(broken)(jnp.float32(1.0)))
+
+
 @pytest.mark.parametrize("wrapped", [xla.outlined, xla.one_kernel])
 def test_a_function_apart_computes_the_same_and_takes_any_tree_and_setting(wrapped):
     def function(tree, factor, activation, *, nothing):
@@ -28,6 +39,12 @@ def test_a_function_apart_computes_the_same_and_takes_any_tree_and_setting(wrapp
     inside = jax.jit(lambda tree: wrapped(function)(tree, 0.5, jnp.tanh, nothing=None))
     for found in (wrapped(function)(tree, 0.5, jnp.tanh, nothing=None), inside(tree)):
         jax.tree.map(lambda e, f: np.testing.assert_allclose(f, e, rtol=1e-6), expected, found)
+
+
+@pytest.mark.parametrize("wrapped", [xla.outlined, xla.one_kernel])
+def test_a_function_apart_may_be_differentiated_and_batched(wrapped):
+    cube = wrapped(lambda x: x**3)
+    np.testing.assert_allclose(jax.jit(jax.vmap(jax.grad(cube)))(jnp.arange(4.0)), 3 * np.arange(4.0) ** 2, rtol=1e-6)
 
 
 @pytest.mark.parametrize("n_runs", [1, 8])
@@ -56,3 +73,9 @@ def test_a_step_with_compiled_functions_inside_is_compiled_for_several_runs():
     (found,) = jax.jit(jax.vmap(xla.for_runs(steps, 3)))(begin)
     (expected,) = steps(jax.tree.map(lambda x: x[0], begin))
     np.testing.assert_allclose(found, jnp.broadcast_to(expected, found.shape), rtol=1e-6)
+
+
+def test_other_processors_are_told_nothing(monkeypatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    traced = jax.make_jaxpr(xla.one_kernel(lambda x: 2.0 * x))(jnp.ones(3))
+    assert [equation.primitive.name for equation in traced.eqns] == ["mul"]

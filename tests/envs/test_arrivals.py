@@ -8,6 +8,7 @@ import functools
 import numpy as np
 import pytest
 
+from rejeu.agents import PPO
 from rejeu.core.errors import WorkerError
 from rejeu.envs.make import make_vector
 from tests.tiers import only
@@ -37,6 +38,46 @@ def test_the_others_do_not_wait_for_a_slow_step(tmp_path):
         vector.send(ZERO)
         while 0 not in vector.receive().which:
             vector.send(ZERO)
+
+
+def test_infos_are_those_of_the_results_that_were_taken():
+    with opened(Paced) as vector:
+        vector.reset()
+        said = []
+        while len(said) < 3:
+            vector.send(ZERO)
+            step = vector.receive()
+            (i,) = step.which
+            assert vector.infos()[i] is step.info[i]
+            said += [vector.infos()[i]["is_success"]] if (step.terminated | step.truncated)[i] else []
+
+
+def test_rows_of_environments_that_still_step_keep_their_observation():
+    with opened(functools.partial(Paced, 0.01)) as vector:
+        first = vector.reset().copy()
+        vector.send(ZERO + 0.5)
+        step = vector.receive()
+        (i,) = step.which
+        rest = np.arange(3) != i
+        np.testing.assert_array_equal(step.obs[rest], first[rest])
+        np.testing.assert_allclose(step.obs[i], first[i] + [1, 0.5, 0])
+        assert (step.reward[rest] == 0).all()
+        assert not (step.terminated | step.truncated)[rest].any()
+
+
+def test_episodes_end_with_the_true_successor_and_begin_by_themselves():
+    with opened(Paced, 1) as vector, contextlib.closing(make_vector(Paced, 1, "gymnasium", seed=0)) as other:
+        np.testing.assert_array_equal(vector.reset(), other.reset())
+        for _ in range(30):
+            vector.send(ZERO)
+            ours, theirs = vector.receive(), other.step(ZERO)
+            np.testing.assert_array_equal(ours.obs, theirs.obs)
+            np.testing.assert_array_equal(ours.reward, theirs.reward)
+            np.testing.assert_array_equal((ours.terminated, ours.truncated), (theirs.terminated, theirs.truncated))
+            done = ours.terminated | ours.truncated
+            if done.any():
+                assert vector.success(ours, 0) == other.success(theirs, 0)
+                np.testing.assert_array_equal(vector.reset_done(done), other.reset_done(done))
 
 
 def test_a_slow_reset_does_not_keep_the_others_waiting(tmp_path):
@@ -148,3 +189,8 @@ def test_damaged_snapshots_are_refused(change, words):
 def test_options_are_checked(options, words):
     with pytest.raises(ValueError, match=words):
         make_vector(Paced, 3, **{"backend": "gymnasium-async", **options})
+
+
+def test_algorithms_that_learn_from_rollouts_refuse_it():
+    with opened(Paced, 2) as vector, pytest.raises(ValueError, match=r"wait_for=1 is for off-policy .* and PPO learns"):
+        PPO("MlpPolicy", vector)

@@ -19,13 +19,15 @@ from rejeu.envs.make import GymnasiumVector, make_vector
 from rejeu.envs.registry import make_env
 from rejeu.envs.workers import pool
 from rejeu.lab.cli import main
-from rejeu.sb3.common.vec_env import DummyVecEnv, VecMonitor
+from rejeu.sb3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor
+from rejeu.training import checks
 from rejeu.training.checks import check_finite
-from tests.bad_environments import EVERY, Good, Line, RewardWithAxis
+from tests.bad_environments import EVERY, Good, Line, RewardReadsInfo, RewardWithAxis, SameArray, seeing
 from tests.helpers import small_sac
 from tests.tiers import crossed, only
 
 ENDING = [name for name, fault in EVERY.items() if fault.trained is not None]
+GOING_ON = [name for name, fault in EVERY.items() if fault.trained is None]
 SEEN = r"(environment 0, (step 3|the first reset)|in environment 0 after [24] steps)"
 """Where a fault is said to be: each shows at the third step, or at the first reset."""
 
@@ -42,6 +44,17 @@ def test_each_fault_is_found_before_training(name, monkeypatch):
 @pytest.mark.parametrize("make", [Good, Line])
 def test_nothing_is_found_where_nothing_is_wrong(make):
     assert findings(make()) == []
+
+
+def test_all_errors_are_raised_together_and_warnings_as_warnings():
+    class Both(EVERY["reward of one"].make):
+        def observe(self):
+            return super().observe().astype(np.float64)
+
+    with pytest.raises(BadEnvironmentError, match=r"(?s)Both: reset .* float64.*\nstep returned a reward"):
+        rejeu.check_env(Both(), warn=False)
+    with pytest.warns(UserWarning, match="terminated at its time limit of 10 steps"):
+        rejeu.check_env(EVERY["folded limit"].make())
 
 
 @pytest.mark.filterwarnings("ignore")  # Box2D's module warns when it is imported, and crashes where that is an error
@@ -95,12 +108,59 @@ def test_a_fault_that_nobody_looked_for_is_explained(name, backend):
         assert re.search(SEEN, str(caught.value)), str(caught.value)
 
 
+@pytest.mark.parametrize(("name", "backend"), crossed([name for name in GOING_ON if name != "endless"], list(BACKENDS)))
+def test_a_fault_that_can_be_mended_or_borne_does_not_end_a_run(name, backend):
+    if name == "folded in info" and backend == "self-resetting":
+        pytest.skip("the info is what such a vector says of time limits")
+    walk(BACKENDS[backend](EVERY[name].make))
+
+
 @pytest.mark.parametrize("name", only({"scalar", "no seed"}, ["scalar", "missing key", "four values", "no seed"]))
 def test_training_ends_with_the_words(name):
     fault = EVERY[name]
     agent = small_sac(fault.make(), learning_starts=99)
     with pytest.raises(BadEnvironmentError, match=fault.trained):
         agent.learn(25)
+
+
+def test_what_is_cast_keeps_its_values():
+    rows = {}
+    for name in ("double", "list", "reward of one", "zeros"):
+        vector = make_vector(EVERY[name].make, 1, "gymnasium", seed=0)
+        vector.reset()
+        for _ in range(4):
+            step = vector.step(np.full((1, 1), 0.25, np.float32))
+        assert (step.obs.dtype, step.reward.dtype, step.terminated.dtype) == (np.float32, np.float32, bool)
+        rows[name] = [*step.obs[0].tolist(), float(step.reward[0]), bool(step.terminated[0]), bool(step.truncated[0])]
+    assert rows["double"][1:] == [4.0, 1.0, 1.0, False, False]
+    assert len({str(row) for row in rows.values()}) == 1
+
+
+def test_images_of_another_integer_type_are_taken_if_they_fit():
+    class Wide(EVERY["float as image"].make):
+        value = 255
+
+        def observe(self):
+            return np.full((2, 2, 3), self.value, np.int64)
+
+    vector = make_vector(Wide, 1, "gymnasium")
+    assert vector.reset().min() == 255
+    Wide.value = 256
+    with pytest.raises(BadEnvironmentError, match=r"expected uint8, which cannot hold 256 at index \(0, 0, 0\)"):
+        vector.reset_done(np.ones(1, bool))
+
+
+def test_what_an_environment_raises_itself_is_raised_as_it_is():
+    class Broken(Good):
+        def step(self, action):
+            raise ValueError("the motor is off")
+
+    for vector in (
+        make_vector(Broken, 2, "gymnasium"),
+        GymnasiumVector(SyncVectorEnv([Broken] * 2, autoreset_mode=AutoresetMode.DISABLED)),
+    ):
+        with pytest.raises(ValueError, match=r"^the motor is off$"):
+            walk(vector)
 
 
 @pytest.mark.parametrize(
@@ -172,6 +232,18 @@ def test_answers_of_a_vector_of_ones_own_are_checked(answer, words):
         walk(GymnasiumVector(env))
 
 
+def test_subprocesses_explain_too():
+    env = SubprocVecEnv([EVERY["too long"].make] * 2)
+    env.reset()
+    for _ in range(2):
+        env.step(np.zeros((2, 1), np.float32))
+    with pytest.raises(
+        BadEnvironmentError, match=r"environment 0, step 3: step returned .*shape \(4,\), expected \(3,\)"
+    ):
+        env.step(np.zeros((2, 1), np.float32))
+    assert env.closed
+
+
 def test_a_reward_of_goals_that_is_no_number_is_explained():
     """An array of one number is taken as that number, as in Stable-Baselines3."""
     places = np.arange(4.0, dtype=np.float32)[:, None]
@@ -185,6 +257,57 @@ def test_a_reward_of_goals_that_is_no_number_is_explained():
     goals = make_vector(TwoRewards, 1, "gymnasium").goals()
     with pytest.raises(BadEnvironmentError, match=r"compute_reward returned an array of shape \(2,\) .* of one goal"):
         goals.reward(places, places)
+
+
+def test_a_reward_that_reads_the_info_is_explained():
+    goals = make_vector(RewardReadsInfo, 1, "gymnasium").goals()
+    places = np.arange(4.0, dtype=np.float32)[:, None]
+    with pytest.raises(
+        BadEnvironmentError, match="compute_reward found no key 'scale': the info is empty in hindsight"
+    ):
+        goals.reward(places, places)
+    np.testing.assert_array_equal(goals.reward(places, places, [{"scale": 3.0}] * 4), np.zeros(4))
+
+
+class OneDict(Good):
+    """Has one info, which it empties at every reset."""
+
+    def __init__(self):
+        self.info = {}
+
+    def reset(self, **kwargs):
+        self.info.clear()
+        return super().reset(**kwargs)[0], self.info
+
+    def step(self, action):
+        self.info["time"] = self.time
+        return (*super().step(action)[:4], self.info)
+
+
+def test_the_last_info_of_an_episode_outlasts_the_reset():
+    vector, venv = make_vector(OneDict), DummyVecEnv([OneDict])
+    vector.reset(), venv.reset()
+    for _ in range(10):
+        step, (_, _, _, infos) = vector.step(np.zeros((1, 1))), venv.step(np.zeros((1, 1)))
+    vector.reset_done(step.truncated)
+    assert step.info[0] == {"time": 9}
+    assert infos[0]["time"] == 9
+
+
+def test_final_observations_that_a_reset_overwrote_are_told_once():
+    def walked(kind):
+        vector = make_vector(AsyncVectorEnv([kind], autoreset_mode=AutoresetMode.SAME_STEP, context="forkserver"))
+        vector.reset(0)
+        for _ in range(50):
+            step = vector.step(np.zeros((1, 1)))
+            vector.reset_done(step.truncated)
+        vector.close()
+
+    with pytest.warns(UserWarning, match="final observations .* are those of the resets") as caught:
+        walked(SameArray)
+    assert len(caught) == 1
+    walked(Good)
+    walked(seeing("Constant", lambda env: np.zeros(3, np.float32)))
 
 
 class SeveralAgents:
@@ -251,6 +374,26 @@ def test_observations_far_outside_of_the_declared_bounds_are_told_once(algorithm
         agent.learn(60)
     assert len(caught) == 1
     assert str(caught[0].message).endswith("declare the bounds that they really have")
+
+
+def test_observations_are_compared_with_their_bounds_at_steps_twice_as_far_apart_each_time(monkeypatch):
+    looked = []
+    monkeypatch.setattr(checks.validation, "far_outside", lambda space, obs: looked.append(True))
+    steps = []
+    agent = small_sac(Good(), learning_starts=999)
+    agent.learn(200, lambda agent, turn: steps.extend([turn.step] * len(looked)) or looked.clear())
+    assert steps == [1, 2, 4, 8, 16, 32, 64, 128]
+
+
+def test_what_is_unbounded_or_little_outside_is_not_told():
+    class Little(Far):
+        scale = 2.0
+
+    class Unbounded(Far):
+        observation_space = gym.spaces.Box(np.float32([-1, -1, -np.inf]), np.float32([20, 20, 1]), dtype=np.float32)
+
+    for kind in (Little, Unbounded):
+        small_sac(kind(), learning_starts=999).learn(40)  # warnings are errors in tests
 
 
 # The command.

@@ -8,6 +8,8 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from scipy.stats import norm
 
+import rejeu
+from rejeu.envs.functional.ball_drawing import BallDrawing
 from rejeu.teaching.ball import Ball
 from tests.tiers import only
 
@@ -60,6 +62,16 @@ def test_leaving_costs_in_the_step_that_leaves(start, n_steps, push, after, rest
     found, *others = placed(*start, n_steps=n_steps).step(np.array(push))
     np.testing.assert_array_equal(found, np.float32(after))
     assert tuple(others) == rest
+
+
+def test_holding_for_500_steps_is_a_time_limit_worth_50():
+    ball = Ball(2, sigma=0.0)
+    ball.reset(seed=0)
+    steps = [ball.step(NOTHING) for _ in range(500)]
+    assert [step[1] for step in steps] == [1.0] * 499 + [50.0]
+    assert not any(step[2] for step in steps)
+    assert [step[3] for step in steps] == [False] * 499 + [True]
+    assert steps[-1][4] == {"is_success": True}
 
 
 def over():
@@ -146,3 +158,59 @@ def test_pushing_to_the_middle_holds_as_many_episodes_as_its_markov_chain_does(s
     expected = survival(sigma) ** 2
     assert expected == pytest.approx({1.0: 1.0, 2.0: 0.9}[sigma], abs=0.015)
     assert abs(held / n_episodes - expected) <= 4 * np.sqrt(expected * (1 - expected) / n_episodes) + 1e-9
+
+
+@pytest.mark.parametrize("dimension", [1, 2])
+def test_picture_shows_the_ball_where_it_is(dimension):
+    """Counts pixels of the ball's blue around where the position is to be drawn, by the drawing's own scales."""
+    pytest.importorskip("pygame")
+    ball = placed(*[6.0, -3.0][:dimension], render_mode="rgb_array")
+    frame = ball.render()
+    assert frame.dtype == np.uint8
+    height, width, channels = frame.shape
+    assert channels == 3
+    assert height % 2 == width % 2 == 0  # for videos
+    drawing = BallDrawing(dimension, 500, "rgb_array")
+    place = drawing.main.place
+    x, y = drawing.main.points(np.array([ball.position]), 0)[0]
+    patch = frame[round(y) - 5 : round(y) + 6, max(round(x) - 5, 0) : round(x) + 6].astype(int)
+    assert (patch[..., 2] > patch[..., 0] + 40).mean() > 0.7
+    inside = [(place(-10, 0)[0], place(10, 0)[0])] if dimension == 2 else []
+    for left, right in inside:
+        assert left < x < right
+        assert (x - left) / (right - left) == pytest.approx(0.8)
+    assert (place(0, -10)[1] - y) / (place(0, -10)[1] - place(0, 10)[1]) == pytest.approx(
+        0.35 if dimension == 2 else 0.8
+    )
+    ball.close()
+
+
+def test_pictures_differ_once_the_ball_is_lost():
+    pytest.importorskip("pygame")
+    ball = placed(9.0, 0.0, render_mode="rgb_array")
+    before = ball.render()
+    ball.step(np.array([2.0, 0.0]))
+    after = ball.render()
+    reddish = lambda frame: ((frame[..., 0].astype(int) - frame[..., 2]) > 100).sum()  # noqa: E731
+    assert reddish(after) > reddish(before) + 200
+
+
+def test_window_opens_and_closes_without_a_display(monkeypatch):
+    pytest.importorskip("pygame")
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    ball = Ball(1, render_mode="human")
+    ball.reset(seed=0)
+    ball.step(np.zeros(1))
+    assert ball.render() is None
+    ball.close()
+    ball.close()
+
+
+def test_several_balls_make_one_vector_environment():
+    vector = rejeu.make_vector("rejeu/Ball-v0", n_envs=3, backend="auto", seed=0, sigma=2.0)
+    obs = vector.reset()
+    assert vector.backend == "gymnasium"
+    assert vector.max_episode_steps == gym.spec("rejeu/Ball-v0").max_episode_steps == 500
+    assert obs.shape == (3, 2)
+    assert len(np.unique(obs)) == 6
+    vector.close()

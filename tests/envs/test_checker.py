@@ -47,6 +47,25 @@ def test_actions_without_bounds_are_advised_on_refused_and_not_scaled(high):
     np.testing.assert_array_equal(spaces.scale_action(Free.action_space, jnp.array(action), jnp), action)
 
 
+@pytest.mark.parametrize(
+    ("actions", "is_chosen"),
+    [
+        (gym.spaces.Dict({"turn": gym.spaces.Discrete(2), "go": gym.spaces.Tuple([Tidy.action_space])}), True),
+        (gym.spaces.Tuple([Tidy.action_space, gym.spaces.Text(3)]), False),
+        (gym.spaces.Dict({}), False),
+    ],
+)
+def test_nested_actions_are_fine_where_agents_choose_all_parts(actions, is_chosen):
+    class Nested(Tidy):
+        action_space = actions
+
+        def step(self, action):
+            return super().step(0)
+
+    found = [finding.text for finding in findings(Nested()) if finding.level == "error"]
+    assert ["agents choose Box, Discrete" in text for text in found] == ([] if is_chosen else [True])
+
+
 def test_goal_environments_are_checked_for_what_hindsight_needs():
     class Line(Reach):
         def _observe(self):

@@ -36,3 +36,12 @@ def test_a_cluster_that_does_not_answer_is_one_line():
         ClusterError, match=rf"^the Ray cluster '127.0.0.1:{port}' cannot be reached: .*ray start --head"
     ):
         cluster.check_reachable(f"127.0.0.1:{port}")
+
+
+def test_versions_of_other_machines_are_compared():
+    here = cluster.versions()
+    cluster.check_versions(here, "node 1")
+    with pytest.raises(ClusterError, match=rf"^node 1 has gymnasium 0\.1 and not {here['gymnasium']} as here; install"):
+        cluster.check_versions({**here, "gymnasium": "0.1"}, "node 1")
+    with pytest.raises(ClusterError, match="numpy of no version"):
+        cluster.check_versions({key: value for key, value in here.items() if key != "numpy"}, "node 1")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import abc
 import contextlib
 
 import gymnasium as gym
@@ -68,6 +69,21 @@ def test_a_vectorized_function_is_called_once_a_batch_after_it_was_found_out():
     assert function.shapes == [(20, 2), (7, 2), (1, 2)]
 
 
+def test_whether_a_function_is_vectorized_is_found_out_once():
+    function = counted(one_distance)
+    batched = over_batches(function, np.float32)
+    batched(*goals(20))
+    function.shapes.clear()
+    batched(*goals(5))
+    assert function.shapes == [(2,)] * 5
+
+
+def test_the_whole_batch_is_tried_only_once():
+    function = counted(distance)
+    over_batches(function, np.float32)(*goals(20))
+    assert function.shapes.count((20, 2)) == 1
+
+
 def test_a_function_that_answers_batches_with_one_number_is_called_by_row():
     """A norm over all axes, and a comparison of whole arrays: both forget the batch."""
     achieved, desired = goals(6)
@@ -85,6 +101,17 @@ def test_a_function_that_mixes_rows_is_called_by_row():
     achieved, desired = goals(6)
     given = over_batches(mixing, np.float32)(achieved, desired)
     np.testing.assert_allclose(given, (achieved - desired).sum(axis=1), rtol=1e-5)
+
+
+def test_a_single_row_does_not_decide():
+    """One row of one number could be either; the decision waits for two."""
+    function = counted(distance)
+    batched = over_batches(function, np.float32)
+    batched(*goals(1))
+    batched(*goals(9))
+    function.shapes.clear()
+    batched(*goals(9))
+    assert function.shapes == [(9, 2)]
 
 
 def test_the_reward_receives_achieved_before_desired():
@@ -109,6 +136,18 @@ def test_goal_functions_are_found_beneath_wrappers():
     assert goal_functions(Reach()).terminated is None
 
 
+class Unfinished(Reach):
+    @abc.abstractmethod
+    def compute_terminated(self, achieved, desired, info):
+        raise NotImplementedError
+
+
+def test_an_abstract_method_is_none():
+    """As FrankaKitchen of Gymnasium-Robotics has one."""
+    assert goal_functions(Unfinished()).terminated is None
+    checker.check_env(Unfinished(), warn=False)
+
+
 def test_an_environment_without_compute_reward_has_no_goal_functions():
     assert goal_functions(Counter()) is None
     assert InProcess([Counter()]).goals() is None
@@ -120,6 +159,14 @@ def test_vectors_of_goal_environments_offer_their_functions():
     synchronous = GymnasiumVector(gym.vector.SyncVectorEnv([Reach]))
     for vector in (InProcess([Reach()]), synchronous):
         np.testing.assert_array_equal(vector.goals().reward(achieved, desired), [0.0, 0.0, -1.0])
+
+
+def test_envpool_and_highway_env_reward_parking_alike():
+    achieved, desired = goals(50, 6)
+    one, two = (
+        make_vector("parking-v0", backend=b).goals().reward(achieved, desired) for b in ("envpool", "gymnasium")
+    )
+    np.testing.assert_allclose(one, two, rtol=1e-5)
 
 
 class ReachNested(Reach):

@@ -12,11 +12,13 @@ import pytest
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
 import rejeu
+from rejeu.core.errors import MissingExtra
 from rejeu.envs.make import EnvPool, GymnasiumVector, InProcess, auto_backend, make_vector
+from rejeu.envs.registry import import_envpool, make_env
 from rejeu.sb3.common.env_util import make_vec_env
 from rejeu.sb3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 from rejeu.training.run import restart
-from tests.environments import Counter
+from tests.environments import Counter, Reach, Sampled
 from tests.helpers import small_sac
 
 LENGTHS = (2, 4), (3, 1)
@@ -162,10 +164,76 @@ def test_keys_keep_their_values_whatever_mapping_the_environment_returns(make):
         assert obs["a"].dtype == np.float32
 
 
+def test_parking_observations_mean_the_same_on_every_backend():
+    """highway-env puts observation before the goals; EnvPool sorts. In the first observation, position is achieved."""
+    for backend in ("gymnasium", "envpool"):
+        vector = make_vector("parking-v0", 2, backend, seed=0)
+        obs = vector.reset()
+        np.testing.assert_allclose(obs["observation"], obs["achieved_goal"], atol=1e-6)
+        # The goal is a parking spot: its velocity is zero and it points up or down, unlike a car that starts anyhow.
+        np.testing.assert_allclose(obs["desired_goal"][:, 2:4], 0.0, atol=1e-6)
+        np.testing.assert_allclose(np.abs(obs["desired_goal"][:, 5]), 1.0, atol=1e-6)
+        vector.close()
+
+
+def test_observations_of_tuples_and_numbers_are_stacked():
+    space = gym.spaces.Tuple([gym.spaces.Discrete(5, start=2), gym.spaces.MultiBinary(3)])
+    vector = InProcess([Sampled(space), Sampled(space)], seed=0)
+    number, bits = vector.reset()
+    assert (number.shape, number.dtype) == ((2,), np.int32)
+    assert (bits.shape, bits.dtype) == ((2, 3), np.int8)
+    assert set(number.tolist()) <= {2, 3, 4, 5, 6}
+
+
 # Seeds.
 
 
+def first_observations(vector, resets=3):
+    every = np.ones(vector.n_envs, bool)
+    seen = [np.array(vector.reset()), *(np.array(vector.reset_done(every)) for _ in range(resets))]
+    vector.close()
+    return np.stack(seen)
+
+
+@pytest.mark.parametrize("backend", ["gymnasium", "envpool"])
+def test_one_seed_gives_one_series_of_episodes_and_another_another(backend):
+    one, two, other = (first_observations(make_vector("Pendulum-v1", 3, backend, seed)) for seed in (5, 5, 6))
+    np.testing.assert_array_equal(one, two)
+    assert (one != other).any()
+    assert len(np.unique(one[0, :, 0])) == 3, "the environments of a vector start differently"
+    assert (one[0] != one[1]).any(), "a seed is used once and later resets differ"
+
+
+def test_in_process_environments_are_seeded_one_after_the_other():
+    """Environment i of a vector with seed s starts as a single environment with seed s + i."""
+    obs = make_vector("Pendulum-v1", 2, "gymnasium", seed=5).reset()
+    for i in range(2):
+        np.testing.assert_array_equal(obs[i], gym.make("Pendulum-v1").reset(seed=5 + i)[0])
+
+
+@pytest.mark.parametrize("seed", [0, 2**31 - 1, 2**31, 2**32 - 1])
+def test_envpool_takes_every_seed_that_an_agent_does(seed):
+    vector = make_vector("Pendulum-v1", 2, "envpool", seed)
+    assert np.isfinite(vector.reset()).all()
+
+
 # EnvPool.
+
+
+@pytest.mark.parametrize(("env_id", "n_players"), [("TicTacToe-v1", 2), ("SparrowMahjong-v1", 3)])
+def test_envpool_refuses_environments_of_several_players(env_id, n_players):
+    with pytest.raises(ValueError, match=f"{env_id} of EnvPool has {n_players} players"):
+        make_vector(env_id, 2, "envpool")
+
+
+def test_bounds_that_envpool_declares_for_want_of_others_are_infinite(monkeypatch, tmp_path):
+    """EnvPool's are the smallest positive and the largest float64; VizDoom's actions have no others."""
+    monkeypatch.chdir(tmp_path)  # where VizDoom writes a file
+    vector = make_vector("Basic-v1", 1, "envpool", seed=0)
+    try:
+        assert vector.action_space == gym.spaces.Box(-np.inf, np.inf, (3,), np.float64)
+    finally:
+        vector.close()
 
 
 def test_envpool_walks_one_trajectory_a_seed():
@@ -206,7 +274,62 @@ def test_envpool_shows_the_final_observation_and_restarts_only_what_ended():
     vector.close()
 
 
+def test_envpool_knows_its_time_limit():
+    vector = EnvPool("Pendulum-v1", 1, seed=0)
+    assert vector.max_episode_steps == 200
+    vector.reset()
+    for t in range(200):
+        step = vector.step(np.zeros((1, 1), np.float32))
+        assert bool(step.truncated[0]) == (t == 199)
+        assert not step.terminated[0]
+    vector.close()
+    vector = EnvPool("CliffWalking-v0", 1, seed=0)  # of which EnvPool says 2,147,483,647
+    assert vector.max_episode_steps is None
+    vector.close()
+
+
+def test_envpool_has_no_time_limit_where_it_declares_zero():
+    vector = make_vector("BabyAI-GoToLocalS8N5-v0", 1, "envpool")
+    assert vector.max_episode_steps is None
+    vector.close()
+
+
 # Success.
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: InProcess([Reach(stops=True), Reach(stops=True)], seed=0),
+        lambda: synchronous_reach(AutoresetMode.DISABLED),
+        lambda: synchronous_reach(AutoresetMode.SAME_STEP),
+    ],
+    ids=["in-process", "DISABLED", "SAME_STEP"],
+)
+def test_success_is_read_from_the_step_that_ended_the_episode(make):
+    vector = make()
+    obs, outcomes = vector.reset(), []
+    for t in range(60):
+        towards = np.clip(obs["desired_goal"] - obs["achieved_goal"], -1, 1)
+        step = vector.step(towards if t % 20 < 10 else -np.sign(towards + 1e-9))
+        done = step.terminated | step.truncated
+        for i in np.flatnonzero(done):
+            reached = abs(step.obs["achieved_goal"][i, 0] - step.obs["desired_goal"][i, 0]) < 0.5
+            assert vector.success(step, i) == float(reached)
+            outcomes.append(reached)
+        obs = vector.reset_done(done) if done.any() else step.obs
+    assert {bool(o) for o in outcomes} == {True, False}
+
+
+def synchronous_reach(mode):
+    return GymnasiumVector(SyncVectorEnv([lambda: Reach(stops=True)] * 2, autoreset_mode=mode), seed=0)
+
+
+def test_success_is_unknown_where_the_environment_does_not_say():
+    for vector in (in_process(), synchronous(AutoresetMode.DISABLED)(), EnvPool("Pendulum-v1", 2, 0)):
+        vector.reset()
+        step = vector.step(np.zeros((2, 1), np.float32))
+        assert np.isnan(vector.success(step, 1))
 
 
 # What may be given.
@@ -251,6 +374,33 @@ print("envpool.classic_control" in sys.modules, hasattr(envpool, "make_spec"))
     assert output_of(code).splitlines() == ["", "True True"]
 
 
+@pytest.mark.exhaustive
+def test_envpool_knows_all_its_environments_without_its_games():
+    ids = "print(*envpool.list_all_envs())"
+    own = f"from rejeu.envs.registry import import_envpool; envpool = import_envpool(); {ids}"
+    assert output_of(own) == output_of(f"import envpool; {ids}")
+
+
+@pytest.mark.parametrize("entry", ["\nimport envpool.games.registration\n", "\nprint()\n", None])
+def test_an_envpool_of_another_layout_is_imported_as_it_is(entry, tmp_path, monkeypatch):
+    (tmp_path / "envpool").mkdir()
+    (tmp_path / "envpool" / "__init__.py").write_text("is_whole = True\n")
+    if entry is not None:
+        (tmp_path / "envpool" / "entry.py").write_text(f'"""Entry point."""\n{entry}')
+    monkeypatch.syspath_prepend(tmp_path)
+    for name in [name for name in sys.modules if name.partition(".")[0] == "envpool"]:
+        monkeypatch.delitem(sys.modules, name)
+    assert import_envpool().is_whole
+    monkeypatch.delitem(sys.modules, "envpool")
+    assert "envpool.entry" not in sys.modules
+
+
+def test_auto_uses_gymnasium_without_envpool(without_envpool):
+    assert make_vector("Pendulum-v1", 4).backend == "gymnasium"
+    agent = rejeu.DQN("MlpPolicy", make_vector("CartPole-v1", 4), policy_kwargs={"net_arch": [4]}, seed=0).learn(8)
+    assert agent.num_timesteps == 8
+
+
 def test_the_envpool_backend_without_envpool_says_how_to_install_it_and_its_size(without_envpool):
     said = r'EnvPool \(about 770 MB with its assets\), which is not installed; run: pip install "rejeu\[envpool\]"'
     with pytest.raises(rejeu.MissingExtra, match=said):
@@ -293,6 +443,61 @@ def test_a_wrong_argument_is_named_with_its_remedy(env, arguments, words):
     assert "\n" not in str(caught.value)
 
 
+def test_an_environment_that_only_gymnasium_has_is_referred_to_it(monkeypatch):
+    monkeypatch.setitem(gym.registry, "OnlyHere-v0", gym.envs.registration.EnvSpec("OnlyHere-v0", Counter))
+    with pytest.raises(ValueError, match="EnvPool does not have OnlyHere-v0; use backend='gymnasium'"):
+        make_vector("OnlyHere-v0", backend="envpool")
+    assert make_vector("OnlyHere-v0").backend == "gymnasium"
+
+
+def test_a_missing_package_is_named_with_the_command_that_installs_it(monkeypatch):
+    import importlib.util
+
+    real = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "gymnasium_robotics" else real(name))
+    with pytest.raises(MissingExtra, match=r'FetchReach-v99 needs gymnasium-robotics.*pip install "rejeu\[robotics\]"'):
+        make_env("FetchReach-v99")
+
+
+@pytest.mark.parametrize(
+    ("env_id", "words"),
+    [
+        ("dm_control/cartpole-balance-v0", r'package shimmy, .*: pip install "shimmy\[dm-control\]"$'),
+        ("PandaReach-v3", "package panda_gym, which is not installed: pip install panda-gym$"),
+        ("Meta-World/MT1", "pip install metaworld$"),
+        ("MiniGrid-Empty-5x5-v0", "pip install minigrid; EnvPool has MiniGrid-Empty-5x5-v0: backend='envpool'"),
+    ],
+)
+def test_an_environment_of_a_package_without_extra_is_named_with_that_package(monkeypatch, env_id, words):
+    import importlib.util
+
+    real, absent = importlib.util.find_spec, ("shimmy", "panda_gym", "metaworld", "minigrid")
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name in absent else real(name))
+    with pytest.raises(ValueError, match=words):
+        make_env(env_id)
+
+
+def test_robots_can_be_made_with_enumerations_that_equal_no_numpy_integer(monkeypatch):
+    """As in MuJoCo 3.12 and later."""
+    mujoco = pytest.importorskip("mujoco")
+    utils = pytest.importorskip("gymnasium_robotics.utils.mujoco_utils")
+
+    class Kind(int):
+        __eq__ = lambda self, other: type(other) is Kind and int(self) == int(other)  # noqa: E731
+        __hash__ = int.__hash__
+
+    class Kinds:
+        __members__ = {name: Kind(kind) for name, kind in mujoco.mjtJoint.__members__.items()}
+
+    for name, kind in Kinds.__members__.items():
+        setattr(Kinds, name, kind)
+    monkeypatch.setattr(mujoco, "mjtJoint", Kinds)
+    monkeypatch.setattr(utils, "mujoco", mujoco)
+    env = make_env("FetchReach-v4")
+    assert env.reset(seed=0)[0]["achieved_goal"].shape == (3,)
+    env.close()
+
+
 # One seed for each environment.
 
 
@@ -311,6 +516,28 @@ def test_each_environment_begins_with_the_seed_that_is_given_for_it(backend):
     vector.close()
 
 
+def test_a_gymnasium_vector_environment_takes_one_seed_for_each_environment():
+    make = lambda: gym.make("Pendulum-v1")  # noqa: E731
+    vector = make_vector(gym.vector.SyncVectorEnv([make, make]), seed=[5, 2])
+    expected = [make().reset(seed=seed)[0] for seed in (5, 2)]
+    np.testing.assert_array_equal(vector.reset(), expected)
+
+
+@pytest.mark.parametrize("backend", ["gymnasium", "envpool"])
+def test_training_begins_with_the_seeds_given_for_each_environment_and_not_with_the_agents(backend):
+    def first(agent_seed, seeds):
+        env = make_vector("Pendulum-v1", 2, backend, seed=seeds)
+        agent = small_sac(env, seed=agent_seed)
+        seen = []
+        agent.learn(2, lambda agent, turn: seen.append(agent.run.replay.arrays()["obs.array"][:, 0]))
+        return seen[0]
+
+    expected = np.array(make_vector("Pendulum-v1", 2, backend, seed=[4, 9]).reset())
+    np.testing.assert_array_equal(first(0, [4, 9]), expected)
+    np.testing.assert_array_equal(first(1, [4, 9]), expected)
+    assert (first(0, 4) != first(1, 4)).any()  # one number is the agent's to choose
+
+
 @pytest.mark.parametrize("kind", ["gymnasium", "envpool", "jax", "SyncVectorEnv", "VecNormalize"])
 def test_runs_with_consecutive_seeds_share_no_first_observation(kind):
     def environments():
@@ -322,3 +549,19 @@ def test_runs_with_consecutive_seeds_share_no_first_observation(kind):
 
     starts = [restart(small_sac(environments(), seed=seed).run).copy() for seed in range(5)]
     assert len(np.unique(np.concatenate(starts), axis=0)) == 40
+
+
+def test_a_dict_in_a_dict_that_holds_one_array_is_read():
+    space = gym.spaces.Dict({"arm": gym.spaces.Dict({"angles": gym.spaces.Box(-1.0, 1.0, (2,))})})
+    vector = InProcess([Sampled(space) for _ in range(2)], seed=0)
+    assert vector.reset()["arm"]["angles"].shape == (2, 2)
+    assert vector.step(np.zeros((2, 1), np.float32)).obs["arm"]["angles"].shape == (2, 2)
+
+
+def test_environments_of_ones_own_are_not_looked_up_in_envpool(monkeypatch):
+    def refuse():
+        raise AssertionError("EnvPool is imported")
+
+    monkeypatch.setattr("rejeu.envs.registry.import_envpool", refuse)
+    gym.register("rejeu-test/Own-v0", lambda: gym.make("CartPole-v1"))
+    assert auto_backend("rejeu-test/Own-v0", 8) == "gymnasium"

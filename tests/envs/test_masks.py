@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 
+import gymnasium as gym
 import jax
 import numpy as np
 import pytest
@@ -11,8 +12,10 @@ from gymnasium import spaces
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
 import rejeu
+from rejeu.algorithms import ppo
 from rejeu.algorithms.actor_critic.steps import samples
-from rejeu.core.errors import BadEnvironmentError
+from rejeu.core.algorithm import Clock, Masked
+from rejeu.core.errors import BadEnvironmentError, WorkerError
 from rejeu.envs.make import InProcess, make_vector
 from rejeu.envs.masks import make_masked
 from rejeu.sb3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor
@@ -20,8 +23,9 @@ from rejeu.training.learner import Readings
 from tests.environments import Counter
 from tests.helpers import assert_same_parameters
 from tests.tiers import crossed, exhaustive, only
-from tests.worker_environments import ACTIONS, Rules, Silent, sizes
+from tests.worker_environments import ACTIONS, Leaving, Rules, Silent, sizes
 
+CLOCK = Clock(np.uint32(0), np.uint32(0), np.float32(0.0))
 pytestmark = pytest.mark.usefixtures("learners_are_shared")
 
 SMALL = {"policy_kwargs": {"net_arch": [4]}, "n_steps": 64, "batch_size": 64, "n_epochs": 1, "seed": 0}
@@ -52,6 +56,13 @@ def test_what_is_forbidden_is_never_done(kind, by, n_envs):
         agent.evaluate(60, env=other, deterministic=deterministic)
     assert sum(one.taken for one in other.envs) > 200
     assert all(np.isfinite(value).all() for value in agent.get_parameters().values())
+
+
+@exhaustive
+def test_a_rollout_of_whole_episodes_keeps_to_the_masks():
+    env = vector("multi")
+    small(env, n_episodes=2, n_steps=6).learn(300)
+    assert sum(one.taken for one in env.envs) >= 300
 
 
 def with_spawn(mode):
@@ -90,6 +101,40 @@ def test_masks_of_environments_elsewhere_are_those_of_environments_in_this_proce
                 shown, seen = here.reset_done(done), there.reset_done(done)
     finally:
         there.close()
+
+
+@exhaustive
+def test_an_agent_learns_with_the_masks_of_worker_processes():
+    env = SubprocVecEnv([functools.partial(Rules, "discrete", "method")] * 2)
+    try:
+        agent = small(env, n_steps=16).learn(64)
+        assert agent.env.inner.venv is env
+    finally:
+        env.close()
+
+
+def test_masks_that_workers_do_not_have_are_asked_for():
+    vector = SubprocVecEnv([Silent])
+    try:
+        with pytest.raises(BadEnvironmentError, match=r'put info\["action_mask"\] into what reset and step return'):
+            make_masked(vector).reset()
+    finally:
+        vector.close()
+
+
+@exhaustive
+def test_a_lost_worker_with_masks_is_started_anew_where_that_is_asked_for():
+    env = make_masked(Leaving, 2, "gymnasium-async", seed=0, worker_timeout=60.0, restart_workers=1)
+    try:
+        env.reset()
+        with pytest.warns(RuntimeWarning, match=r"restarted \(1 of at most 1 times\)"):
+            step = env.step(np.array([0, 1]))
+        assert step.truncated.tolist() == [False, True]
+        assert env.reset_done(step.truncated).mask.tolist() == [[True, True]] * 2
+        with pytest.raises(WorkerError, match="and 1 restarts are spent"):
+            env.step(np.array([0, 1]))
+    finally:
+        env.close()
 
 
 @pytest.mark.parametrize("normalize", only([True], [True, {"norm_reward": False}]))
@@ -176,6 +221,32 @@ def test_learning_knows_the_probabilities_among_what_was_allowed(kind):
         assert float(entropy[i]) == pytest.approx(h, abs=2e-5)
 
 
+def test_what_is_forbidden_gets_no_gradient():
+    (state, rollout), _ = recorded("discrete")
+    mask = np.ones((32, 2, 5), bool)
+    mask[..., 3] = False
+    action = np.where(rollout.action == 3, 0, rollout.action)
+    rollout = rollout._replace(obs=Masked(rollout.obs.obs, mask), action=action)
+    data = samples(state.network, rollout, 0.95)
+    config = ppo.Config(ent_coef=0.1)
+    slope = jax.grad(lambda n: ppo.loss(n, data, config, CLOCK)[0])(state.network)
+    weight = np.asarray(slope.head.weight)
+    assert np.abs(weight[:, 3]).max() == 0.0
+    assert np.abs(np.delete(weight, 3, axis=1)).min() > 0.0
+
+
+@exhaustive
+def test_the_best_of_what_is_allowed_is_learnt():
+    """Rewards are the action itself: with the mask in hand the best is the largest that is allowed."""
+    agent = small(vector("discrete"), gamma=0.0, learning_rate=0.02, n_steps=128, n_epochs=4).learn(4000)
+    rng = np.random.default_rng(0)
+    mask = rng.random((100, 5)) < 0.5
+    mask[np.arange(100), rng.integers(0, 5, 100)] = True
+    action, _ = agent.predict(rng.normal(size=(100, 2)).astype(np.float32), deterministic=True, action_masks=mask)
+    best = [np.flatnonzero(m)[-1] for m in mask]
+    assert np.mean(action == best) > 0.9
+
+
 # Predict.
 
 
@@ -213,7 +284,25 @@ def test_a_file_keeps_all_of_it(tmp_path):
     loaded.learn(192)
 
 
+def test_a_registered_environment_is_made_anew_for_evaluation():
+    gym.register("rejeu-test/Rules-v0", functools.partial(Rules, "discrete"), max_episode_steps=50)
+    agent = small("rejeu-test/Rules-v0")
+    assert agent.env.max_episode_steps == 50
+    one, other = (agent.evaluate(8, seed=3).returns for _ in range(2))
+    assert np.array_equal(one, other)
+
+
 # Where masks come from.
+
+
+def test_environments_seeded_before_masks_were_asked_for_stay_seeded():
+    agent = small(vector("discrete"))
+    seeds = []
+    for seed in (4, 4, 5):
+        env = InProcess([Rules(), Rules()], seed)
+        seeds.append([agent.evaluate(10, env=env).returns.tolist(), env.envs[1].seeds[0]])
+    assert seeds[0] == seeds[1] != seeds[2]
+    assert seeds[0][1] == 5
 
 
 def test_an_episode_may_end_where_nothing_is_allowed():
@@ -230,6 +319,11 @@ class Fixed(Counter):
         super().__init__((4,))
         self.action_space = spaces.Discrete(3) if space is None else space
         self.action_masks = lambda: mask
+
+
+def test_masks_may_come_as_a_list_of_parts():
+    env = Fixed([np.array([1, 0]), [False, True]], spaces.MultiDiscrete([2, 2]))
+    assert make_masked(env).reset().mask.tolist() == [[True, False, False, True]]
 
 
 class Mute(Fixed):
@@ -258,3 +352,30 @@ def test_environments_whose_masks_cannot_be_had_or_kept_to_are_refused(env, erro
 
 
 # Who looks on.
+
+
+class Drawn(Rules):
+    """Can be filmed."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
+    render_mode = "rgb_array"
+
+    def render(self):
+        return np.zeros((16, 16, 3), np.uint8)
+
+
+def test_films_keep_to_the_masks(tmp_path):
+    agent = small(vector("multi"))
+    env = Drawn("multi")
+    rejeu.record_video(agent, tmp_path / "film.mp4", env, episodes=20, seed=0)
+    assert env.taken > 20
+
+
+def test_predict_takes_what_an_environment_with_its_mask_shows():
+    agent = small(vector("discrete"))
+    shown = {"observation": np.zeros(2, np.float32), "action_mask": np.array([0, 0, 0, 1, 0], np.int8)}
+    assert agent.predict(shown)[0] == 3
+    shown = agent.get_env().reset()
+    for _ in range(20):
+        actions, _ = agent.predict(shown)
+        assert shown.mask[np.arange(3), actions].all()

@@ -6,6 +6,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+import rejeu
+from tests.tiers import exhaustive
+
 pytest.importorskip("highway_env")
 
 
@@ -35,3 +38,10 @@ def test_it_is_parking_otherwise_and_equal_for_equal_seeds():
         np.testing.assert_array_equal(one[key], two[key])
     plain.reset(seed=3)
     assert len(plain.unwrapped.road.vehicles) == 1
+
+
+@exhaustive
+def test_hindsight_works_in_it():
+    settings = {"replay_buffer_class": "HerReplayBuffer", "learning_starts": 20, "batch_size": 8}
+    agent = rejeu.SAC("MultiInputPolicy", "rejeu/ParkingHard-v0", policy_kwargs={"net_arch": [8]}, seed=0, **settings)
+    assert agent.learn(40).n_updates > 0

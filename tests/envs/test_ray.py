@@ -18,9 +18,10 @@ import rejeu
 from rejeu.callbacks import Checkpoint
 from rejeu.core.errors import WorkerError
 from rejeu.envs.make import make_vector
+from rejeu.envs.workers import pool, remote
 from tests.envs import ray_cluster
 from tests.helpers import assert_same_parameters, small_sac
-from tests.worker_environments import Losable, Paced, imports_jax, process_id
+from tests.worker_environments import Losable, Paced, imports_jax, in_order, process_id
 
 pytestmark = [
     pytest.mark.exhaustive,
@@ -182,6 +183,26 @@ def test_a_run_resumes_exactly(tmp_path):
         assert again.resumed.exact
         again.learn()
     assert_same_parameters(whole, again)
+
+
+def test_results_in_the_same_order_train_the_same_agent_in_actors_and_in_processes():
+    with opened(functools.partial(Paced, 0.002), 3, wait_for=2) as env:
+        live = small_sac(in_order(env)).learn(60)
+    with contextlib.closing(make_vector(Paced, 3, "gymnasium-async", seed=0, wait_for=2)) as env:
+        again = small_sac(in_order(env)).learn(60)
+    assert_same_parameters(live, again)
+
+
+def test_environments_without_a_place_are_named(monkeypatch):
+    monkeypatch.setattr(pool, "START_SECONDS", 3.0)
+    monkeypatch.setattr(remote, "SLOW_START_SECONDS", 1.0)
+    with (
+        pytest.warns(RuntimeWarning, match="environment 0 waits for a place on the cluster, of which each"),
+        pytest.raises(
+            WorkerError, match=r"environment 0 found no place .*'num_cpus': 99.*, and which has 16 CPUs in all"
+        ),
+    ):
+        make_vector(Paced, 1, "ray", ray={"num_cpus": 99}, worker_timeout=2.0)
 
 
 def test_a_cluster_that_the_program_is_connected_to_stays_connected(nodes):

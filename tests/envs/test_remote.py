@@ -117,6 +117,12 @@ def test_results_are_taken_as_they_arrive():
             vector.reset_done(step.terminated | step.truncated)
 
 
+def test_an_actor_that_never_ran_is_started_again(monkeypatch):
+    monkeypatch.setattr(Task, "n_failures", 3)
+    with opened() as vector:
+        assert vector.reset().shape == (2, 3)
+
+
 @pytest.mark.parametrize(
     ("error", "words"),
     [
@@ -154,3 +160,18 @@ def test_connections_without_a_token_are_closed(monkeypatch):
             assert stranger.recv(1) == b""
     actors.accept(0.01)  # nobody
     actors.close()
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "words"),
+    [
+        ({"num_cpu": 1}, TypeError, "did you mean num_cpus"),
+        ({"num_cpus": -1}, ValueError, "num_cpus=-1 must be"),
+        ({"resources": {"fast": "two"}}, ValueError, "fast"),
+        ({"resources": 1}, TypeError, "dict of numbers by name"),
+        ({"address": 6379}, TypeError, "'HOST:PORT' or 'auto'"),
+    ],
+)
+def test_options_are_checked(options, error, words):
+    with pytest.raises(error, match=words):
+        make_vector(Paced, 1, "ray", ray=options)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import warnings
 from contextlib import closing
 
 import gymnasium as gym
@@ -81,6 +82,24 @@ def test_wrappers_are_carried(wrap):
     assert_goes_on_alike(lambda: wrap(gym.make("Pendulum-v1")))
 
 
+def test_monitors_count_on():
+    one, two = (rejeu.Monitor(gym.make("CartPole-v1")) for _ in range(2))
+    one.reset(seed=0)
+    walk(one, [1, 0, 1])
+    restore(two, state_of(one))
+    assert two.get_total_steps() == 3
+    while not (step := two.step(1))[2]:
+        pass
+    assert step[4]["episode"]["l"] == two.get_total_steps()
+
+
+def test_an_environment_that_has_not_begun_can_be_carried():
+    env = gym.make("Pendulum-v1")
+    restore(env, state_of(gym.make("Pendulum-v1")))
+    with pytest.raises(gym.error.ResetNeeded):
+        env.step(np.zeros(1))
+
+
 class Remembering(gym.Wrapper):
     """Remembers something, and does not say so."""
 
@@ -95,6 +114,26 @@ class Remembering(gym.Wrapper):
 )
 def test_what_is_not_known_is_not_carried(make):
     env = make()
+    env.reset(seed=0)
+    assert state_of(env) is None
+
+
+def test_box2d_cannot_be_carried():
+    with warnings.catch_warnings():
+        warnings.simplefilter(
+            "ignore", DeprecationWarning
+        )  # of what SWIG generates, and it crashes where they are errors
+        pytest.importorskip("Box2D")
+    env = gym.make("LunarLander-v3")
+    env.reset(seed=0)
+    assert state_of(env) is None
+
+
+def test_an_heir_of_a_known_environment_is_not_taken_for_it():
+    class Heir(gym.envs.classic_control.PendulumEnv):
+        """Might remember more."""
+
+    env = Heir()
     env.reset(seed=0)
     assert state_of(env) is None
 
@@ -158,6 +197,21 @@ def test_a_vector_continues_from_its_snapshot(backend, n_envs):
         saved = records.decode(records.encode(one.snapshot(), arrays := {}, "envs"), arrays)
         assert two.restore(saved, obs.copy()) == []
         assert_vectors_continue_alike(one, two)
+
+
+def test_a_snapshot_of_another_number_of_environments_is_refused():
+    for backend in ("gymnasium", "gymnasium-async"):
+        with closing(make_vector("CartPole-v1", 2, backend, seed=2)) as one:
+            one.reset()
+            with pytest.raises(ValueError, match="not those of 2 environments"):
+                one.restore(one.snapshot()[:1], None)
+
+
+def test_worker_processes_refuse_a_snapshot_of_another_environment():
+    with closing(make_vector("CartPole-v1", 1, "gymnasium-async", seed=2)) as one:
+        one.reset()
+        with pytest.raises(ValueError, match="environment 0 cannot be restored"):
+            one.restore([[{}]], None)
 
 
 def assert_vectors_continue_alike(one, two):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import math
+import re
 
 import gymnasium as gym
 import numpy as np
@@ -10,8 +12,10 @@ import pytest
 
 import rejeu
 from rejeu.envs.base import success_of
-from rejeu.envs.make import InProcess
+from rejeu.envs.make import InProcess, make_vector
+from rejeu.lab.cli import main
 from tests.environments import Counter, Reach
+from tests.tiers import exhaustive
 
 pytestmark = pytest.mark.usefixtures("learners_are_shared")
 
@@ -70,6 +74,21 @@ def test_an_info_says_success_by_one_of_two_keys(info, expected):
     np.testing.assert_equal(vector.success(last_step(vector), 0), expected)
 
 
+def test_what_the_environment_says_goes_first():
+    vector = InProcess([Reach(), Reach()], seed=0)
+    vector.reset()
+    step = vector.step(np.zeros((2, 1), np.float32))
+    for i in range(2):
+        own = vector.success(step, i)
+        assert vector.judge(step, i, 1e9, 0.0) == vector.judge(step, i, -1e9, 0.0) == own
+
+
+@pytest.mark.parametrize("backend", ["envpool", "gymnasium"])
+def test_the_environments_own_threshold_is_known_on_every_backend(backend):
+    assert make_vector("CartPole-v1", 2, backend).reward_threshold == 475.0
+    assert make_vector("Pendulum-v1", 2, backend).reward_threshold is None
+
+
 def test_history_says_which_training_episodes_succeeded():
     agent = rejeu.A2C("MlpPolicy", counter(), success_threshold=303.0, **SMALL).learn(12)
     assert [(e.episode_return, e.success) for e in agent.history.episodes] == [
@@ -95,3 +114,35 @@ def test_evaluation_takes_a_threshold_of_its_own_else_the_agents(tmp_path):
         == 0.5
     )
     assert math.isnan(rejeu.A2C("MlpPolicy", counter(), **SMALL).evaluate(2, env=counter()).success_rate)
+
+
+@exhaustive
+def test_masks_and_memory_leave_the_judgement_alone():
+    env = counter()
+    env.action_space, env.action_masks = gym.spaces.Discrete(2), lambda: [1, 0]
+    agent = rejeu.MaskablePPO("MlpPolicy", env, success_threshold=303.0, **SMALL).learn(6)
+    assert [e.success for e in agent.history.episodes] == [0.0, 1.0]
+
+
+@pytest.mark.parametrize("value", ["high", True, math.nan])
+def test_a_bad_threshold_is_refused(value):
+    with pytest.raises((TypeError, ValueError), match="success_threshold"):
+        rejeu.A2C("MlpPolicy", counter(), success_threshold=value, **SMALL)
+
+
+@exhaustive
+def test_the_command_line_takes_thresholds(tmp_path, capsys):
+    out = tmp_path / "run"
+    argv = ["train", "Pendulum-v1", "--algo", "A2C", "--steps", "400", "--evaluate-every", "400"]
+    argv += ["--evaluate-episodes", "2", "--seed", "0", "--out", str(out), "--success-threshold", "-1e6"]
+    assert main([*argv, "--set", "policy_kwargs.net_arch=[4]"]) == 0
+    assert json.loads((out / "config.json").read_text())["success_threshold"] == -1e6
+    assert rejeu.load(out / "best.safetensors").success_threshold == -1e6
+    assert "success 100.0%" in capsys.readouterr().out
+    for more, rate in (([], "100.0%"), (["--success-threshold", "0"], "0.0%")):
+        assert main(["evaluate", str(out), "--episodes", "2", "--seed", "0", *more]) == 0
+        assert re.search(rf"^success {re.escape(rate)} ", capsys.readouterr().out, re.MULTILINE)
+    assert (
+        main(["train", "Pendulum-v1", "--steps", "5", "--success-threshold", "nan", "--out", str(tmp_path / "b")]) == 2
+    )
+    assert "--success-threshold" in capsys.readouterr().err

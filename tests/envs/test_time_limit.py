@@ -54,3 +54,10 @@ def test_an_environment_of_the_old_package_gym_is_stepped_as_one_of_gymnasium(in
     steps = [vector.step(np.array([0])) for _ in range(3)]
     assert [(bool(s.terminated[0]), bool(s.truncated[0])) for s in steps] == [(False, False)] * 2 + [end]
     assert np.asarray(steps[-1].obs).tolist() == [[3, 3]]
+
+
+def test_a_space_without_bounds_or_choices_is_refused():
+    old = Old({})
+    old.action_space = SimpleNamespace(shape=[2])
+    with pytest.raises(ValueError, match="with low and high, or with n, got SimpleNamespace"):
+        rejeu.OldEnvironment(old)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import multiprocessing
 import os
@@ -17,13 +18,16 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.envs.registration import EnvSpec
+from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 
 from rejeu.core.errors import BadEnvironmentError, WorkerError
-from rejeu.envs.make import make_vector
+from rejeu.envs.make import GymnasiumVector, make_vector
+from rejeu.envs.workers import pool
 from rejeu.sb3.common.vec_env import SubprocVecEnv
 from tests.environments import Counter
+from tests.helpers import small_sac
 from tests.tiers import exhaustive, only
-from tests.worker_environments import DrawsGlobally, Faulty, Losable
+from tests.worker_environments import DrawsGlobally, Faulty, Losable, Rare
 
 
 def make(fault, n_envs=2):
@@ -80,12 +84,53 @@ def test_workers_are_never_forked_from_this_process():
     vector.close()
 
 
+def test_a_vector_of_workers_knows_what_it_was_made_of():
+    vector = make_vector("MountainCar-v0", 2, "gymnasium-async")
+    assert (vector.env_id, vector.max_episode_steps, vector.reward_threshold) == ("MountainCar-v0", 200, -110.0)
+    vector.close()
+    given = make_vector(SyncVectorEnv([lambda: gym.make("MountainCar-v0")] * 2))
+    assert (given.env_id, given.max_episode_steps, given.reward_threshold) == ("MountainCar-v0", 200, -110.0)
+
+
 def test_environments_registered_in_this_process_reach_the_workers(monkeypatch):
     monkeypatch.setitem(gym.registry, "OnlyHere-v0", EnvSpec("OnlyHere-v0", Counter, max_episode_steps=2))
     vector = make_vector("OnlyHere-v0", 2, "gymnasium-async")
     vector.reset()
     vector.step(np.zeros((2, 1), np.float32))
     assert vector.step(np.zeros((2, 1), np.float32)).truncated.all()
+    vector.close()
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"), [("make", "no such device"), ("reset", "cannot begin"), ("step", "the wheel came off")]
+)
+def test_the_traceback_of_a_worker_reaches_the_user(fault, words):
+    with pytest.raises(WorkerError, match=rf"(?s)Traceback .*worker_environments.py.*UnsendableError: {words}"):
+        make_and_step(fault)
+
+
+def make_and_step(fault):
+    with contextlib.closing(make(fault)) as vector:
+        vector.reset()
+        vector.step(np.array([[0.0], [1.0]], np.float32))
+
+
+def test_the_environments_that_failed_are_named():
+    vector = make("step", 3)
+    vector.reset()
+    with pytest.raises(WorkerError, match="environments 0, 2 failed in a worker process"):
+        vector.step(np.array([[1.0], [0.0], [1.0]], np.float32))
+    vector.close()
+
+
+def test_a_worker_that_is_gone_is_reported():
+    vector = make("exit")
+    vector.reset()
+    with pytest.raises(
+        WorkerError, match=r"environment 1 ended by itself at 'step' \(exit code 3\); what it printed .* res"
+    ):
+        vector.step(np.array([[0.0], [1.0]], np.float32))
+    assert not any(worker.alive for worker in vector.workers.workers)
     vector.close()
 
 
@@ -136,6 +181,57 @@ def test_a_lost_worker_is_started_anew_and_its_episode_truncated(act):
     with pytest.raises(WorkerError, match="and 1 restarts are spent"):
         vector.step(actions(0, act))
     assert not children()
+
+
+def test_a_worker_lost_at_a_reset_is_started_anew(tmp_path):
+    crash = tmp_path / "crash"
+    vector = make_vector(lambda: Losable(crash), 1, "gymnasium-async", seed=0, restart_workers=2)
+    vector.reset()
+    crash.touch()
+    with pytest.warns(RuntimeWarning, match=r"ended by itself at 'reset' \(exit code 5\); it is restarted"):
+        np.testing.assert_array_equal(vector.reset()[0, :2], [0, 0])
+    vector.close()
+
+
+def test_training_goes_on_where_workers_are_started_anew():
+    vector = make_vector(Rare, 2, "gymnasium-async", seed=0, restart_workers=99)
+    agent = small_sac(vector, learning_starts=99)
+    with pytest.warns(RuntimeWarning, match="restarted"):
+        agent.learn(60)
+    assert agent.num_timesteps == 60
+    assert 0 < vector.workers.restarts_left < 99
+    buffer = agent.replay_buffer.arrays()
+    assert np.isfinite(buffer["reward"]).all()
+    vector.close()
+
+
+def test_a_subproc_vector_replaces_lost_processes_too():
+    env = SubprocVecEnv([Losable] * 2, restart_workers=1)
+    try:
+        env.reset()
+        before = env.step(actions(0, 0))[0]
+        with pytest.warns(RuntimeWarning, match="environment 0 ended by itself"):
+            obs, rewards, dones, infos = env.step(actions(1, 0))
+        assert (dones.tolist(), rewards[0], infos[0]["TimeLimit.truncated"]) == ([True, False], 0.0, True)
+        np.testing.assert_array_equal(infos[0]["terminal_observation"], before[0])
+        np.testing.assert_array_equal(obs[:, 1], [0, 2])
+        with pytest.raises(WorkerError, match=r"environment 1 ended by itself .*restarts are spent"):
+            env.step(actions(0, 1))
+        assert env.closed
+    finally:
+        env.close()
+    assert not children()
+
+
+def test_answers_that_nobody_fetched_are_dropped():
+    """As after a Ctrl-C that came between question and answer."""
+    vector = make("nothing")
+    vector.reset()
+    vector.workers.send({i: ("step", np.zeros(1, np.float32)) for i in range(2)})
+    np.testing.assert_array_equal(vector.step(actions(0, 0)).obs[:, 1], 2)
+    vector.workers.send({0: ("step", np.zeros(1, np.float32))})
+    np.testing.assert_array_equal(vector.reset_done(np.array([True, False]))[:, 1], [0, 2])
+    vector.close()
 
 
 @pytest.mark.parametrize(
@@ -210,6 +306,16 @@ def test_a_function_that_cannot_be_sent_is_refused():
         make_vector(lambda: Locked((3,)), 2, "gymnasium-async")
 
 
+def test_a_self_resetting_vector_without_shared_memory_is_refused():
+    """Its workers forget a masked reset, and would reset once more instead of taking the next step."""
+    env = AsyncVectorEnv([Counter] * 2, shared_memory=False, context=pool.START_METHOD)
+    with pytest.raises(
+        ValueError, match=r"AsyncVectorEnv without shared memory .*autoreset_mode=AutoresetMode.DISABLED"
+    ):
+        GymnasiumVector(env)
+    env.close()
+
+
 # The main script, which every worker imports.
 
 
@@ -263,6 +369,29 @@ def test_a_script_without_a_guard_is_told_so(tmp_path):
     )
     assert ran.returncode == 1
     assert "must stand under `if __name__ == '__main__':`" in ran.stderr.splitlines()[-1]
+
+
+@exhaustive
+def test_a_script_with_a_guard_makes_workers(tmp_path):
+    ran = run_script(
+        tmp_path,
+        """
+        import gymnasium
+        import numpy
+        import rejeu
+        from gymnasium.envs.classic_control import PendulumEnv
+
+        class Mine(PendulumEnv):
+            pass
+
+        if __name__ == "__main__":
+            gymnasium.register("Mine-v0", Mine)
+            env = rejeu.make_vector("Mine-v0", 2, "gymnasium-async")
+            print(env.reset().shape, env.step(numpy.zeros((2, 1))).reward.shape)
+            env.close()
+        """,
+    )
+    assert (ran.stdout, ran.stderr) == ("(2, 3) (2,)\n", "")
 
 
 def test_worker_processes_do_not_import_jax():

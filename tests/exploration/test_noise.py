@@ -129,6 +129,14 @@ def test_repulsion_gives_the_course_of_the_document_once_its_units_are_converted
     np.testing.assert_allclose(found, expected, atol=2e-4)
 
 
+def test_strong_repulsion_pushes_no_further_than_to_the_middle():
+    noise = OrnsteinUhlenbeckActionNoise([0.0], 0.0, initial_noise=3.0, repulsive=1.0)
+    state, action = noise.perturb(noise.init(1), jnp.ones((1, 1)), jax.random.PRNGKey(0))
+    assert float(action[0, 0]) == 0.0
+    assert float(state[0, 0]) == pytest.approx(-1.0)
+    assert np.isfinite(course(noise, 1_000, policy=1.0)).all()
+
+
 def test_processes_start_anew_where_an_episode_ended_and_only_there():
     noise = OrnsteinUhlenbeckActionNoise([0.0], 0.0, theta=1.0, dt=0.5, initial_noise=0.8)
     exploring = explorer.make(constant(0.0, 1), noise)
@@ -139,6 +147,13 @@ def test_processes_start_anew_where_an_episode_ended_and_only_there():
         action, carry = exploring.act(carry, None, obs, ended, jax.random.PRNGKey(t), CLOCK)
         found.append(np.asarray(action)[:, 0])
     np.testing.assert_allclose(found, [[0.4, 0.4], [0.2, 0.2], [0.4, 0.1]], rtol=1e-6)
+
+
+def test_each_environment_has_a_process_of_its_own():
+    x = course(OrnsteinUhlenbeckActionNoise([0.0], 0.3), 2_000, n_envs=8, clip=False)[:, :, 0]
+    kicks = np.diff(x, axis=0)
+    correlation = np.corrcoef(kicks.T) - np.eye(8)
+    assert np.abs(correlation).max() < 5 / np.sqrt(2_000)
 
 
 def test_arguments_are_those_of_stable_baselines3_in_its_order():
@@ -196,6 +211,32 @@ def test_action_noise_is_refused_where_it_does_not_fit_the_actions():
 
 
 # By hand.
+
+
+def test_noise_called_by_hand_runs_the_process_of_one_environment():
+    noise = OrnsteinUhlenbeckActionNoise([0.3], [0.0], theta=1.0, dt=0.5, initial_noise=[0.7])
+    found = [float(noise()[0]) for _ in range(3)]
+    np.testing.assert_allclose(found, [0.5, 0.4, 0.35], rtol=1e-6)  # half way to the mean in each step
+    noise.reset()
+    assert noise().tolist() == pytest.approx([0.5], rel=1e-6)
+
+
+def test_a_seed_repeats_what_is_drawn_by_hand_and_reset_alone_lets_the_random_numbers_continue():
+    noise = NormalActionNoise([0.0], 1.0)
+    noise.reset(seed=3)
+    first = [noise().item(), noise().item()]
+    noise.reset()
+    assert noise().item() not in first
+    noise.reset(seed=3)
+    assert [noise().item(), noise().item()] == first
+
+
+def test_the_repulsive_boundary_answers_the_action_that_is_given_by_hand():
+    """At u = 1 the slope is 3 pi (pi / 2)^5 = 90.13; no kicks, so that the push is all there is."""
+    noise = OrnsteinUhlenbeckActionNoise([0.0], 0.0, theta=0.0, repulsive=1e-3)
+    assert noise(1.0).item() == pytest.approx(-1e-3 * 3 * np.pi * (np.pi / 2) ** 5, rel=1e-5)
+    noise.reset()
+    assert noise().item() == 0.0
 
 
 # It belongs to training: nothing that predicts adds it.

@@ -83,6 +83,14 @@ def test_perturbations_differ_between_environments_and_change_at_episode_starts_
         assert np.array_equal(weights[t], weights[t - 1]) == (t % 5 != 0)
 
 
+def test_noise_is_drawn_at_the_first_step_also_in_the_middle_of_an_episode():
+    """The first steps of a run are random, so that exploration may begin long after an episode did."""
+    _, act, carry, actor = made()
+    _, carry = act(carry, actor, observations(4), np.zeros(4, bool), jax.random.PRNGKey(0), CLOCK)
+    assert all((np.asarray(leaf) != 0).all() for leaf in carry.perturbation)
+    assert float(carry.sigma) == pytest.approx(0.1)
+
+
 def test_noise_has_the_standard_deviation_sigma_in_every_perturbed_leaf_and_spares_layer_norm():
     _, act, carry, actor = made(noise=ParameterNoise(initial_sigma=0.3), n_envs=500)
     _, carry = act(carry, actor, observations(500), np.ones(500, bool), jax.random.PRNGKey(0), CLOCK)
@@ -103,6 +111,26 @@ def test_sigma_rises_while_policies_are_too_alike_and_falls_while_they_differ_to
         _, sigmas, _ = play(act, carry, actor, n_steps=10, length=3)
         expected = 0.02 * factor ** np.array([0, 0, 0, 1, 1, 1, 2, 2, 2, 3])
         np.testing.assert_allclose(sigmas, expected, rtol=1e-5)
+
+
+def test_long_episodes_adapt_once_per_interval():
+    noise = ParameterNoise(0.02, target_distance=0.9, adaptation=1.1, adaptation_interval=4)
+    _, act, carry, actor = made(ddpg, noise)
+    _, sigmas, _ = play(act, carry, actor, n_steps=11, length=10)
+    assert sigmas[-1] == pytest.approx(0.02 * 1.1 ** (4 * 10 / 4), rel=1e-5)
+
+
+def test_sigma_settles_where_the_actions_differ_by_the_target():
+    """At the end the root mean square difference of actions over many states is near the target distance."""
+    noise = ParameterNoise(initial_sigma=1.0, target_distance=0.1, adaptation=1.05)
+    exploit, act, carry, actor = made(noise=noise)
+    carry, _, _ = play(act, carry, actor, n_steps=400, length=4)
+    differences = []
+    for env in range(4):
+        perturbed = parameter_space.perturb(actor, [leaf[env] for leaf in carry.perturbation])
+        obs = observations(100, env)
+        differences.append(np.mean((exploit(perturbed, obs) - exploit(actor, obs)) ** 2))
+    assert 0.05 < np.sqrt(np.mean(differences)) < 0.2
 
 
 def test_distance_is_measured_over_the_states_of_the_episode():

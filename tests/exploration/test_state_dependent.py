@@ -17,6 +17,8 @@ from rejeu.algorithms.actor_critic.network import ActorCritic, action_kind, expl
 from rejeu.algorithms.sac.continuous import SdeActor
 from rejeu.core.algorithm import Clock
 from rejeu.core.spaces import leaves
+from rejeu.envs.make import InProcess
+from tests.algorithms.probes.environments import ByAction, BySightAndAction, Discretely
 from tests.environments import Counter
 from tests.helpers import assert_same_parameters
 from tests.tiers import only
@@ -70,9 +72,8 @@ def test_the_noise_that_is_drawn_has_that_deviation():
 
 def test_the_deviation_of_sac_trains_the_hidden_layer():
     """d log(sqrt(v)) / dh_i = h_i sigma_ij^2 / v_j with v_j = sum_i h_i^2 sigma_ij^2, summed over j; as in the original."""
-    actor = SdeActor(
-        jax.random.PRNGKey(0), leaves(OBS_SPACE), 2, sac.Config(use_sde=True, policy_kwargs={"net_arch": [WIDTH]})
-    )
+    config = sac.Config(use_sde=True, policy_kwargs={"net_arch": [WIDTH]})
+    actor = SdeActor(jax.random.PRNGKey(0), (leaves(OBS_SPACE), config.policy_kwargs), 2, config)
     h, squares = np.random.default_rng(0).normal(size=(N, WIDTH)), np.exp(2.0 * np.float64(actor.log_std))
     slope = jax.grad(lambda h: actor.distribution(h).log_std.sum())(h.astype(np.float32))
     np.testing.assert_allclose(slope, h * ((1.0 / (h**2 @ squares + 1e-6)) @ squares.T), rtol=1e-3)
@@ -158,6 +159,26 @@ def test_prediction_draws_noise_of_its_own():
     assert np.array_equal(agent.predict(obs, deterministic=True)[0], agent.predict(obs, deterministic=True)[0])
 
 
+def test_predictions_have_the_deviation_of_the_noise():
+    agent = rejeu.PPO("MlpPolicy", Counter((5,), low=-3.0, high=3.0), **SMALL)
+    obs = np.float32([1.0, -0.5, 0.2])
+    drawn = agent.predict(np.tile(obs, (4000, 1)))[0][:, 0] / 3.0
+    distribution = agent.state.network.policy(obs[None])
+    deviation, middle = float(np.exp(distribution.log_std[0, 0])), float(distribution.mean[0, 0])
+    bounded = np.clip(middle + deviation * np.random.default_rng(0).normal(size=10**6), -1.0, 1.0)
+    np.testing.assert_allclose([drawn.mean(), drawn.std()], [bounded.mean(), bounded.std()], atol=0.05)
+
+
+def test_it_finds_the_best_action():
+    """Of two sights, neither of them 0: there the hidden layer would be 0 at first, and with it the noise."""
+    env = InProcess([BySightAndAction() for _ in range(4)], seed=0)
+    agent = rejeu.PPO(
+        "MlpPolicy", env, **{**SMALL, "policy_kwargs": {"net_arch": [16], "log_std_init": -1.0}}, learning_rate=1e-2
+    ).learn(4000)
+    action, _ = agent.predict(np.float32([[-1.0], [1.0]]), deterministic=True)
+    assert action[:, 0] == pytest.approx([0.5, 1.5], abs=0.15)
+
+
 @pytest.mark.parametrize(
     ("settings", "error", "message"),
     [
@@ -171,3 +192,8 @@ def test_prediction_draws_noise_of_its_own():
 def test_a_bad_setting_is_refused(settings, error, message):
     with pytest.raises(error, match=message):
         rejeu.PPO("MlpPolicy", Counter(), **{**SMALL, **settings})
+
+
+def test_choices_get_no_noise():
+    with pytest.raises(ValueError, match="use_sde=True needs Box actions"):
+        rejeu.PPO("MlpPolicy", Discretely(ByAction()), **SMALL)

@@ -227,3 +227,10 @@ def test_a_full_disk_leaves_nothing_new(target, tmp_path, monkeypatch):
     assert "\n" not in str(error.value)
     assert disk.failures == 1
     assert ([*tmp_path.iterdir()], path.read_bytes()) == ([path], b"older")
+
+
+def test_no_c_file_is_kept_without_its_header(tmp_path):
+    (tmp_path / "policy.h").mkdir()
+    with pytest.raises(OSError, match=r"policy.h.*give a path that is not a folder"):
+        agent_of("PPO", "Box").export(tmp_path / "policy.c")
+    assert [*tmp_path.iterdir()] == [tmp_path / "policy.h"]

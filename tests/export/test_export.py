@@ -18,6 +18,7 @@ from gymnasium.wrappers import FrameStackObservation
 from rejeu.agents import exporting
 from rejeu.algorithms.sac.continuous import policy as sac_policy
 from rejeu.core import spaces
+from rejeu.core.spaces import parts
 from rejeu.export import FORMATS, c_file, check, contract, stablehlo_file
 from rejeu.lab.cli import main
 from rejeu.lab.policies import load_policy
@@ -82,6 +83,21 @@ def fewer(monkeypatch):
     monkeypatch.setattr(check, "OBSERVATIONS", 100)
 
 
+def skip_without_compiler(target):
+    if target == "c" and not has_compiler:
+        pytest.skip("there is no C compiler")
+
+
+def inputs_of(agent, samples):
+    """The observations as a file takes them, by name."""
+    leaves = spaces.leaves(agent.observation_space)
+    rows = [parts(agent.observation_space, one) for one in samples]
+    return {
+        leaf.path or "observation": np.stack([np.asarray(row[i], leaf.dtype) for row in rows])
+        for i, leaf in enumerate(leaves)
+    }
+
+
 @pytest.mark.parametrize(("name", "action", "settings", "targets"), CASES)
 def test_files_and_numpy_act_as_predict(name, action, settings, targets, tmp_path):
     agent = agent_of(name, action, **settings)
@@ -98,6 +114,16 @@ def test_files_and_numpy_act_as_predict(name, action, settings, targets, tmp_pat
     assert found.dtype == expected.dtype
     assert len(np.unique(expected)) > 1  # else any constant would do
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5 if expected.dtype.kind == "f" else 0)
+
+
+def test_a_batch_of_observations_has_the_actions_of_predict(tmp_path):
+    agent = agent_of("SAC", "Box", "small Dict", normalize=True)
+    path = agent.export(tmp_path / "policy.onnx").path
+    samples = observations(agent, 50, seed=3)
+    (action,) = onnxruntime.InferenceSession(path).run(["action"], inputs_of(agent, samples))
+    expected = np.stack([agent.predict(one, deterministic=True)[0] for one in samples])
+    np.testing.assert_allclose(action, expected, atol=1e-5)
+    assert np.ptp(expected, axis=0).min() > 0.1  # else any constant would do
 
 
 def test_memory_and_masks_are_inputs_that_matter(tmp_path):
@@ -368,3 +394,11 @@ def test_keys_may_be_words_of_c_and_names_of_outputs(name, tmp_path):
     agent = made("PPO", "MultiInputPolicy", Words(), policy_kwargs={"net_arch": [4], "activation_fn": "tanh"})
     found = agent.export(tmp_path / name)
     assert found.check.n == check.OBSERVATIONS
+
+
+def test_observations_with_practically_infinite_bounds_are_sampled_near_0():
+    """The space of CartPole had float32's largest number as a bound, and values were infinite for samples of it."""
+    most = np.finfo(np.float32).max
+    x = exporting.moderate(np.array([[0.9 * most, -most, 3.0, 0.0]], np.float32), np.random.default_rng(0))
+    assert np.abs(x).max() < 10
+    assert x[0, 2:].tolist() == [3.0, 0.0]

@@ -86,6 +86,12 @@ def test_no_text_of_a_card_ends_the_script_of_a_page():
     assert node(script + "\nconsole.log(JSON.stringify(ABOUT.card.source));", None) == "</script><!--"
 
 
+def test_a_policy_with_memory_acts_as_predict(tmp_path, monkeypatch):
+    monkeypatch.setattr(check, "OBSERVATIONS", 100)
+    agent = made("RecurrentPPO", "MlpPolicy", "Pendulum-v1", policy_kwargs={"lstm_hidden_size": 8, "net_arch": [8]})
+    assert agent.export(tmp_path / "page.html").check.difference <= 1e-5
+
+
 @pytest.mark.parametrize("env_id", PARTS)
 def test_the_environment_of_a_page_steps_as_in_jax(env_id):
     script, env = script_of(env_id)
@@ -105,6 +111,21 @@ def test_the_environment_of_a_page_steps_as_in_jax(env_id):
     for one, other in zip(node(script + DRIVER, given), expected, strict=True):
         for a, b in zip(one, other, strict=True):
             np.testing.assert_allclose(a, b, atol=1e-5, rtol=1e-5)
+
+
+def test_episodes_start_as_in_jax():
+    driver = "console.log(JSON.stringify([0, 0.25, 0.999].map((u) => resetWorld({}).map((x) => x[0]))));"
+    script, _ = script_of("Pendulum-v1")
+    angles = [state[0] for state in node(script + driver.format("[u, u]"), None)]
+    np.testing.assert_allclose(angles, [-np.pi, -np.pi / 2, np.pi * 0.998], rtol=1e-5)
+    script, _ = script_of("jax/Parking-v0")
+    driver = """
+    const goals = Array.from({ length: 27 }, (_, i) => resetWorld([0.25], [(i + 0.5) / 27])[6][0]);
+    console.log(JSON.stringify([goals, resetWorld([0.25], [0])[1][0]]));
+    """
+    goals, heading = node(script + driver, None)
+    assert goals == [i for i in range(28) if i != 6]  # the spot in the row ahead that highway-env excludes
+    np.testing.assert_allclose(heading, np.pi / 2, rtol=1e-5)
 
 
 DRAWS = "let drawnBefore = 1; Math.random = () => (drawnBefore = (drawnBefore * 16807) % 2147483647) / 2147483647;\n"

@@ -48,6 +48,12 @@ def test_returns_and_lengths_are_those_of_whole_episodes():
     assert np.isnan(result.successes).all()
 
 
+def test_every_environment_plays_its_share_so_short_episodes_are_not_counted_more_often():
+    """Stable-Baselines3's shares of 5 episodes on 3 environments: (5 + i) // 3 = 1, 2, 2."""
+    result = evaluate(still, InProcess([Counter((1,)), Counter((2,)), Counter((30,))]), 5)
+    assert sorted(result.lengths.tolist()) == [1, 2, 2, 30, 30]
+
+
 @pytest.mark.parametrize("n_envs", [1, 3])
 def test_exactly_as_many_episodes_are_played_as_asked_for(n_envs):
     assert len(evaluate(still, InProcess([Counter((2,)) for _ in range(n_envs)]), 7).returns) == 7
@@ -75,6 +81,14 @@ def timed(monkeypatch, envs, episodes, seconds, compiling=0.0):
 def test_when_the_time_is_over_no_episode_begins_and_the_one_under_way_is_played_to_its_end(monkeypatch):
     """Episodes of 3 and 5 steps in turn end after 3, 8 and 11 s: the third began before 10 s, and no fourth begins."""
     assert timed(monkeypatch, [Counter((3, 5))], None, 10.0) == [3, 5, 3]
+
+
+def test_compilation_takes_none_of_the_time_of_an_evaluation(monkeypatch):
+    assert timed(monkeypatch, [Counter((3, 5))], None, 10.0, compiling=100.0) == [3, 5, 3]
+
+
+def test_long_episodes_under_way_when_the_time_is_over_count(monkeypatch):
+    assert sorted(timed(monkeypatch, [Counter((2,)), Counter((30,))], None, 9.0)) == [2, 2, 2, 2, 2, 30]
 
 
 def test_of_a_number_of_episodes_and_a_time_the_nearer_limit_ends_an_evaluation(monkeypatch):
@@ -122,6 +136,12 @@ def test_statistics_equal_numpy_and_scipy():
     assert "success 75.0%" in str(result)
 
 
+def test_one_episode_has_no_interval_and_unknown_success_none_either():
+    result = Evaluation(np.array([1.0]), np.array([3]), np.array([np.nan]))
+    assert np.isnan([*result.return_interval, *result.success_interval, result.success_rate]).all()
+    assert "success" not in str(result)
+
+
 @pytest.mark.parametrize("episodes", [0, -3])
 def test_no_episode_is_refused(episodes):
     with pytest.raises(ValueError, match=f"episodes={episodes} must be at least 1"):
@@ -131,6 +151,26 @@ def test_no_episode_is_refused(episodes):
 
 
 # evaluate_policy, as Stable-Baselines3 has it.
+
+
+def test_mean_and_deviation_of_the_return():
+    expected = returns_of((2, 4), 4)
+    mean, std = rejeu.evaluate_policy(Still(), Counter((2, 4)), 4)
+    assert (mean, std) == (pytest.approx(np.mean(expected)), pytest.approx(np.std(expected)))
+
+
+def test_lists_of_returns_and_lengths_on_request():
+    returns, lengths = rejeu.evaluate_policy(Still(), Counter((2, 4)), 3, return_episode_rewards=True)
+    assert returns == returns_of((2, 4), 3)
+    assert lengths == [2, 4, 2]
+    assert type(returns[0]) is float
+    assert type(lengths[0]) is int
+
+
+def test_actions_of_the_model_are_in_the_range_of_the_environment():
+    env = Counter(low=[2.0], high=[6.0])
+    rejeu.evaluate_policy(Still(5.0), env, 1)
+    assert [float(action[0]) for action in env.actions] == [5.0] * 3
 
 
 @pytest.mark.parametrize("deterministic", [True, False])
@@ -149,3 +189,8 @@ def test_the_callback_is_called_after_every_step_that_counts_with_what_it_may_wa
         callback=lambda local, _: seen.append((local["i"], float(local["reward"]), bool(local["done"]))),
     )
     assert sorted(seen) == [(0, 0.0, False), (0, 1.0, True), (1, 0.0, False), (1, 1.0, False), (1, 2.0, True)]
+
+
+def test_a_mean_below_the_threshold_is_an_error():
+    with pytest.raises(AssertionError, match=r"mean return 3.00 is not above reward_threshold=5.00"):
+        rejeu.evaluate_policy(Still(), Counter(), 1, reward_threshold=5.0)

@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 
-from rejeu.logs.history import COLUMNS, History
+from rejeu.logs.history import COLUMNS, EpisodeTable, History
 from rejeu.training.run import Episode
 
 NAN = float("nan")
@@ -24,10 +24,35 @@ def history():
     return History(Episode(*row) for row in rows)
 
 
+def test_columns_come_by_name_in_order():
+    table = history()
+    assert len(table) == 4
+    assert table["step"].tolist() == [10, 20, 25, 40]
+    assert table["return"].tolist() == [1, 3, 5, 7]
+    assert table["length"].dtype == np.float64
+    assert list(table.to_dict()) == list(COLUMNS)
+
+
+def test_the_moving_average_takes_up_to_a_window_of_values():
+    assert history().moving_average("return", 2).tolist() == [1.0, 2.0, 4.0, 6.0]
+    assert history().moving_average("return", 50).tolist() == [1.0, 2.0, 3.0, 4.0]
+
+
 def test_the_moving_average_leaves_out_what_is_unknown():
     average = history().moving_average("success", 2)
     assert math.isnan(average[0])
     assert average[1:].tolist() == [1.0, 0.5, 0.5]
+
+
+def test_the_moving_average_of_a_long_table_equals_the_plain_mean():
+    values = np.random.default_rng(0).normal(size=200)
+    table = History(Episode(i, 0, value, 1, NAN, 0.0) for i, value in enumerate(values))
+    expected = [values[max(i - 6, 0) : i + 1].mean() for i in range(200)]
+    np.testing.assert_allclose(table.moving_average("return", 7), expected, atol=1e-12)
+
+
+def test_an_empty_table_has_empty_columns():
+    assert History()["return"].shape == History().moving_average().shape == (0,)
 
 
 def test_the_csv_file_holds_the_table(tmp_path):
@@ -71,6 +96,15 @@ def test_records_are_the_episodes_that_returned_more_than_all_before_them():
     assert History().best_return == -math.inf
 
 
+def test_a_table_put_back_has_the_same_records_and_counts_further_ones():
+    one, two = returning(2.0, 1.0, 4.0), returning(9.0)
+    two.replace(one.table())
+    np.testing.assert_equal(two.records(), one.records())
+    two.append(Episode(40, 0, 3.0, 10, NAN, 8.0))
+    two.append(Episode(50, 0, 5.0, 10, NAN, 10.0))
+    assert [episode.episode_return for episode in two.records()] == [2.0, 4.0, 5.0]
+
+
 def test_a_summary_has_the_means_of_all_and_of_the_last_episodes():
     summary = returning(1.0, 2.0, 6.0, 3.0, successes=[0.0, NAN, 1.0, 1.0]).summary(window=2)
     assert (summary.steps, summary.seconds, summary.records) == (40, 8.0, 3)
@@ -99,3 +133,15 @@ def test_a_summary_shows_itself_as_a_table():
     assert "success" not in repr(returning(1.0).summary())
     with pytest.raises(ValueError, match="window=0 must be a whole number of at least 1"):
         History().summary(0)
+
+
+def test_episode_table_grows_during_training(tmp_path):
+    history = History([Episode(10, 0, 1.0, 10, math.nan, 0.1)])
+    table = EpisodeTable(lambda: history, tmp_path / "episodes.csv")
+    for step in (20, 30):
+        history.append(Episode(step, 0, 2.0, 10, 1.0, 0.2))
+        table.write(step, {})
+    table.write(30, {})
+    grown = (tmp_path / "episodes.csv").read_bytes()
+    history.write_csv(tmp_path / "whole.csv")
+    assert grown == (tmp_path / "whole.csv").read_bytes()

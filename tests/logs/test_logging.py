@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 import rejeu
+from rejeu.callbacks import Evaluate
 from rejeu.logs import logging
 from rejeu.logs.logging import CsvFile, JsonLines
 from tests.helpers import small_sac
@@ -102,6 +103,21 @@ def test_each_learn_writes_the_logs_into_a_folder_of_its_own(tmp_path, monkeypat
     agent.save("model")
     assert rejeu.load("model").log == ()
     assert rejeu.SAC.load("model", log="csv").log == ("csv",)
+
+
+def test_evaluations_are_rows_under_the_names_of_stable_baselines3(tmp_path):
+    log = JsonLines(tmp_path / "rows.json")
+    evaluate = Evaluate(BALL, 20, episodes=2, seed=0)
+    small_sac(BALL).learn(40, evaluate, log_interval=10**6, sinks=[log])
+    assert lines(log.path) == [
+        {
+            "step": step,
+            "eval/mean_reward": result.mean_return,
+            "eval/mean_ep_length": result.mean_length,
+            "eval/success_rate": result.success_rate,
+        }
+        for step, result in evaluate.results
+    ]
 
 
 @exhaustive

@@ -18,6 +18,19 @@ def evaluated(step, success=float("nan")):
     return step, Evaluation(np.array([-500.0, -400.0]), np.array([50, 50]), np.array([success, success]))
 
 
+def test_success_has_a_panel_of_its_own_where_it_is_known():
+    assert len(learning_curve(history()).axes) == 1
+    assert len(learning_curve(history(success=1.0)).axes) == 2
+
+
+def test_the_line_is_the_moving_average():
+    record = history(20)
+    figure = learning_curve(record, window=5)
+    line = next(line for line in figure.axes[0].lines if line.get_label() == "mean of 5 episodes")
+    expected = [np.mean(record["return"][max(0, i - 4) : i + 1]) for i in range(20)]
+    np.testing.assert_allclose(line.get_ydata(), expected)
+
+
 @pytest.mark.parametrize(
     ("given", "error", "message"),
     [
@@ -49,6 +62,22 @@ def test_evaluations_are_drawn_at_their_steps_or_at_their_time(against, at):
     np.testing.assert_allclose(points.get_xdata(), at, rtol=1e-5)
     np.testing.assert_array_equal(points.get_ydata(), [-450, -450])
     assert (axes.get_xlabel() == "seconds of training") == (against == "seconds")
+
+
+@pytest.mark.parametrize("n", [0, 1])
+def test_a_run_of_hardly_any_episodes_can_be_drawn(tmp_path, n):
+    learning_curve(history(n, success=1.0), tmp_path / "curve.png", evaluations=[evaluated(1_000, 1.0)])
+    assert (tmp_path / "curve.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_nothing_of_matplotlibs_global_state_is_touched():
+    import matplotlib
+
+    backend = matplotlib.rcParams._get("backend")
+    learning_curve(history(), title="a title")
+    assert matplotlib.rcParams._get("backend") is backend
+    pyplot = sys.modules.get("matplotlib.pyplot")
+    assert pyplot is None or not pyplot.get_fignums()
 
 
 def test_an_evaluation_draws_every_episode_by_success_and_the_mean_with_its_interval(tmp_path):

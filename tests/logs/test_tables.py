@@ -29,6 +29,13 @@ def test_numbers_equal_those_of_python(tmp_path):
     np.testing.assert_array_equal(found, correct)
 
 
+def test_only_some_columns(tmp_path):
+    (tmp_path / "a.csv").write_text("a,b,c\n1,2,3\n4,5,6\n", encoding="utf-8")
+    table = read_table(tmp_path / "a.csv", only=("a", "c"))
+    assert {name: values.tolist() for name, values in table.columns.items()} == {"a": [1, 4], "c": [3, 6]}
+    assert np.isnan(table.column("b")).all()
+
+
 @pytest.mark.parametrize(
     ("content", "note"),
     [
@@ -43,3 +50,8 @@ def test_numbers_equal_those_of_python(tmp_path):
 def test_damage_is_noted(tmp_path, content, note):
     (tmp_path / "a.csv").write_bytes(content)
     assert read_table(tmp_path / "a.csv").notes == (note,)
+
+
+def test_file_of_a_spreadsheet_has_a_mark_before_the_header(tmp_path):
+    (tmp_path / "a.csv").write_bytes(b"\xef\xbb\xbfstep,b\r\n1,2\r\n")
+    assert [*read_table(tmp_path / "a.csv").columns] == ["step", "b"]

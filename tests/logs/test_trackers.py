@@ -78,6 +78,13 @@ def assert_close(given, expected):
         assert given[key] == pytest.approx(value, rel=1e-6, nan_ok=True), key
 
 
+def test_json_lines_hold_what_the_csv_file_holds():
+    _, expected = learn("json")
+    with open("logs/SAC_1/progress.json", encoding="utf-8") as file:
+        rows = [json.loads(line) for line in file]
+    assert_close({(row["step"], name): v for row in rows for name, v in row.items() if name != "step"}, expected)
+
+
 def test_tensorboard_holds_what_the_csv_file_holds():
     accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
     agent, expected = learn("tensorboard")
@@ -148,6 +155,20 @@ def test_mlflow_holds_what_the_csv_file_holds():
     assert run.data.params["learning_rate"] == str(agent.config.learning_rate)
     assert run.data.params["policy_kwargs.net_arch"] == str(list(agent.config.policy_kwargs.net_arch))
     assert len(client.list_artifacts(run.info.run_id, "videos")) == 2
+
+
+def test_a_run_that_is_resumed_continues_the_run_in_mlflow():
+    mlflow = pytest.importorskip("mlflow")
+    pytest.importorskip("sqlalchemy")
+    agent, _ = learn("mlflow")
+    agent.learn(50, reset_num_timesteps=False, log_interval=1)
+    client = mlflow.MlflowClient()
+    (run,) = client.search_runs([client.get_experiment_by_name("rejeu").experiment_id])
+    steps = [one.step for one in client.get_metric_history(run.info.run_id, "time/total_timesteps")]
+    assert max(steps) > 100
+    assert steps == sorted(set(steps))
+    agent.learn(50, log_interval=1)  # counts from 0, which is another run
+    assert len(client.search_runs([client.get_experiment_by_name("rejeu").experiment_id])) == 2
 
 
 def test_trackio_holds_what_the_csv_file_holds(tmp_path):

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import base64
+import builtins
 import ctypes.util
+import importlib.util
 import os
 import re
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
 from typing import NamedTuple
@@ -16,9 +19,11 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+import rejeu
 from rejeu.envs import rendering
 from rejeu.logs import video as video_file
-from rejeu.logs.video import record_video, rendering_env, show_videos
+from rejeu.logs.video import VideoFile, record_video, rendering_env, show_videos
+from tests.tiers import exhaustive
 
 
 class Lamp(gym.Env):
@@ -54,6 +59,14 @@ class Blank(Lamp):
 
     def render(self):
         return None
+
+
+@pytest.mark.parametrize("frame", [np.full((4, 6), 7), np.full((4, 6, 1), 7.0), np.full((4, 6, 4), 7, np.int64)])
+def test_frames_of_other_types_are_taken_if_their_values_fit(frame):
+    shown = rendering.rgb_frame(SimpleNamespace(render=lambda: frame))
+    assert (shown.dtype, shown.shape, shown.min(), shown.max()) == (np.uint8, (4, 6, 3), 7, 7)
+    with pytest.raises(ValueError, match=r"returned an array of shape .* expected whole numbers from 0 to 255"):
+        rendering.rgb_frame(SimpleNamespace(render=lambda: frame + 0.5))
 
 
 class Still:
@@ -123,6 +136,32 @@ def test_mujoco_without_a_screen_is_told_how_to_draw(tmp_path, monkeypatch):
     assert not (tmp_path / "v.mp4").exists()
 
 
+@pytest.mark.parametrize(("module", "name"), [("mujoco", "UnexpectedError"), ("elsewhere", "FatalError")])
+def test_other_errors_of_drawing_are_left_as_they_are(module, name, tmp_path):
+    env = Dark(module, name)
+    with pytest.raises(env.error, match=r"^no context$"):
+        record_video(Still(), tmp_path / "v.mp4", env)
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="elsewhere there is always a screen")
+@pytest.mark.skipif(importlib.util.find_spec("mujoco") is None, reason="MuJoCo is not installed")
+def test_the_command_line_says_in_one_line_what_mujoco_lacks(tmp_path):
+    model = rejeu.SAC("MlpPolicy", gym.make("InvertedPendulum-v5"), seed=0).save(tmp_path / "agent")
+    shown = {key: value for key, value in os.environ.items() if key not in ("DISPLAY", "WAYLAND_DISPLAY")}
+    result = subprocess.run(
+        [sys.executable, "-W", "ignore", "-m", "rejeu", "record", str(model)],
+        capture_output=True,
+        text=True,
+        check=False,
+        env=shown | {"MUJOCO_GL": "glfw"},
+    )
+    assert result.returncode == 2
+    errors = [line for line in result.stderr.splitlines() if "rror" in line]
+    assert errors[0].startswith("rejeu: error: ")
+    assert "set the environment variable MUJOCO_GL=egl (or osmesa)" in errors[0]
+    assert "Traceback" not in result.stderr
+
+
 def test_recording_is_of_the_deterministic_policy_and_ends_after_max_steps_over_all_episodes(lamp, tmp_path):
     agent = Still()
     path = record_video(agent, tmp_path / "v.mp4", lamp, episodes=5, max_steps=6, seed=7)
@@ -131,6 +170,15 @@ def test_recording_is_of_the_deterministic_policy_and_ends_after_max_steps_over_
     assert lamp.seeds == [7, None]
     found = decode(record_video(agent, tmp_path / "slow.mp4", lamp, episodes=1, fps=4))
     assert (found.fps, len(found.frames)) == (4, 5 + 2)
+
+
+def test_suffix_and_folders_are_supplied_and_only_environments_made_here_are_closed(lamp, tmp_path):
+    path = record_video(Still(), tmp_path / "a" / "b" / "v", lamp, episodes=1)
+    assert path == tmp_path / "a" / "b" / "v.mp4"
+    assert os.listdir(path.parent) == ["v.mp4"]
+    assert not lamp.closed
+    record_video(Still(), path, lambda: lamp, episodes=1)
+    assert lamp.closed
 
 
 def test_own_environment_is_made_again_with_its_arguments_and_wrappers(tmp_path):
@@ -152,6 +200,46 @@ def test_own_environment_is_made_again_with_its_arguments_and_wrappers(tmp_path)
         del gym.registry["Lamp-v0"]
 
 
+def test_parking_is_drawn_and_plays_at_15_frames_a_second(tmp_path):
+    path = record_video(StillCar(), tmp_path / "v.mp4", "parking-v0", episodes=1, max_steps=5, seed=0)
+    found = decode(path)
+    assert found.frames.shape == (6, 300, 600, 3)
+    assert found.frames.std() > 10  # not blank, although the tests set SDL_VIDEODRIVER=dummy
+    assert found.fps == 15
+
+
+class StillCar:
+    def predict(self, obs, state=None, episode_start=None, deterministic=False):
+        return np.array([1.0, 0.5], np.float32), None
+
+
+@pytest.mark.parametrize("setting", [None, "dummy", "x11"])
+def test_environment_variables_are_put_back(setting, monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    if setting is None:
+        monkeypatch.delenv("SDL_VIDEODRIVER", raising=False)
+    else:
+        monkeypatch.setenv("SDL_VIDEODRIVER", setting)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", "given")
+    before = dict(os.environ)
+    with suppress(KeyError), rendering.display_for_pygame():
+        inside = os.environ.get("SDL_VIDEODRIVER")
+        raise KeyError
+    assert dict(os.environ) == before
+    assert inside in ({"x11"} if setting == "x11" else {None, "dummy"})
+
+
+def test_driver_is_left_alone_where_there_is_a_display(monkeypatch):
+    monkeypatch.setenv("DISPLAY", ":0")
+    monkeypatch.delenv("SDL_VIDEODRIVER", raising=False)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", "")
+    monkeypatch.delenv("XDG_RUNTIME_DIR")
+    with rendering.display_for_pygame():
+        assert "SDL_VIDEODRIVER" not in os.environ
+    assert Path(os.environ["XDG_RUNTIME_DIR"]).is_dir()  # SDL complains without it
+
+
 def test_an_error_leaves_the_older_file_and_nothing_half_written(lamp, tmp_path):
     path = tmp_path / "v.mp4"
     path.write_bytes(b"older")
@@ -161,6 +249,24 @@ def test_an_error_leaves_the_older_file_and_nothing_half_written(lamp, tmp_path)
         record_video(agent, path, lamp)
     assert path.read_bytes() == b"older"
     assert os.listdir(tmp_path) == ["v.mp4"]
+
+
+def test_what_ffmpeg_says_is_passed_on(tmp_path):
+    writer = VideoFile(tmp_path / "v.mp4", 1e99)  # no rate that ffmpeg takes
+    writer.write(np.zeros((2, 2, 3), np.uint8))
+    with pytest.raises(OSError, match=r"could not be written; ffmpeg: \S"):
+        writer.close()
+    assert os.listdir(tmp_path) == []
+
+
+def test_frames_of_another_shape_or_type_are_refused(tmp_path):
+    for bad in (np.zeros((8, 6, 3), np.uint8), np.zeros((8, 8, 3))):
+        writer = VideoFile(tmp_path / "v", 30)
+        writer.write(np.zeros((8, 8, 3), np.uint8))
+        with pytest.raises(ValueError, match=r"frame 1 is .* expected uint8 of shape \(8, 8, 3\)"):
+            writer.write(bad)
+        writer.discard()
+    assert os.listdir(tmp_path) == []
 
 
 def test_environment_that_cannot_render_is_an_error(tmp_path):
@@ -196,6 +302,35 @@ def test_bad_arguments_are_named(arguments, message, lamp, tmp_path):
     assert os.listdir(tmp_path) == []
 
 
+def hide(monkeypatch, package):
+    real = builtins.__import__
+
+    def import_(name, *args, **kwargs):
+        if name.split(".")[0] == package:
+            raise ImportError(name)
+        return real(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", import_)
+    for name in [name for name in sys.modules if name.split(".")[0] == package]:
+        monkeypatch.delitem(sys.modules, name)
+
+
+@exhaustive
+def test_training_episodes_are_filmed_by_gymnasiums_wrapper(tmp_path):
+    pytest.importorskip("moviepy")
+    env = gym.make("Pendulum-v1", render_mode="rgb_array", max_episode_steps=10)
+    env = gym.wrappers.RecordVideo(env, str(tmp_path / "videos"), episode_trigger=lambda episode: episode % 2 == 0)
+    agent = rejeu.SAC("MlpPolicy", env, policy_kwargs={"net_arch": [8]}, seed=0).learn(30)
+    env.close()
+    record_video(
+        agent, tmp_path / "after.mp4", episodes=1, max_steps=5
+    )  # in an environment that records nothing itself
+    assert {path.name for path in (tmp_path / "videos").iterdir()} == {
+        "rl-video-episode-0.mp4",
+        "rl-video-episode-2.mp4",
+    }
+
+
 def test_show_videos_embeds_the_files_in_order(tmp_path, capsys):
     for name in ("b-10", "b-2", "a-1", "b-1", ".b-3.partial"):
         (tmp_path / f"{name}.mp4").write_bytes(name.encode())
@@ -212,6 +347,21 @@ def test_show_videos_escapes_names_and_says_when_there_is_none(tmp_path):
     text = show_videos(tmp_path, prefix="sac").data
     assert "No mp4 file whose name starts with sac" in text
     assert "<video" not in text
+
+
+@pytest.mark.exhaustive
+def test_an_environment_of_envpool_is_filmed_though_its_package_was_not_imported(tmp_path):
+    pytest.importorskip("highway_env")
+    script = """if True:
+        import sys, rejeu
+        env = rejeu.make_vector("parking-v0", 2, "envpool", seed=0)
+        agent = rejeu.SAC("MultiInputPolicy", env, policy_kwargs={"net_arch": [8]}, seed=0)
+        assert "highway_env" not in sys.modules
+        print(rejeu.record_video(agent, sys.argv[1], max_steps=3))
+    """
+    done = subprocess.run([sys.executable, "-c", script, str(tmp_path / "film")], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert Path(done.stdout.splitlines()[-1]).stat().st_size > 1000
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="EGL is Linux's")

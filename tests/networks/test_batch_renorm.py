@@ -84,6 +84,12 @@ def test_the_ratio_of_deviations_is_clipped(deviation, r):
     np.testing.assert_allclose(np.std(y, axis=0), r * np.sqrt(variance / (variance + 1e-3)), rtol=1e-3)
 
 
+@pytest.mark.parametrize(("mean", "d"), [(1000.0, 5.0), (-1000.0, -5.0)])
+def test_the_difference_of_means_is_clipped(mean, d):
+    y, _ = layer_with(warm_up=0).train(batch(0, mean=mean))
+    np.testing.assert_allclose(np.mean(y, axis=0), d, atol=1e-3)
+
+
 @pytest.mark.parametrize("warm_up", [0, 5])
 def test_the_gradient_equals_finite_differences_with_r_and_d_held(warm_up):
     """Through the batch's own mean and deviation, not through r, d or the running statistics."""

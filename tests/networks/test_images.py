@@ -161,6 +161,22 @@ def test_sampled_stacks_are_those_that_the_agent_saw(case, n_steps, prioritised)
     assert seen <= history.steps()
 
 
+def test_stacks_whose_frames_are_all_kept_are_exact():
+    n_envs, stack, rows = 2, 4, 30
+    ring = make_ring(rows * n_envs, n_envs, stack)
+    history = History(n_envs, rows, stack)
+    play(ReplayBuffer(ring, 0.9), history, [[0] if i % 7 == 6 else [1] if i % 5 == 4 else [] for i in range(70)])
+    exact = 0
+    for env in range(n_envs):
+        oldest = history.oldest(env)
+        for place in range(oldest, len(history.starts[env])):
+            _, (camera, _) = ring.read(ring.index(np.array(env), np.array(place)))
+            kept = min(place - history.starts[env][place], stack - 1) <= place - oldest
+            assert kept == np.array_equal(camera, history.seen(env, place))
+            exact += kept
+    assert exact >= n_envs * (rows - stack + 1)
+
+
 @pytest.mark.parametrize("shape", [SIZE, (*SIZE, 3)])
 def test_an_agent_replays_the_stacks_of_gymnasiums_wrapper(shape):
     def make(frame_stack):
@@ -238,6 +254,14 @@ def test_observations_that_cannot_be_rebuilt_are_refused(env):
         agent.learn(10)
 
 
+def test_a_turn_that_some_environments_sit_out_keeps_its_stacks():
+    envs = gym.vector.SyncVectorEnv([lambda: FrameStackObservation(Film(), 3)] * 3)
+    agent = rejeu.SAC("MlpPolicy", envs, frame_stack=3, **SMALL)
+    agent.learn(10)  # 3 x 3 steps, and one more in the first environment
+    agent.learn(11)
+    assert len(agent.replay_buffer.ring) == 21
+
+
 @pytest.mark.parametrize(
     ("space", "frame_stack"),
     [
@@ -249,6 +273,22 @@ def test_observations_that_cannot_be_rebuilt_are_refused(env):
 def test_observations_that_are_no_stacks_are_refused_at_once(space, frame_stack):
     with pytest.raises(ValueError, match=r"frame_stack=4 needs uint8 observations \(4, height, width"):
         Ring(10, 1, leaves(space), structure(space), (1,), np.float32, frame_stack)
+
+
+def test_goals_are_never_taken_for_stacks():
+    goal = spaces.Box(0, 255, (4, 8, 8), np.uint8)
+    space = spaces.Dict(observation=goal, achieved_goal=goal, desired_goal=goal)
+    ring = Ring(10, 1, leaves(space), structure(space), (1,), np.float32, 4)
+    assert [array.shape for array in ring.obs] == [(10, 4, 8, 8), (10, 4, 8, 8), (10, 8, 8)]
+
+
+@pytest.mark.parametrize("frame_stack", [None, 4])
+def test_the_bytes_of_a_ring_are_told(frame_stack):
+    space = spaces.Box(0, 255, (4, 84, 84), np.uint8)
+    ring = Ring(100, 2, leaves(space), structure(space), (2,), np.float32, frame_stack)
+    # Per row: the frames; two actions and a reward of 4 bytes; the kind; and for stacks the steps since the start.
+    frames, since_start = (4, 0) if frame_stack is None else (1, 4)
+    assert ring.nbytes == 100 * (frames * 84 * 84 + 2 * 4 + 4 + 1 + since_start)
 
 
 def test_a_buffer_that_memory_cannot_hold_is_refused_before_anything_is_reserved(monkeypatch):

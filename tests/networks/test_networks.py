@@ -13,6 +13,9 @@ from gymnasium import spaces
 from scipy import stats
 
 import rejeu
+from rejeu.algorithms import config as configs, sac
+from rejeu.core import validation
+from rejeu.core.algorithm import ensemble
 from rejeu.core.errors import CheckpointError
 from rejeu.core.spaces import leaves
 from rejeu.lab import cli
@@ -21,9 +24,11 @@ from rejeu.networks import (
     Convolution,
     Encoder,
     Linear,
+    MemoryConfig,
     Network,
     PolicyConfig,
     QNetwork,
+    action_values,
     convolutions,
     encoder,
 )
@@ -42,6 +47,7 @@ DOCUMENT = {
 """The example of branches in ``../shared/seeds/002_c02ee75899cc9380.txt``."""
 VECTOR = spaces.Box(-np.inf, np.inf, (5,), np.float32)
 RNG = np.random.default_rng(0)
+KEY = jax.random.PRNGKey(0)
 OBS = RNG.normal(size=(7, 5)).astype(np.float32)
 ACTION = RNG.uniform(-1, 1, (7, 3)).astype(np.float32)
 
@@ -153,6 +159,27 @@ def test_gradients_reach_every_parameter(kind):
         assert np.abs(gradient).max() > 0, jax.tree_util.keystr(path)
 
 
+def test_action_values_are_those_of_each_critic():
+    shape = PolicyConfig(**DOCUMENT)
+    init = lambda key: QNetwork(key, leaves(VECTOR), 3, shape.critic_widths(()), shape)  # noqa: E731
+    critics = filled(jax.eval_shape(lambda key: ensemble(init, key, 3), jax.random.PRNGKey(0)))
+    together = jax.jit(action_values)(critics, OBS, ACTION)
+    for i in range(3):
+        one = jax.tree.map(lambda p, i=i: p[i], critics)
+        np.testing.assert_allclose(together[i], call(one, OBS, ACTION)[:, 0], rtol=1e-4, atol=1e-4)
+
+
+def test_the_default_widths_are_the_algorithms_own():
+    assert PolicyConfig().actor_widths((400, 300)) == (400, 300)
+    assert PolicyConfig(net_arch={"pi": [7], "qf": [8, 9]}).actor_widths((1,)) == (7,)
+    assert PolicyConfig(net_arch={"pi": [7], "qf": [8, 9]}).critic_widths((1,)) == (8, 9)
+    assert PolicyConfig(architecture="simba", width=32, n_blocks=3).critic_widths((1,)) == (32, 32, 32)
+    assert PolicyConfig(architecture="simba", net_arch={"pi": [8], "qf": [16, 16]}).actor_widths((1,)) == (8,)
+    assert PolicyConfig(net_arch={"pi": [4]}).critic_widths((9,)) == (9,)
+    assert PolicyConfig(**DOCUMENT).actor_widths((1,)) == (24,)
+    assert PolicyConfig(state_layers=[5]).critic_widths((1,)) == ()
+
+
 @pytest.mark.parametrize(
     ("given", "message"),
     [
@@ -176,6 +203,13 @@ def test_gradients_reach_every_parameter(kind):
 def test_impossible_shapes_are_refused(given, message):
     with pytest.raises((ValueError, TypeError), match=message):
         PolicyConfig(**given)
+
+
+@pytest.mark.parametrize("kind", [kind for kind in SHAPES if kind != "own"])
+def test_a_shape_survives_json(kind):
+    config = sac.Config(policy_kwargs=SHAPES[kind])
+    assert validation.build(sac.Config, configs.to_json(config)) == config
+    assert hash(config.policy_kwargs) == hash(MemoryConfig(**SHAPES[kind]))
 
 
 # --- encoders -------------------------------------------------------------------------------------------------------
@@ -390,6 +424,46 @@ def test_a_saved_torso_must_be_given_again(tmp_path):
 
 def own_mlp(key, n_inputs):
     return eqx.nn.MLP(n_inputs, 6, 5, 1, key=key)
+
+
+class OwnCNN(eqx.Module):
+    """Takes one image, channels first, as Equinox's layers do."""
+
+    conv: eqx.nn.Conv2d
+
+    def __init__(self, key, leaves):
+        (leaf,) = leaves
+        self.conv = eqx.nn.Conv2d(leaf.shape[0], 4, 3, key=key)
+
+    def __call__(self, image):
+        return jax.nn.relu(self.conv(image.astype(jnp.float32) / 255)).mean(axis=(1, 2))
+
+
+class OwnGoalEncoder(eqx.Module):
+    weight: jax.Array
+
+    def __init__(self, key, leaves):
+        self.weight = jnp.full((2, 3), 0.5)
+
+    def __call__(self, obs):
+        return (obs["desired_goal"] - obs["achieved_goal"]) @ self.weight
+
+
+def test_an_own_encoder_reads_one_image_or_a_dict():
+    image = spaces.Box(0, 255, (3, 9, 9), np.uint8)
+    network = Network(KEY, leaves(image), 2, (4,), PolicyConfig(encoder=OwnCNN))
+    assert network.encoder.n_features == 4
+    assert network(np.zeros((6, 3, 9, 9), np.uint8)).shape == (6, 2)
+    goal = spaces.Dict({key: spaces.Box(-1, 1, (2,)) for key in ("achieved_goal", "desired_goal", "observation")})
+    network = Network(KEY, leaves(goal), 2, (4,), PolicyConfig(encoder=OwnGoalEncoder))
+    obs = {key: np.full((4, 2), i, np.float32) for i, key in enumerate(sorted(goal.spaces))}
+    np.testing.assert_allclose(network.encoder(obs), np.ones((4, 3)))
+
+
+def test_a_head_of_another_width_is_refused():
+    shape = PolicyConfig(head=lambda key, n, m: eqx.nn.Linear(n, m + 1, key=key))
+    with pytest.raises(TypeError, match="must have 2 outputs, got 3"):
+        Network(KEY, leaves(VECTOR), 2, (4,), shape)
 
 
 @pytest.mark.parametrize("agent", only([rejeu.PPO], [rejeu.SAC, rejeu.PPO]))

@@ -103,8 +103,26 @@ def test_projection_scales_units_to_norm_1_and_gains_of_flashsac_to_the_root_of_
         np.testing.assert_allclose(new_gains, old_gains / size if gains else old_gains, atol=1e-5)
 
 
+def test_units_begin_orthogonal_with_norm_1():
+    weight = np.float64(UnitLinear(jax.random.PRNGKey(0), 6, 4).weight)
+    np.testing.assert_allclose(weight.T @ weight, np.eye(4), atol=1e-5)
+    wide = np.float64(UnitLinear(jax.random.PRNGKey(0), 3, 9).weight)
+    np.testing.assert_allclose(np.linalg.norm(wide, axis=0), 1.0, atol=1e-5)
+
+
 def test_rms_norm_equals_its_formula():
     x = np.random.default_rng(0).normal(size=(4, 5))
     norm = eqx.tree_at(lambda n: n.scale, RMSNorm(5), jnp.arange(1.0, 6.0))
     expected = x / np.sqrt((x**2).mean(axis=1, keepdims=True) + 1e-6) * np.arange(1.0, 6.0)
     np.testing.assert_allclose(norm(jnp.asarray(x, jnp.float32)), expected, atol=1e-5)
+
+
+def test_weights_of_several_networks_are_drawn_one_after_another() -> None:
+    """Batches of QR decompositions hung where XLA had fewer threads than a program had batches."""
+    draw = jax.jit(jax.vmap(lambda key: UnitLinear(key, 4, 4).weight))
+    keys = jax.random.split(jax.random.PRNGKey(0), 3)
+    factorizations = [line for line in draw.lower(keys).as_text().splitlines() if "geqrf" in line]
+    assert factorizations
+    assert all("tensor<4x4xf32>" in line and "tensor<3x4x4xf32>" not in line for line in factorizations)
+    one_by_one = np.stack([UnitLinear(key, 4, 4).weight for key in keys])
+    np.testing.assert_allclose(draw(keys), one_by_one, atol=1e-6)

@@ -341,3 +341,34 @@ def test_episodes_begin_and_end_where_they_are_stored():
         times = np.full(len(steps.time), time)
         episode = model.episode(0, time)
         assert (steps.begin(times)[0], steps.end(times)[0]) == (episode[0], episode[-1])
+
+
+def test_of_the_goals_of_next_future_a_quarter_more_is_the_next_moment():
+    """With ``m`` later moments the next one has the probability 1/4 + 3/4 1/m, and every other one 3/4 1/m."""
+    places, goals = later_goals("next_future")
+    for place in range(10):
+        m, of_place = 10 - place, goals[places == place]
+        counts = np.bincount(of_place - place - 1, minlength=m)
+        expected = len(of_place) * (0.75 / m + 0.25 * (np.arange(m) == 0))
+        assert len(counts) == m
+        assert m == 1 or stats.chisquare(counts, expected).pvalue > 1e-4
+
+
+def test_termination_is_computed_anew_where_the_environment_can_say():
+    """After one step from place 0 to 1, terminated((0, 1), (0, 1)) holds, whereas the step itself did not terminate."""
+    replay, _ = filled(1, 8, [turn("truncated")], ends=True)
+    batch = replay.sample(np.random.default_rng(0), (10,))
+    np.testing.assert_array_equal(batch.discount, [0.0] * 8 + [np.float32(GAMMA)] * 2)
+
+
+def test_rewards_come_from_one_call_a_sample():
+    replay, _ = filled(2, 8, [turn("no", "no")] * 6)
+    sizes = []
+    replay.goals = GoalFunctions(lambda a, d: sizes.append(len(a)) or reward(a, d))
+    replay.sample(np.random.default_rng(0), (3, 10))
+    assert sizes == [24]
+
+
+@pytest.mark.parametrize("strategy", [*STRATEGIES, *GoalSelectionStrategy])
+def test_a_strategy_is_given_by_string_or_enum(strategy):
+    assert HindsightConfig(goal_selection_strategy=strategy).goal_selection_strategy in STRATEGIES

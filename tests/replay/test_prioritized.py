@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import timeit
 
 import jax
 import numpy as np
@@ -119,6 +120,12 @@ def test_sum_tree_agrees_with_an_array(n, changes, data):
         assert (mass <= running[found + 1] + slack).all()
 
 
+def test_finding_a_mass_at_or_beyond_the_total_gives_a_positive_position():
+    tree = SumTree(6)
+    tree.set(np.array([1, 3]), np.array([0.1, 0.2]))
+    np.testing.assert_array_equal(tree.find(np.array([0.0, 0.1, tree.total, 2 * tree.total])), [1, 3, 3, 3])
+
+
 @pytest.mark.parametrize("alpha", [0.0, 0.6, 1.0])
 def test_steps_are_drawn_in_proportion_to_their_priorities(alpha):
     """P(i) = (|delta_i| + epsilon)^alpha / sum (arXiv 1511.05952, equation 1)."""
@@ -231,6 +238,72 @@ def test_exactly_the_steps_that_are_kept_can_be_drawn(rows, n_envs, course, kind
         assert len(can_be_drawn) == buffer.size()
 
 
+@pytest.mark.parametrize("kind", [uniform, hindsight])
+@pytest.mark.parametrize("n_envs", [1, 3])
+def test_rows_drawn_are_the_steps_that_their_rewards_and_successors_say(kind, n_envs):
+    buffer = kind(20 * n_envs, n_envs, alpha=0.5)
+    story = Story(buffer, goals=kind is hindsight)
+    for t in range(50):
+        story.step({t % n_envs} if t % 4 == 0 else set(), terminated=t % 8 == 0)
+    batch = buffer.sample(np.random.default_rng(0), (5, 100))
+    obs, next_obs = (jax.tree.leaves(tree)[0][..., 0] for tree in (batch.obs, batch.next_obs))
+    np.testing.assert_array_equal(batch.reward, obs)
+    np.testing.assert_array_equal(next_obs, obs + 1)
+    ends = {1000 * env + time for env in range(n_envs) for time, terminated in story.steps[env] if terminated}
+    np.testing.assert_array_equal(batch.discount == 0, np.isin(obs, list(ends)))
+    assert set(obs.ravel()) == story.kept()
+    assert batch.weight.shape == (5, 100)
+    np.testing.assert_array_equal(batch.weight.max(axis=1), np.ones(5))
+
+
+@pytest.mark.parametrize("kind", [uniform, hindsight])
+def test_n_step_returns_compose_with_priorities(kind):
+    """Rewards equal times: an unbroken 3-step return from t is t + 0.9 (t + 1) + 0.81 (t + 2)."""
+    buffer = kind(40, 2, n_steps=3, alpha=0.5)
+    story = Story(buffer, goals=kind is hindsight)
+    for t in range(12):
+        story.step({0} if t == 5 else set(), terminated=True)
+    batch = buffer.sample(np.random.default_rng(0), (400,))
+    obs = jax.tree.leaves(batch.obs)[0][:, 0]
+    next_obs = jax.tree.leaves(batch.next_obs)[0][:, 0]
+    for i in range(400):
+        now = obs[i]
+        end = 12 if now < 1000 else 1011  # environment 0 ended after time 5, began again at 7 and stands at 13
+        end = 5 if now <= 5 else end
+        n = int(min(3, end - now + 1))
+        assert batch.reward[i] == pytest.approx(sum(0.9**j * (now + j) for j in range(n)), rel=1e-5)
+        assert next_obs[i] == now + n
+        assert batch.discount[i] == pytest.approx(0.0 if now <= 5 and now + n == 6 else 0.9**n)
+
+
+def test_hindsight_relabels_the_same_share_of_a_prioritised_batch():
+    buffer = hindsight(64, 2, k=4, alpha=0.5)
+    story = Story(buffer, goals=True)
+    for t in range(20):
+        story.step({0, 1} if t % 10 == 9 else set())
+    batch = buffer.sample(np.random.default_rng(0), (3, 50))
+    relabelled = batch.obs["desired_goal"][..., 0] % 1 == 0  # the environment's own goals end in .5
+    np.testing.assert_array_equal(relabelled.sum(axis=1), [40, 40, 40])
+    reached = batch.next_obs["achieved_goal"] == batch.next_obs["desired_goal"]
+    np.testing.assert_array_equal(batch.reward[relabelled], reached[..., 0][relabelled])
+    future = batch.next_obs["desired_goal"][..., 0] - batch.obs["achieved_goal"][..., 0]
+    assert (future[relabelled] >= 1).all()
+    assert (future[relabelled] <= 10).all()
+
+
+def test_relabelled_transitions_carry_high_and_low_priorities_alike():
+    """Which part of a batch is relabelled must not depend on where in the ring, or how likely, a step is."""
+    buffer = hindsight(64, k=1, alpha=1.0)
+    story = Story(buffer, goals=True)
+    for _ in range(40):
+        story.step()
+    give_td_errors(buffer, np.where(np.arange(40) < 20, 1.0, 9.0))
+    batch = buffer.sample(np.random.default_rng(0), (4_000,))
+    late = batch.obs["observation"][:, 0] >= 20
+    assert late[:2000].mean() == pytest.approx(0.9, abs=0.03)
+    assert late[2000:].mean() == pytest.approx(0.9, abs=0.03)
+
+
 def test_a_restored_buffer_can_draw_all_its_steps_and_ignores_td_errors_of_earlier_draws():
     buffer, other = uniform(16, 2), uniform(16, 2)
     story, stale = Story(buffer), Story(other)
@@ -247,6 +320,21 @@ def test_a_restored_buffer_can_draw_all_its_steps_and_ignores_td_errors_of_earli
     assert other.priorities.tree.total == pytest.approx(other.size())
     other.update_priorities([(drawn, np.full(512, 3.0))])
     assert other.priorities.tree.total == pytest.approx(other.size() * (3 + 1e-6) ** 0.6)
+
+
+def test_drawing_and_setting_take_time_in_the_logarithm_of_the_size():
+    def seconds(n: int) -> float:
+        tree, rng = SumTree(n), np.random.default_rng(0)
+        tree.set(np.arange(n), rng.random(n) + 0.1)
+        mass, index = rng.random(256) * tree.total, rng.integers(n, size=256)
+
+        def turn() -> None:
+            tree.find(mass)
+            tree.set(index, 1.0)
+
+        return min(timeit.repeat(turn, number=20, repeat=7))
+
+    assert seconds(1_000_000) < 4 * seconds(10_000)
 
 
 @pytest.mark.parametrize(
@@ -283,6 +371,10 @@ def not_a_number(batch, drawn):
     return batch._replace(reward=batch.reward * np.float32(np.nan)), drawn
 
 
+def compute_reward_fails(batch, drawn):
+    raise RuntimeError("compute_reward")
+
+
 def assert_priorities_are_of_their_steps(agent: rejeu.DQN, least: int) -> None:
     """Fails unless all steps have the priority of their own TD error or, being new, the largest, which is 1."""
     ring, tree = agent.replay_buffer.ring, agent.replay_buffer.priorities.tree
@@ -315,6 +407,27 @@ def test_after_an_update_that_was_not_finite_td_errors_still_belong_to_their_ste
     agent.learn(60)
     assert_priorities_are_of_their_steps(agent, least=20)
     assert_resumes(agent, tmp_path / "run")
+
+
+def test_after_a_draw_that_raised_td_errors_still_belong_to_their_steps(tmp_path):
+    agent = small_dqn(train_freq=(1, "episode"), gradient_steps=-1)
+    fail_once(agent, 8, compute_reward_fails)  # the fourth of the five of a turn
+    with pytest.raises(RuntimeError, match="compute_reward"):
+        agent.learn(60)
+    agent.learn(60)
+    assert_priorities_are_of_their_steps(agent, least=20)
+    assert_resumes(agent, tmp_path / "run")
+
+
+def test_a_loaded_replay_buffer_forgets_the_td_errors_of_the_one_before(tmp_path):
+    agent = small_dqn().learn(60)
+    agent.save_replay_buffer(tmp_path / "replay")
+    agent.load_replay_buffer(tmp_path / "replay")
+    Checkpoint(tmp_path / "run").save(agent)
+    with pytest.warns(UserWarning, match="none was under way"):
+        assert rejeu.DQN.resume(tmp_path / "run", agent.env).run.td_errors == []
+    agent.learn(60)
+    assert_priorities_are_of_their_steps(agent, least=20)
 
 
 def test_checkpoints_in_which_draws_have_lost_their_td_errors_are_read(tmp_path):

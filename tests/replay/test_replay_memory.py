@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 import rejeu
+from tests.environments import Reach
 
 LINE = gym.spaces.Box(-9.0, 9.0, (1,), np.float32)
 CHOICES = gym.spaces.Discrete(3, start=5)
+GAMMA = np.float32(0.5)
 
 
 def memory(capacity=4, action_space=CHOICES, **settings):
@@ -41,6 +43,33 @@ def test_the_oldest_give_way_and_exactly_the_newest_are_kept():
         push(kept, i)
     assert len(kept) == 4
     assert [row[0] for row in drawn(kept)] == [6.0, 7.0, 8.0, 9.0]
+
+
+def test_a_seed_repeats_the_draws():
+    first, second = memory(seed=3), memory(seed=3)
+    for i in range(4):
+        push(first, i)
+        push(second, i)
+    np.testing.assert_array_equal(first.sample(50).obs, second.sample(50).obs)
+
+
+def test_continuous_actions_come_back_as_algorithms_have_them():
+    kept = memory(action_space=gym.spaces.Box(0.0, 4.0, (2,), np.float32))
+    kept.push([0.0], [0.0, 3.0], 1.0, [0.0], False)
+    batch = kept.sample(2)
+    np.testing.assert_allclose(batch.action, [[-1.0, 0.5]] * 2)
+    assert batch.action.dtype == batch.reward.dtype == batch.discount.dtype == np.float32
+
+
+def test_observations_may_be_dicts():
+    env = Reach()
+    kept = rejeu.ReplayMemory(10, env.observation_space, env.action_space)
+    obs, _ = env.reset(seed=0)
+    next_obs, reward, terminated, *_ = env.step(np.ones(1, np.float32))
+    kept.push(obs, np.ones(1), reward, next_obs, terminated)
+    batch = kept.sample(3)
+    for key in env.observation_space:
+        np.testing.assert_array_equal(batch.next_obs[key], np.stack([next_obs[key]] * 3))
 
 
 @pytest.mark.parametrize(

@@ -162,6 +162,22 @@ def test_what_goes_into_the_buffer_comes_out(kind, n_envs):
     assert rollout.reward.dtype == rollout.discount.dtype == np.float32
 
 
+def test_a_new_rollout_has_nothing_of_the_one_before_in_it():
+    space = OBSERVATIONS["Box"]
+    buffer = buffer_of(space)
+    buffer.begin((), np.ones(3, bool))
+    fill(buffer, space, 4)
+    started = np.array([True, False, True])
+    buffer.begin((), started)
+    started[:] = False
+    assert (buffer.length, buffer.size(), buffer.full) == (0, 0, False)
+    steps = fill(buffer, space, 2, seed=1)
+    rollout = buffer.rollout()
+    assert_holds(rollout, steps)
+    np.testing.assert_array_equal(rollout.valid, np.arange(4)[:, None] < np.full(3, 2))
+    np.testing.assert_array_equal(rollout.started, [True, False, True])
+
+
 def test_only_the_steps_of_active_environments_count():
     space = OBSERVATIONS["Box"]
     buffer = buffer_of(space)

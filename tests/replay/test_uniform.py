@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gymnasium as gym
 import jax
 import numpy as np
 import pytest
@@ -99,6 +100,19 @@ def test_a_restored_buffer_samples_and_grows_like_the_original(case, more):
     assert kept_counters(other.ring) == kept_counters(replay.ring)
 
 
+@settings(max_examples=50)
+@given(case=histories())
+def test_counters_are_those_of_the_episodes(case):
+    replay, model = filled(*case, counters=COUNTERS)
+    for env, (since_start, until_end) in enumerate(kept_counters(replay.ring)):
+        episodes = [model.episode(env, place) for place in model.kept(env)]
+        places = list(model.kept(env))
+        assert since_start == [place - episode[0] for place, episode in zip(places, episodes, strict=True)]
+        closed = [model.frames[env][episode[-1]].closed for episode in episodes]
+        ends = [e[-1] if is_closed else place for place, e, is_closed in zip(places, episodes, closed, strict=True)]
+        assert until_end == [end - place for place, end in zip(places, ends, strict=True)]
+
+
 NO_END = Turn([True] * 2, ["no"] * 2, [False] * 2)
 
 
@@ -136,11 +150,31 @@ def test_a_sample_does_not_change_when_the_ring_goes_on():
     np.testing.assert_array_equal(batch.next_obs["where"], before[1])
 
 
+def test_an_empty_buffer_says_that_it_is_empty():
+    with pytest.raises(ValueError, match="replay buffer is empty: take some environment steps"):
+        filled(2, 4, [])[0].sample(np.random.default_rng(0), (1,))
+
+
 def test_capacity_is_shared_among_environments():
     ring = make_ring(10, 3)
     assert ring.rows == 3
     needed = sum(a.nbytes for a in (*ring.obs, ring.action, ring.reward, ring.kind))
     assert needed <= ring.nbytes < needed + 9 * 4, "a row takes what it holds, and less than 4 bytes of alignment"
+
+
+def test_priorities_take_sixteen_bytes_a_row_where_their_number_is_a_power_of_two():
+    """A sum tree of float64 has twice as many nodes as leaves, and the next power of two of leaves."""
+    ring = make_ring(1024, 4, gym.spaces.Box(-8, 8, (3,), np.float32))
+    assert ring.nbytes == 1024 * 21
+    assert Priorities(ring, PriorityConfig()).tree.nodes.nbytes == 1024 * 16
+    assert Priorities(make_ring(1025, 1), PriorityConfig()).tree.nodes.nbytes == 2048 * 16
+
+
+def test_small_numbers_leave_no_gaps_between_larger_ones():
+    """9 and 7 bytes around two float32, which would take 12 and 8 in the order of the keys."""
+    boxes = {"a": (9, np.uint8), "b": (2, np.float32), "c": (7, np.uint8)}
+    space = gym.spaces.Dict({key: gym.spaces.Box(0, 255, (n,), dtype) for key, (n, dtype) in boxes.items()})
+    assert make_ring(100, 1, space).nbytes == 100 * (9 + 2 * 4 + 7 + 4 + 4 + 1)
 
 
 # Files of buffers.

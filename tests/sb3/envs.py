@@ -10,7 +10,13 @@ from gymnasium import spaces
 
 
 class IdentityEnv(gym.Env):
-    """The action must equal the observation, for a reward of 1; observations are random."""
+    """The action must equal the observation, for a reward of 1; observations are random.
+
+    Args:
+        dim: number of values of a Discrete space; None with ``space``.
+        space: space of observations and actions; None with ``dim``.
+        ep_length: steps of an episode.
+    """
 
     def __init__(self, dim: int | None = None, space: spaces.Space | None = None, ep_length: int = 100) -> None:
         if space is None:
@@ -69,7 +75,16 @@ class InvalidActionEnvDiscrete(IdentityEnv):
 
 
 class FakeImageEnv(gym.Env):
-    """Random images, for tests of convolutions."""
+    """Random images, for tests of convolutions.
+
+    Args:
+        action_dim: number of actions, or of their dimensions.
+        screen_height: in pixels.
+        screen_width: in pixels.
+        n_channels: number of channels.
+        discrete: Discrete actions; False: in [-1, 1].
+        channel_first: put the channels first.
+    """
 
     def __init__(
         self,
@@ -102,7 +117,13 @@ class FakeImageEnv(gym.Env):
 
 
 class BitFlippingEnv(gym.Env):
-    """Bits are flipped one a step until all are 1; the reward is 0 then and -1 before. A goal environment."""
+    """Bits are flipped one a step until all are 1; the reward is 0 then and -1 before. A goal environment.
+
+    Args:
+        n_bits: number of bits.
+        continuous: one action in [-1, 1] for each bit, which flips it if it is positive.
+        max_steps: steps of an episode; None: ``n_bits``.
+    """
 
     def __init__(self, n_bits: int = 10, continuous: bool = False, max_steps: int | None = None) -> None:
         keys = ("observation", "achieved_goal", "desired_goal")
@@ -138,7 +159,15 @@ class BitFlippingEnv(gym.Env):
 
 
 class SimpleMultiObsEnv(gym.Env):
-    """A walk through a grid to its last cell, which is observed as a vector and as an image, each at random for a cell."""
+    """A walk through a grid to its last cell, which is observed as a vector and as an image, each at random for a cell.
+
+    Args:
+        num_col: columns of the grid.
+        num_row: rows of the grid.
+        random_start: begin anywhere.
+        discrete_actions: left, down, right and up as numbers; False: as the largest of four numbers in [-1, 1].
+        channel_last: put the channels of the image last.
+    """
 
     def __init__(
         self,

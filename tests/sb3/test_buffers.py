@@ -8,6 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from rejeu.replay.ring import Ring
 from rejeu.sb3 import A2C, DQN, SAC, HerReplayBuffer
 from rejeu.sb3.common import buffers
 from rejeu.sb3.common.vec_env import DummyVecEnv, VecNormalize
@@ -78,6 +79,14 @@ def test_everything_of_a_replay_buffer_works_on_agents(kind):
     assert buffer.size() == 24 // n_envs  # a view of the agent's buffer as it is now
 
 
+def test_a_step_is_added():
+    buffer = SAC("MlpPolicy", gym.make("Pendulum-v1"), learning_starts=100, **TINY).learn(10).replay_buffer
+    np.testing.assert_array_equal(buffer.next_observations[:-1], buffer.observations[1:])
+    buffer.add(np.zeros((1, 3)), np.ones((1, 3)), np.full((1, 1), 0.5), np.array([2.0]), np.array([True]), [{}])
+    assert (buffer.size(), buffer.rewards[-1, 0], buffer.dones[-1, 0], buffer.timeouts[-1, 0]) == (11, 2.0, 1.0, 0.0)
+    assert (buffer.actions[-1, 0], buffer.next_observations[-1, 0].tolist()) == (0.5, [1.0] * 3)
+
+
 def test_a_replay_buffer_draws_what_vec_normalize_scales():
     model = made(buffers.ReplayBuffer)
     env = VecNormalize(dummy(lambda: gym.make("Pendulum-v1")), norm_obs=False)
@@ -106,6 +115,20 @@ def test_ends_by_time_limits_are_no_terminations():
     assert 0 < batch.dones.sum() < (batch.rewards == 7).sum()
 
 
+def test_a_full_replay_buffer_has_its_size():
+    model = SAC("MlpPolicy", gym.make("Pendulum-v1"), learning_starts=100, buffer_size=8, **TINY).learn(30)
+    assert model.replay_buffer.full
+    assert model.replay_buffer.size() == model.replay_buffer.buffer_size
+    assert len(model.replay_buffer.rewards) == model.replay_buffer.pos
+
+
+def test_an_agent_that_was_loaded_alone_shows_an_empty_replay_buffer(tmp_path):
+    model = made(buffers.HerReplayBuffer)
+    model.save(tmp_path / "m")
+    shown = DQN.load(tmp_path / "m").replay_buffer
+    assert (type(shown), shown.size(), shown.buffer_size, shown.full) == (buffers.HerReplayBuffer, 0, 200, False)
+
+
 @pytest.mark.parametrize("nested", only([False], [False, True]))
 def test_everything_of_a_rollout_buffer_works_on_agents(nested):
     env, name = (BitFlippingEnv(n_bits=3), "MultiInputPolicy") if nested else (gym.make("CartPole-v1"), "MlpPolicy")
@@ -121,3 +144,12 @@ def test_everything_of_a_rollout_buffer_works_on_agents(nested):
             array[0] = 1
     buffer.reset()
     model.learn(8)
+
+
+def test_buffers_cannot_be_made_by_hand_or_set_to_something_else():
+    space = gym.spaces.Box(-1, 1, (1,))
+    with pytest.raises(TypeError, match=r"rejeu.replay.replay_memory.ReplayMemory"):
+        buffers.ReplayBuffer(10, space, space)
+    model = made(buffers.ReplayBuffer)
+    with pytest.raises(TypeError, match="must be the replay buffer of an agent"):
+        model.replay_buffer = Ring

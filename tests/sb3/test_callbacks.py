@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -11,10 +12,13 @@ import rejeu
 from rejeu.logs.logging import CsvFile, Logger, configure
 from rejeu.sb3.common.callbacks import (
     BaseCallback,
+    CallbackList,
     CheckpointCallback,
+    ConvertCallback,
     EvalCallback,
     EveryNTimesteps,
     ProgressBarCallback,
+    StopTrainingOnMaxEpisodes,
     StopTrainingOnNoModelImprovement,
     StopTrainingOnRewardThreshold,
 )
@@ -54,10 +58,44 @@ def test_a_callback_stops_training_and_knows_the_agent():
     assert note.seen[-1] == (4, 4)
 
 
+@pytest.mark.parametrize("callback", [Note(goes_on=lambda self: None), ConvertCallback(lambda _locals, _globals: None)])
+def test_returning_nothing_stops_training_as_in_the_original(callback):
+    with pytest.warns(UserWarning, match="_on_step returned None"):
+        assert dqn().learn(5, callback=callback).num_timesteps == 1
+
+
 def test_a_callback_with_hooks_and_functions_of_rejeu_go_together():
     calls, note = [], Note()
     dqn().learn(4, callback=[note, lambda agent, progress: calls.append(progress.step), Note()])
     assert calls == note.seen == [1, 2, 3, 4]
+
+
+def test_functions_of_the_other_form_are_converted():
+    seen = []
+    callback = ConvertCallback(lambda _locals, _globals: seen.append(_locals["self"].num_timesteps) or len(seen) < 3)
+    assert dqn().learn(9, callback=callback).num_timesteps == 3
+    assert seen == [1, 2, 3]
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        pytest.param(lambda: make_vec_env(Walk, 2), id="vector of python objects"),
+        pytest.param(lambda: VecNormalize(make_vec_env(Walk, 2), norm_obs=False, norm_reward=False), id="wrapped"),
+        pytest.param(lambda: rejeu.make_vector(Walk, 2), id="rejeu's own"),
+    ],
+)
+def test_infos_say_how_episodes_ended(make):
+    def look(self):
+        return [
+            (info["episode"]["r"], info["episode"]["l"], info["TimeLimit.truncated"], info["terminal_observation"][0])
+            for info in self.locals["infos"]
+            if "episode" in info
+        ]
+
+    note = Note(look)
+    dqn(make()).learn(12, callback=note)
+    assert note.seen == [[], [], [(6.0, 3, False, 3.0)] * 2] * 2
 
 
 def test_recorded_numbers_reach_the_next_row(tmp_path):
@@ -93,6 +131,19 @@ def test_a_logger_of_one_s_own_takes_the_rows(tmp_path, capsys):
         Logger().record("mine/text", "words")
 
 
+def test_the_best_model_is_kept_and_loads_under_either_suffix(tmp_path):
+    evaluate = EvalCallback(Walk(1), eval_freq=5, n_eval_episodes=2, best_model_save_path=tmp_path / "best", verbose=0)
+    agent = dqn().learn(10, callback=evaluate)
+    assert evaluate.best_mean_reward == evaluate.last_mean_reward == 11.0
+    assert [path.name for path in (tmp_path / "best").iterdir()] == ["best_model.zip"]
+    for name in ("best_model", "best_model.zip", "best_model.safetensors"):
+        loaded = rejeu.DQN.load(tmp_path / "best" / name)
+        assert loaded.num_timesteps == 5
+    assert agent.num_timesteps == 10
+    with pytest.raises(FileNotFoundError, match=r"other\.zip"):
+        rejeu.DQN.load(tmp_path / "best" / "other.zip")
+
+
 def test_results_are_printed_logged_and_written(tmp_path, capsys):
     rows = []
 
@@ -113,6 +164,17 @@ def test_results_are_printed_logged_and_written(tmp_path, capsys):
         assert file["successes"].tolist() == [[True, True]] * 2
 
 
+def test_evaluation_wants_environments_of_its_own():
+    env = Walk()
+    with pytest.raises(ValueError, match="that the agent trains in; give it others"):
+        dqn(env).learn(5, callback=EvalCallback(env))
+    vector = make_vec_env(Walk)
+    with pytest.raises(ValueError, match="that the agent trains in"):
+        dqn(vector).learn(5, callback=EvalCallback(VecNormalize(vector)))
+    with pytest.raises(TypeError, match="got str"):
+        EvalCallback("CartPole-v1")
+
+
 @pytest.mark.parametrize(
     ("stop", "best", "calls"),
     [
@@ -129,6 +191,11 @@ def test_an_evaluation_stops_training(stop, best, calls, capsys):
         stop.n_calls = call
         assert stop._on_step() == (call < calls)
         assert ("Stopping" in capsys.readouterr().out) == (call == calls)
+
+
+def test_judges_of_evaluations_belong_to_one():
+    with pytest.raises(TypeError, match="StopTrainingOnRewardThreshold needs evaluations; give it to EvalCallback"):
+        dqn().learn(5, callback=StopTrainingOnRewardThreshold(1.0))
 
 
 def test_statistics_are_shared_with_the_evaluation():
@@ -161,6 +228,38 @@ def test_checkpoints_hold_all_that_learning_needs(tmp_path):
     assert loaded.replay_buffer.size() == agent.replay_buffer.size() == 16
 
 
+def test_a_list_calls_every_one_though_the_first_stops():
+    first, second = Note(goes_on=lambda self: False), Note()
+    assert dqn().learn(5, callback=CallbackList([first, second, StopTrainingOnMaxEpisodes(9)])).num_timesteps == 1
+    assert second.seen == [1]
+
+
+def test_the_training_environments_can_be_changed_between_steps():
+    class Harder(BaseCallback):
+        def _on_rollout_start(self):
+            self.training_env.set_attr("scale", 1.0 + self.num_timesteps // 3)
+
+        def _on_step(self):
+            return True
+
+    agent = dqn(train_freq=3).learn(9, callback=Harder())
+    assert agent.history["return"].tolist() == [6.0, 12.0, 18.0]
+
+
 def test_a_bar_is_shown(capsys):
     dqn().learn(5, callback=ProgressBarCallback())
     assert "5/5 steps" in capsys.readouterr().out
+
+
+def test_hooks_are_called_where_episodes_or_time_end_training():
+    events = []
+
+    class Log(BaseCallback):
+        def _on_training_end(self):
+            events.append(self.num_timesteps)
+
+        def _on_step(self):
+            return True
+
+    dqn(gym.wrappers.TimeLimit(Walk(5), 4)).learn(episodes=2, callback=Log())
+    assert events == [8]

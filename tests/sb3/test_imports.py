@@ -10,8 +10,23 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+import rejeu
+from rejeu.logs.video import record_video
 from rejeu.sb3.common.vec_env import DummyVecEnv, VecVideoRecorder
 from tests.logs.test_video import Lamp, decode
+from tests.tiers import exhaustive
+
+
+@exhaustive
+def test_an_agent_is_recorded_on_an_environment_like_its_own(tmp_path):
+    """highway-env's observations are an OrderedDict; the agent was made with a configuration of its own."""
+    import highway_env  # noqa: F401
+
+    env = gym.make("parking-v0", config={"screen_width": 300, "screen_height": 200})
+    agent = rejeu.SAC("MultiInputPolicy", env, policy_kwargs={"net_arch": [8]}, seed=0)
+    frames = decode(record_video(agent, tmp_path / "own", max_steps=3, seed=0)).frames
+    assert frames.shape == (4, 200, 300, 3)
+    assert frames.std() > 10
 
 
 def test_the_core_does_not_import_rejeu_sb3_and_get_env_still_returns_a_vec_env():
@@ -61,6 +76,20 @@ class Corridor(gym.Env):
         return 2 * number + self.end
 
 
+def test_observations_have_a_leading_axis_and_their_own_memory():
+    env = DummyVecEnv([Corridor, Corridor])
+    first = env.reset()
+    assert set(first) == {"where", "kind", "pair"}
+    assert first["where"].shape == (2, 1)
+    assert first["kind"].shape == (2,)
+    second, rewards, dones, infos = env.step(np.array([0, 1]))
+    np.testing.assert_array_equal(first["where"], [[0], [0]])
+    np.testing.assert_array_equal(second["where"], [[1], [1]])
+    np.testing.assert_array_equal(rewards, np.array([0, 10], np.float32))
+    assert (rewards.dtype, dones.dtype, dones.tolist()) == (np.float32, bool, [False, False])
+    assert [info["time"] for info in infos] == [1, 1]
+
+
 def test_an_ended_environment_is_reset_within_the_step():
     env = DummyVecEnv([lambda: Corridor(end=2), Corridor])
     env.reset()
@@ -87,6 +116,20 @@ def test_seeds_and_options_are_of_the_next_reset_only():
     env.reset()
     env.reset()
     assert [e.calls for e in env.envs] == [[(5, {"a": 1}), (None, None)], [(6, {"a": 1}), (None, None)]]
+
+
+def test_attributes_and_methods_are_reached_through_wrappers():
+    wrapped = [lambda: gym.wrappers.TimeLimit(Corridor(end=3), 7), lambda: gym.wrappers.TimeLimit(Corridor(end=4), 7)]
+    env = DummyVecEnv(wrapped)
+    assert env.get_attr("end") == [3, 4]
+    assert env.get_attr("end", 1) == [4]
+    env.set_attr("end", 8, indices=[0])
+    assert [e.unwrapped.end for e in env.envs] == [8, 4]
+    assert env.env_method("double", 1, indices=[1, 0]) == [6, 10]
+    assert env.env_is_wrapped(gym.wrappers.TimeLimit) == [True, True]
+    assert env.env_is_wrapped(gym.wrappers.ClipAction) == [False, False]
+    assert env.has_attr("end")
+    assert not env.has_attr("begin")
 
 
 def test_functions_must_be_functions_and_make_new_environments():
@@ -127,6 +170,19 @@ def test_several_environments_are_shown_side_by_side(tmp_path):
     env.step(np.zeros((3, 1)))
     env.close()
     assert decode(tmp_path / "rl-video-step-0-to-step-1.mp4").frames.shape == (2, 66, 102, 3)
+
+
+def test_recorder_hands_on_what_it_does_not_do_itself(tmp_path):
+    env = VecVideoRecorder(lamps(2), tmp_path, lambda step: False)
+    assert env.num_envs == 2
+    assert env.get_attr("closed") == [False, False]
+    assert env.seed(3) == [3, 4]
+    env.reset()
+    assert env.render().shape == (66, 51, 3)
+    assert rejeu.make_vector(env).venv is env
+    env.close()
+    assert env.get_attr("closed") == [True, True]
+    assert os.listdir(tmp_path) == []
 
 
 def test_an_error_while_recording_leaves_no_file(tmp_path):

@@ -27,9 +27,11 @@ from rejeu.sb3.common.buffers import HerReplayBuffer
 from rejeu.sb3.common.callbacks import LogEveryNTimesteps
 from rejeu.sb3.common.env_util import make_atari_env, make_vec_env
 from rejeu.sb3.common.monitor import ResultsWriter, load_results
-from rejeu.sb3.common.vec_env import VecTransposeImage, is_vecenv_wrapped
+from rejeu.sb3.common.vec_env import DummyVecEnv, VecNormalize, VecTransposeImage, is_vecenv_wrapped
+from rejeu.sb3.common.vec_env.base_vec_env import VecEnvWrapper
 from tests.sb3 import envs
-from tests.tiers import crossed
+from tests.sb3.test_original import Features
+from tests.tiers import crossed, exhaustive
 
 pytestmark = pytest.mark.usefixtures("learners_are_shared")
 
@@ -104,6 +106,24 @@ def test_the_default_optimizer_of_a2c_is_the_rmsprop_of_pytorch():
     np.testing.assert_allclose(direction, gradient / np.sqrt(0.9 + 0.1 * gradient**2 + 1e-5), rtol=1e-5)
 
 
+def test_nothing_is_learned_without_gradient_steps():
+    settings = {"learning_starts": 4, "batch_size": 4, "seed": 0, **SMALL}
+    still = sb3.SAC("MlpPolicy", "Pendulum-v1", gradient_steps=0, **settings)
+    before = still.policy.state_dict()
+    assert still.learn(12)._n_updates == 0
+    assert all((array == before[name]).all() for name, array in still.policy.state_dict().items())
+
+
+@exhaustive
+def test_targets_stay_with_a_tau_of_zero():
+    fixed = sb3.SAC("MlpPolicy", "Pendulum-v1", learning_starts=4, batch_size=4, tau=0, seed=0, **SMALL)
+    before = fixed.policy.state_dict()
+    after = fixed.learn(12).policy.state_dict()
+    same = {name for name in before if (before[name] == after[name]).all()}
+    assert {name for name in before if name.startswith("target_critics")} <= same
+    assert not any(name.startswith("critics.") and name.endswith("weight") for name in same)
+
+
 def test_files_leave_out_and_contain_what_save_is_told(tmp_path):
     model = sb3.A2C("MlpPolicy", "CartPole-v1", verbose=2, gamma=0.5, ent_coef=0.1, **SMALL)
     model.note = {"trained by": "me", "scores": [1, 2.5]}
@@ -138,6 +158,48 @@ def test_a_refused_setting_is_an_assertion_error_and_a_value_error():
         sb3.DQN("MlpPolicy", "Pendulum-v1")
 
 
+class Named(VecEnvWrapper):
+    """A wrapper with an attribute."""
+
+    level = "inner"
+
+    def reset(self):
+        return self.venv.reset()
+
+    def step_wait(self):
+        return self.venv.step_wait()
+
+
+def test_an_attribute_of_two_inner_wrappers_is_ambiguous():
+    inner = Named(DummyVecEnv([lambda: gym.make("CartPole-v1")]))
+    assert VecNormalize(inner).level == "inner"
+    with pytest.raises(AttributeError, match="ambiguous: Named and Named"):
+        _ = VecNormalize(Named(inner)).level
+
+
+def test_actor_and_critic_share_their_extractor_or_not():
+    shape = {"features_extractor_class": Features, "net_arch": [5]}
+    for shares, n_extractors in ((True, 1), (False, 2)):
+        model = sb3.A2C("MlpPolicy", "CartPole-v1", policy_kwargs={**shape, "share_features_extractor": shares})
+        assert sum(array.shape == (3, 4) for array in model.policy.parameters()) == n_extractors
+    with pytest.warns(UserWarning, match="share_features_extractor"):
+        sb3.SAC("MlpPolicy", "Pendulum-v1", policy_kwargs={**SMALL["policy_kwargs"], "share_features_extractor": True})
+
+
+def test_squashed_actions_stay_in_their_bounds():
+    shape = {"squash_output": True, "net_arch": [8], "log_std_init": 3.0}
+    model = sb3.A2C("MlpPolicy", "Pendulum-v1", use_sde=True, policy_kwargs=shape, seed=0)
+    actions = model.policy.get_distribution(np.ones((256, 3), np.float32)).sample()
+    assert 1.9 < np.abs(actions).max() <= 2.0  # of Pendulum
+
+
+@exhaustive
+def test_tqc_explores_by_state_dependent_noise_as_in_the_original():
+    model = sb3.TQC("MlpPolicy", "Pendulum-v1", use_sde=True, sde_sample_freq=4, learning_starts=8, seed=0, **SMALL)
+    model.learn(16)
+    assert any(name.endswith("log_std") for name in model.policy.state_dict())
+
+
 def test_a_row_is_logged_every_so_many_steps(tmp_path):
     model = sb3.SAC("MlpPolicy", "Pendulum-v1", learning_starts=8, **SMALL)
     model.set_logger(loggers.configure(str(tmp_path), ["csv", "json"]))
@@ -147,6 +209,23 @@ def test_a_row_is_logged_every_so_many_steps(tmp_path):
     assert float(rows[-1]["time/fps"]) > 0
     assert model.logger.output_formats[1].names == ("json",)
     model.logger.close()
+
+
+class Kept(loggers.Logger):
+    """A logger that keeps the values of the last row."""
+
+    def dump(self, step=0):
+        pass
+
+
+def test_a_logger_that_keeps_values_gets_those_of_the_last_row():
+    model = sb3.DQN("MlpPolicy", envs.IdentityEnv(2, ep_length=5), learning_starts=100, **SMALL)
+    logger = Kept(None, [])
+    model.set_logger(logger)
+    model.learn(40, log_interval=1)
+    assert logger.name_to_value["time/total_timesteps"] == 40
+    sac = sb3.SAC("MlpPolicy", "Pendulum-v1", learning_starts=8, batch_size=4, **SMALL)
+    assert sac.learn(12).logger.name_to_value["train/n_updates"] == 4
 
 
 class Console(gym.Env):
@@ -364,10 +443,3 @@ def test_masks_forbid_choices_and_bits():
     bits = distributions.BernoulliDistribution(3).proba_distribution(np.zeros((1, 3)))
     bits.apply_masking([[True, True, False, True, True, False]])  # 0 and 1 of each bit
     assert {tuple(bits.sample()[0].tolist()) for _ in range(20)} == {(0, 1, 0), (1, 1, 0)}
-
-
-def test_squashed_actions_stay_in_their_bounds():
-    shape = {"squash_output": True, "net_arch": [8], "log_std_init": 3.0}
-    model = sb3.A2C("MlpPolicy", "Pendulum-v1", use_sde=True, policy_kwargs=shape, seed=0)
-    actions = model.policy.get_distribution(np.ones((256, 3), np.float32)).sample()
-    assert 1.9 < np.abs(actions).max() <= 2.0  # of Pendulum

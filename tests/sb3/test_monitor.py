@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from rejeu.sb3.common.monitor import Monitor
+from rejeu.sb3.common.monitor import Monitor, monitor_path
 
 
 class Stairs(gym.Env):
@@ -45,6 +45,14 @@ def read(path):
         return header, list(csv.DictReader(file))
 
 
+def test_episode_is_in_the_info_of_its_last_step_only():
+    infos = play(Monitor(Stairs()), 2)
+    assert ["episode" in info for info in infos] == [False, False, True] * 2
+    assert infos[2]["episode"]["r"] == 6
+    assert infos[2]["episode"]["l"] == 3
+    assert 0 <= infos[2]["episode"]["t"] <= infos[5]["episode"]["t"]
+
+
 def test_totals_count_all_episodes():
     env = Monitor(Stairs())
     play(env, 2)
@@ -54,6 +62,14 @@ def test_totals_count_all_episodes():
     assert env.get_episode_rewards() == [6.0, 6.0]
     assert env.get_episode_lengths() == [3, 3]
     assert len(env.get_episode_times()) == 2
+
+
+def test_a_given_up_episode_is_not_counted():
+    env = Monitor(Stairs())
+    env.reset()
+    env.step(0)
+    assert play(env)[2]["episode"]["r"] == 6
+    assert env.get_episode_lengths() == [3]
 
 
 def test_file_has_stable_baselines3_layout(tmp_path):
@@ -85,6 +101,12 @@ def test_file_is_begun_anew_or_continued(tmp_path):
         assert "t_start" in header
 
 
+def test_path_follows_stable_baselines3(tmp_path):
+    assert monitor_path(tmp_path / "a") == tmp_path / "a.monitor.csv"
+    assert monitor_path(tmp_path / "0.monitor.csv") == tmp_path / "0.monitor.csv"
+    assert monitor_path(tmp_path) == tmp_path / "monitor.csv"
+
+
 def test_step_needs_a_running_episode():
     env = Monitor(Stairs())
     with pytest.raises(RuntimeError, match=r"call reset"):
@@ -92,3 +114,20 @@ def test_step_needs_a_running_episode():
     play(env)
     with pytest.raises(RuntimeError, match=r"call reset"):
         env.step(0)
+
+
+def test_early_reset_can_be_forbidden():
+    env = Monitor(Stairs(), allow_early_resets=False)
+    play(env)
+    env.reset()
+    with pytest.raises(RuntimeError, match="allow_early_resets=True"):
+        env.reset()
+
+
+def test_attributes_of_the_environment_stay_in_reach():
+    env = Monitor(Stairs())
+    assert env.get_wrapper_attr("compute_reward")(None, None, {}) == 42
+    made = Monitor(gym.make("CartPole-v1"))
+    assert made.spec.id == "CartPole-v1"
+    assert made.observation_space == made.unwrapped.observation_space
+    assert gym.make(made.spec).get_wrapper_attr("get_total_steps")() == 0

@@ -14,6 +14,7 @@ import pytest
 from gymnasium import spaces
 
 from rejeu import sb3
+from rejeu.algorithms.actor_critic.network import sde_std
 from rejeu.core.distributions import Normal, TanhNormal
 from rejeu.sb3.common import env_checker, logger as loggers
 from rejeu.sb3.common.buffers import HerReplayBuffer
@@ -87,6 +88,17 @@ def test_a_features_extractor_is_used_saved_and_loaded(tmp_path):
         ppo(policy_kwargs={"features_extractor_class": AdamW})
 
 
+def test_the_width_of_convolutions_and_images_that_are_scaled_already():
+    image = envs.FakeImageEnv(screen_height=36, screen_width=36, channel_first=True)
+    env = VecNormalize(DummyVecEnv([lambda: image]))
+    shape = {"features_extractor_kwargs": {"features_dim": 16}, "normalize_images": False}
+    model = sb3.A2C("CnnPolicy", env, policy_kwargs=shape)
+    assert model.state.network.encoder.n_features == 16
+    assert model.state.network.encoder.images[0].scale == 1.0
+    with pytest.raises(AssertionError, match="uint8"):
+        sb3.A2C("CnnPolicy", env)
+
+
 def test_a_policy_class_of_ones_own_sets_the_layers():
     model = sb3.PPO(Wide, "CartPole-v1", n_steps=16, batch_size=16)
     assert isinstance(model.policy, Wide)
@@ -105,6 +117,12 @@ def test_sac_explores_by_state_dependent_noise(tmp_path):
         sb3.TD3("MlpPolicy", "Pendulum-v1", use_sde=True)
     with pytest.warns(UserWarning, match="explores by itself"):
         assert sac(use_sde=True, action_noise=0.1).config.action_noise is None
+
+
+def test_expln_continues_the_exponential_smoothly():
+    x = np.array([-1.0, 0.0, 2.0], np.float32)
+    np.testing.assert_allclose(sde_std(x, True), [np.exp(-1), 1, np.log(3) + 1], rtol=1e-6)
+    assert float(jax.grad(lambda v: sde_std(v, True))(1e-6)) == pytest.approx(1.0, rel=1e-4)
 
 
 def test_policy_parts_agree_with_the_agent():
@@ -157,6 +175,17 @@ def test_box_distributions_are_in_the_environments_units():
     assert Distribution(TanhNormal(jnp.zeros(1), jnp.zeros(1)), None).entropy() is None
 
 
+def test_hyperparameters_are_attributes_that_can_be_set():
+    model = ppo(**SMALL, learning_rate=lambda remaining: 1e-3 if remaining > 0.5 else 1e-4, clip_range=0.3)
+    assert (model.gamma, model.batch_size, model.clip_range(0.1)) == (0.99, 16, 0.3)
+    assert (model.lr_schedule(0.9), model.lr_schedule(0.1)) == (1e-3, 1e-4)
+    model.gamma = 0.5
+    assert model.config.gamma == 0.5
+    assert model.learn(16)._n_updates == 1
+    with pytest.raises(AttributeError):
+        _ = model.no_such_thing
+
+
 def test_neutral_arguments_are_accepted_and_those_not_followed_warn():
     ppo(**SMALL, use_sde=False, rollout_buffer_class=None, _init_setup_model=True)
     noise = VectorizedActionNoise(NormalActionNoise(np.zeros(1), np.ones(1)), 2)
@@ -185,6 +214,11 @@ def test_neutral_arguments_are_accepted_and_those_not_followed_warn():
         sb3.SAC("MlpPolicy", env, replay_buffer_kwargs={"handle_timeout_termination": False}, **SMALL)
     with pytest.raises(TypeError, match="no_such_argument"):
         sac(no_such_argument=1)
+
+
+@exhaustive
+def test_a_batch_may_be_larger_than_the_buffer():
+    assert sac(batch_size=64, buffer_size=16).learn(20)._n_updates > 0
 
 
 def test_files_have_exactly_the_given_name_or_are_file_objects(tmp_path):
@@ -223,6 +257,11 @@ def test_the_rollout_of_an_agent_has_its_values_and_advantages_also_right_after_
     np.testing.assert_allclose(shown.returns, shown.advantages + shown.values, rtol=1e-5)
     log_prob = agent.policy.evaluate_actions(shown.observations[:, 0], shown.actions[:, 0, 0])[1]
     np.testing.assert_allclose(shown.log_probs[:, 0], log_prob, rtol=1e-5)
+
+
+@exhaustive
+def test_the_rollout_of_a_recurrent_agent_has_no_values():
+    assert not hasattr(sb3.RecurrentPPO("MlpLstmPolicy", "CartPole-v1", **SMALL).rollout_buffer, "values")
 
 
 PARTS = {
@@ -279,6 +318,15 @@ def test_extractors_are_shown_as_parts_of_the_networks():
     assert agent.critic.features_extractor(obs).any()
 
 
+def test_a_policy_class_whose_methods_are_not_called_warns():
+    class Own(ActorCriticPolicy):
+        def forward(self, obs, deterministic=False):
+            return super().forward(obs, deterministic)
+
+    with pytest.warns(UserWarning, match=r"Own.forward='your own' is called neither in training nor by model.predict"):
+        sb3.A2C(Own, "CartPole-v1", policy_kwargs={"net_arch": [4]})
+
+
 @exhaustive
 def test_compute_reward_may_return_an_array_of_one_for_one_goal():
     class OfOne(envs.BitFlippingEnv):
@@ -311,11 +359,28 @@ def test_logger_formats(tmp_path, capsys):
     assert model.logger.name_to_value["time/fps"] > 0
 
 
+@pytest.mark.parametrize(
+    "kind", [envs.IdentityEnv, envs.IdentityEnvBox, envs.FakeImageEnv, envs.BitFlippingEnv, envs.SimpleMultiObsEnv]
+)
+def test_environments_pass_the_checker_without_warnings(kind):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        env_checker.check_env(kind())
+
+
 def test_the_checker_states_the_difference():
     env = envs.IdentityEnvBox()
     env.step = lambda action: (np.full(1, 3.0, np.float32), 0.0, False, False, {})
     with pytest.raises(AssertionError, match=r"Expected: -1\.0 <= obs\[0\] <= 1\.0, actual value: 3\.0"):
         env_checker.check_env(env)
+
+
+def test_the_checker_renders_if_it_is_asked_to():
+    env, rendered = envs.IdentityEnvBox(), []
+    env.render_mode, env.render = "rgb_array", lambda: rendered.append(1)
+    for skips in (True, False):
+        env_checker.check_env(env, skip_render_check=skips)
+    assert rendered == [1]
 
 
 def test_contrib_modules_and_masks():
@@ -405,6 +470,23 @@ def test_a_vector_environment_need_not_call_its_base_and_extra_actions_warn():
         env.step(np.zeros((2, 1)))
 
 
+@exhaustive
+def test_trust_regions_and_random_search_are_at_their_paths():
+    from rejeu.sb3_contrib import ARS, TRPO
+    from rejeu.sb3_contrib.ars import LinearPolicy
+    from rejeu.sb3_contrib.trpo import MlpPolicy
+
+    assert TRPO(MlpPolicy, "CartPole-v1", n_steps=32, batch_size=32, seed=0).learn(64).num_timesteps == 64
+    linear = ARS(LinearPolicy, "CartPole-v1", n_delta=1, seed=0).learn(100)
+    assert {array.shape for array in linear.policy.parameters() if array.ndim == 2} == {(4, 2)}
+    hidden = ARS("MlpPolicy", "CartPole-v1", n_delta=1, seed=0)
+    assert {array.shape for array in hidden.policy.parameters() if array.ndim == 2} == {
+        (4, 64),
+        (64, 64),
+        (64, 2),
+    }
+
+
 class Reach(gym.Env):
     """A point that moves on a line, and a place that it must reach, far from 0; five steps an episode."""
 
@@ -464,31 +546,3 @@ def test_noise_of_one_component_is_that_of_every_action():
     env, noise = envs.IdentityEnvBox(), NormalActionNoise(np.zeros(1), 0.1 * np.ones(1))
     env.action_space = spaces.Box(-1, 1, (3,), np.float32)
     assert sb3.TD3("MlpPolicy", env, action_noise=noise, **SMALL).config.action_noise.sigma == (0.1, 0.1, 0.1)
-
-
-@pytest.mark.parametrize(
-    "kind", [envs.IdentityEnv, envs.IdentityEnvBox, envs.FakeImageEnv, envs.BitFlippingEnv, envs.SimpleMultiObsEnv]
-)
-def test_environments_pass_the_checker_without_warnings(kind):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        env_checker.check_env(kind())
-
-
-def test_the_checker_renders_if_it_is_asked_to():
-    env, rendered = envs.IdentityEnvBox(), []
-    env.render_mode, env.render = "rgb_array", lambda: rendered.append(1)
-    for skips in (True, False):
-        env_checker.check_env(env, skip_render_check=skips)
-    assert rendered == [1]
-
-
-def test_hyperparameters_are_attributes_that_can_be_set():
-    model = ppo(**SMALL, learning_rate=lambda remaining: 1e-3 if remaining > 0.5 else 1e-4, clip_range=0.3)
-    assert (model.gamma, model.batch_size, model.clip_range(0.1)) == (0.99, 16, 0.3)
-    assert (model.lr_schedule(0.9), model.lr_schedule(0.1)) == (1e-3, 1e-4)
-    model.gamma = 0.5
-    assert model.config.gamma == 0.5
-    assert model.learn(16)._n_updates == 1
-    with pytest.raises(AttributeError):
-        _ = model.no_such_thing

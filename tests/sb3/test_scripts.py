@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 import importlib
+import os
+import random
 
+import gymnasium as gym
+import numpy as np
 import pytest
 
+import rejeu
 from rejeu import sb3
 from rejeu.core.schedules import at
+from rejeu.sb3 import algorithms
 from tests.golden.vec_env_script import Walk
+from tests.tiers import only
 
 PATHS = {
     "": ["PPO", "A2C", "DQN", "SAC", "TD3", "DDPG", "HerReplayBuffer", "QRDQN", "TQC", "RecurrentPPO", "MaskablePPO"],
@@ -60,6 +67,20 @@ def test_names_stand_where_stable_baselines3_has_them(path):
         assert name in module.__all__
 
 
+def test_seeds_and_schedules():
+    from rejeu.sb3.common.utils import LinearSchedule, get_linear_fn, get_schedule_fn, set_random_seed
+
+    set_random_seed(3)
+    first = random.random(), np.random.get_state()[1].tolist()  # noqa: NPY002
+    set_random_seed(3)
+    assert (random.random(), np.random.get_state()[1].tolist()) == first  # noqa: NPY002
+    agent = sb3.DQN("MlpPolicy", Walk(), learning_rate=get_linear_fn(1e-3, 1e-4, 0.5), policy_kwargs={"net_arch": [4]})
+    assert agent.config.learning_rate == rejeu.Linear(1e-3, 1e-4, 0.5)
+    assert get_linear_fn(1.0, 0.1, 0.5) == LinearSchedule(1.0, 0.1, 0.5)
+    assert [LinearSchedule(1.0, 0.0, 0.5)(x) for x in (1.0, 0.75, 0.5, 0.0)] == [1.0, 0.5, 0.0, 0.0]
+    assert get_schedule_fn(3e-4)(0.5) == 3e-4
+
+
 def count_down(x):
     return 1e-3 * x
 
@@ -74,3 +95,100 @@ def test_every_function_given_as_a_schedule_takes_the_remaining_progress(schedul
     for config in (agent.config, sb3.PPO.load(agent.save("a"), learning_rate=schedule, clip_range=schedule).config):
         for given in (config.learning_rate, config.clip_range):
             assert [float(at(given, progress)) for progress in (0.0, 0.5, 1.0)] == pytest.approx([1e-3, 5e-4, 0.0])
+
+
+class Counting(gym.Env):
+    """Has four steps in an episode and rewards large actions."""
+
+    observation_space = gym.spaces.Box(-1, 1, (2,), np.float32)
+
+    def __init__(self, action_space):
+        self.action_space = action_space
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.time = 0
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action):
+        self.time += 1
+        return np.full(2, self.time / 4, np.float32), float(np.sum(action)) + self.time, False, self.time == 4, {}
+
+    def action_masks(self):
+        return np.ones(2, bool)
+
+
+def in_the_third_quarter(remaining):
+    return 1e-2 if 0.25 < remaining <= 0.5 else 0.0
+
+
+@pytest.mark.parametrize("name", only({"PPO", "SAC"}, algorithms.__all__))
+@pytest.mark.filterwarnings("ignore:.*without exploration noise")
+def test_schedules_of_every_algorithm_follow_the_remaining_progress_of_each_call_of_learn(name):
+    kind = getattr(algorithms, name)
+    is_off_policy = issubclass(kind, rejeu.OffPolicyAgent)
+    small = {"batch_size": 4, "n_epochs": 1, "learning_starts": 0, "n_delta": 1, "n_top": 1, "policy_delay": 1}
+    small |= {"train_freq": 1} if is_off_policy else {"n_steps": 4}
+    fields = {*kind.algorithm.Config.__dataclass_fields__}
+    settings = {key: value for key, value in small.items() if key in fields}
+    is_clipped = "clip_range" in fields
+    if is_clipped:
+        settings["clip_range"] = lambda remaining: 0.5 * remaining
+    is_discrete = name in ("DQN", "QRDQN", "MaskablePPO")
+    env = Counting(gym.spaces.Discrete(2) if is_discrete else gym.spaces.Box(-1, 1, (1,), np.float32))
+    agent = kind(
+        "MlpPolicy", env, learning_rate=in_the_third_quarter, seed=0, policy_kwargs={"net_arch": [4]}, **settings
+    )
+    # TRPO's policy moves by its trust region, and target networks follow later.
+    parts = "value" if name == "TRPO" else "weight"
+    keys = [key for key in agent.policy.state_dict() if parts in key and "target" not in key]
+    assert keys
+    for _ in range(2):
+        seen, clips = [agent.policy.state_dict()], {}
+
+        def record(agent, progress, seen=seen, clips=clips):
+            seen.append(agent.policy.state_dict())
+            if is_clipped and progress.metrics is not None:
+                clips[progress.step % 32 or 32] = float(progress.metrics["clip_range"])
+
+        agent.learn(32, callback=record)
+        moved = [i + 1 for i in range(32) if any(not np.array_equal(seen[i][key], seen[i + 1][key]) for key in keys)]
+        assert moved
+        assert set(moved) <= set(range(16, 24))
+        assert moved[0] == 16
+        for step, clip in clips.items():
+            if step % 4 == 0:
+                assert clip == pytest.approx(0.5 * (1 - step / 32), abs=1e-6)
+        assert len(clips) >= 28 * is_clipped
+
+
+def test_files_contain_functions_given_as_schedules_as_tables(in_tmp_path):
+    from rejeu.sb3.common.utils import LinearSchedule
+
+    curved = lambda remaining: 1e-3 * float(np.sqrt(remaining)) if remaining > 0.5 else 1e-4  # noqa: E731 - not for JAX
+    sb3.DQN("MlpPolicy", Walk(), learning_rate=curved, policy_kwargs={"net_arch": [4]}).save("code")
+    loaded = sb3.DQN.load("code")
+    for remaining in (1.0, 0.9, 0.6, 0.3, 0.0):
+        assert loaded.learning_rate(remaining) == pytest.approx(curved(remaining))
+        assert float(at(rejeu.load("code").config.learning_rate, np.float32(1 - remaining))) == pytest.approx(
+            curved(remaining), rel=1e-5
+        )
+    assert sb3.DQN("MlpPolicy", Walk(), learning_rate=lambda _: 0.5).learning_rate == 0.5
+    sb3.DQN("MlpPolicy", Walk(), learning_rate=LinearSchedule(1e-3, 0, 1), policy_kwargs={"net_arch": [4]}).save("line")
+    assert rejeu.load("line").config.learning_rate == rejeu.Linear(1e-3, 0.0)
+
+
+def test_recording_goes_through_other_wrappers(in_tmp_path):
+    from rejeu.sb3 import A2C
+    from rejeu.sb3.common.vec_env import DummyVecEnv, VecNormalize, VecVideoRecorder
+
+    vec_env = DummyVecEnv([lambda: gym.make("CartPole-v1", render_mode="rgb_array")])
+    model = A2C("MlpPolicy", vec_env)
+    vec_env = VecVideoRecorder(
+        VecNormalize(vec_env), "logs/videos", record_video_trigger=lambda x: x == 0, video_length=4, name_prefix="agent"
+    )
+    obs = vec_env.reset()
+    for _ in range(5):
+        obs, _, _, _ = vec_env.step(model.predict(obs)[0])
+    vec_env.close()
+    assert os.listdir("logs/videos") == ["agent-step-0-to-step-4.mp4"]

@@ -3,13 +3,50 @@
 from __future__ import annotations
 
 import gymnasium as gym
+import numpy as np
 import pytest
 
-from rejeu.sb3 import DQN, PPO
+from rejeu.sb3 import A2C, DQN, PPO
 from rejeu.sb3.common.callbacks import BaseCallback
 
 TINY = {"policy_kwargs": {"net_arch": [4]}, "seed": 0}
 FAST = {"train_freq": 8, "learning_starts": 8, "batch_size": 8, "target_update_interval": 10_000}
+
+
+class At(BaseCallback):
+    """Calls a function at one step, and keeps the parameters of the policy one step later."""
+
+    def __init__(self, step, function):
+        super().__init__()
+        self.step, self.function = step, function
+
+    def _on_step(self):
+        if self.n_calls == self.step:
+            self.function(self.model)
+        if self.n_calls == self.step + 1:
+            self.kept = policy_of(self.model)
+        return True
+
+
+def policy_of(model):
+    return {name: np.array(array) for name, array in model.get_parameters()["policy"].items()}
+
+
+@pytest.mark.parametrize(
+    ("kind", "settings"), [(A2C, {"n_steps": 8}), pytest.param(DQN, FAST, marks=pytest.mark.exhaustive)]
+)
+def test_a_learning_rate_set_in_a_callback_counts_from_the_next_update(kind, settings):
+    def stop_learning(model):
+        model.learning_rate = 0.0
+        model._setup_lr_schedule()
+
+    model = kind("MlpPolicy", gym.make("CartPole-v1"), **TINY, **settings)
+    before, callback = policy_of(model), At(20, stop_learning)
+    model.learn(48, callback=callback)
+    after = policy_of(model)
+    assert any(not np.array_equal(before[name], after[name]) for name in after)
+    assert all(np.array_equal(callback.kept[name], after[name]) for name in after)
+    assert (model.num_timesteps, model.lr_schedule(1.0)) == (48, 0.0)
 
 
 def test_a_number_that_a_callback_sets_at_every_step_is_compiled_once(tmp_path):
@@ -64,3 +101,18 @@ def test_what_cannot_be_set_raises_and_changes_nothing(dqn, name, value, error, 
         setattr(dqn, name, value)
     assert dqn.config is config
     assert dqn.learner is learner
+
+
+def test_the_size_of_a_buffer_that_holds_steps_cannot_be_set():
+    model = PPO("MlpPolicy", gym.make("CartPole-v1"), **TINY, n_steps=16, batch_size=16).learn(4)
+    with pytest.raises(ValueError, match="n_steps cannot be set on a PPO whose buffer holds steps"):
+        model.n_steps = 8
+    model.n_steps = 16
+    assert model.run.replay.length == 4
+
+
+def test_attributes_of_ones_own_can_be_set_and_nearly_right_names_warn(dqn):
+    dqn.best_so_far = 3
+    assert dqn.best_so_far == 3
+    with pytest.warns(UserWarning, match="is the hyperparameter batch_size meant"):
+        dqn.batchsize = 3

@@ -6,15 +6,21 @@ import io
 import math
 from types import SimpleNamespace
 
+import equinox as eqx
+import gymnasium as gym
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from gymnasium import spaces
 
+from rejeu.core.distributions import TanhNormal
 from rejeu.sb3.common import distributions, logger as loggers, preprocessing, save_util, utils
 from rejeu.sb3.common.results_plotter import rolling_window
-from rejeu.sb3.common.vec_env import DummyVecEnv, VecCheckNan
+from rejeu.sb3.common.torch_layers import create_mlp
+from rejeu.sb3.common.vec_env import DummyVecEnv, VecCheckNan, VecMonitor, VecTransposeImage
 from tests.golden.vec_env_script import Walk
+from tests.sb3 import envs
 
 IMAGE = spaces.Box(0, 255, (36, 40, 3), np.uint8)
 FIRST = spaces.Box(0, 255, (3, 36, 40), np.uint8)
@@ -42,6 +48,13 @@ def test_numbers_of_arrays():
     assert (x[0, 0], type(clone), type(x.numpy())) == (0.0, utils.Tensor, np.ndarray)
     seen = utils.obs_as_tensor({"a": np.ones(2)})
     assert (type(seen["a"]), type(utils.obs_as_tensor(np.ones(2)))) == (utils.Tensor, utils.Tensor)
+
+
+def test_collecting_goes_on_up_to_so_many_steps_or_episodes():
+    for unit, n_steps, n_episodes in (("step", 3, 9), ("episode", 9, 3)):
+        frequency = SimpleNamespace(frequency=4, unit=unit)
+        assert utils.should_collect_more_steps(frequency, n_steps, n_episodes)
+        assert not utils.should_collect_more_steps(frequency, n_steps + 1, n_episodes + 1)
 
 
 def test_schedules_and_rates():
@@ -172,6 +185,33 @@ def test_distributions_by_the_space_of_actions(space, name, n):
     assert (type(made).__name__, made.action_dim) == (f"{name}Distribution", n)
 
 
+def test_distributions_take_settings_and_make_layers():
+    make = distributions.make_proba_distribution
+    noisy = make(BOX, use_sde=True, dist_kwargs={"squash_output": True, "epsilon": 0.1})
+    assert (noisy.kind, noisy.epsilon) == (TanhNormal, 0.1)
+    layer, log_std = noisy.proba_distribution_net(4, log_std_init=-2.0)
+    assert (layer.weight.shape, log_std.shape, log_std[0, 0]) == ((3, 4), (4, 3), -2.0)
+    assert make(BOX).proba_distribution_net(4)[1].tolist() == [0.0] * 3
+    with pytest.raises(NotImplementedError):
+        make(spaces.Text(3))
+
+
+def test_choices_bits_and_squashed_actions():
+    several = distributions.MultiCategoricalDistribution([2, 3]).proba_distribution(
+        np.log([[0.25, 0.75, 0.2, 0.3, 0.5]])
+    )
+    assert several.mode().tolist() == several.get_actions(deterministic=True).tolist() == [[1, 2]]
+    assert float(several.log_prob(np.array([[0, 1]]))[0]) == pytest.approx(np.log(0.25 * 0.3), rel=1e-5)
+    squashed = distributions.SquashedDiagGaussianDistribution(1).proba_distribution([[0.5]], np.log([0.1]))
+    action = np.tanh(0.6)
+    density = -0.5 - np.log(0.1 * np.sqrt(2 * np.pi)) - np.log(1 - action**2)
+    assert float(squashed.log_prob(np.array([[action]]))[0]) == pytest.approx(density, rel=1e-4)
+    assert float(squashed.mode()[0, 0]) == pytest.approx(np.tanh(0.5), rel=1e-5)
+    bijector = distributions.TanhBijector(1e-6)
+    assert np.isfinite(bijector.inverse(np.array([-1.0, 1.0]))).all()
+    assert float(bijector.log_prob_correction(50.0)) == pytest.approx(np.log(1e-6))
+
+
 # save_util
 
 
@@ -248,6 +288,17 @@ def test_levels_means_and_what_is_left_out(tmp_path):
         loggers.make_output_format("xml", tmp_path)
 
 
+def test_the_environment_says_where_a_logger_writes(tmp_path, monkeypatch):
+    monkeypatch.setenv("SB3_LOGDIR", str(tmp_path / "logs"))
+    monkeypatch.setenv("SB3_LOG_FORMAT", "json,log")
+    logger = loggers.configure()
+    logger.record("a", 1)
+    logger.dump()
+    logger.close()
+    assert sorted(path.name for path in (tmp_path / "logs").iterdir()) == ["log.txt", "progress.json"]
+    assert "| a | 1 |" in (tmp_path / "logs" / "log.txt").read_text()
+
+
 # wrappers of vectors
 
 
@@ -263,3 +314,32 @@ def test_nan_is_looked_for_as_asked():
     for _ in range(2):
         with pytest.warns(UserWarning, match="inf"):
             env.step(step)
+
+
+def test_a_reset_begins_the_count_of_every_episode_anew():
+    env = VecMonitor(DummyVecEnv([Walk]))
+    env.reset()
+    env.step([0])
+    env.reset()
+    episodes = [env.step([0])[3][0].get("episode") for _ in range(3)]
+    assert [(one["r"], one["l"]) for one in episodes if one] == [(6.0, 3)]
+
+
+def test_images_are_left_as_they_are_where_that_is_asked_for():
+    make = lambda: envs.FakeImageEnv(screen_height=36, screen_width=40)  # noqa: E731
+    for skip, shape in ((True, (1, 36, 40, 1)), (False, (1, 1, 36, 40))):
+        env = VecTransposeImage(DummyVecEnv([make]), skip)
+        assert env.reset().shape == (1, *env.observation_space.shape) == shape
+    with pytest.raises(ValueError, match="images"):
+        VecTransposeImage(DummyVecEnv([lambda: gym.make("CartPole-v1")]))
+
+
+def test_layers_end_as_asked():
+    shapes = lambda *args, **kwargs: [  # noqa: E731
+        getattr(layer, "weight", np.zeros(0)).shape for layer in create_mlp(*args, **kwargs, key=jax.random.key(0))
+    ]
+    assert shapes(4, 2, [16, 8]) == [(16, 4), (0,), (8, 16), (0,), (2, 8)]
+    assert (shapes(4, 0, [3]), shapes(4, -1, [])) == ([(3, 4), (0,)], [])
+    layers = create_mlp(2, 1, [], with_bias=False, squash_output=True, key=jax.random.key(0))
+    assert (layers[0].bias, len(layers), len(shapes(2, 1, []))) == (None, 2, 1)
+    assert np.abs(eqx.nn.Sequential(layers)(np.full(2, 1e3, np.float32))).max() <= 1

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import gymnasium as gym
 import jax
 import numpy as np
@@ -9,9 +11,11 @@ import pytest
 from gymnasium import spaces
 
 import rejeu
-from rejeu.core.errors import BadEnvironmentError
+from rejeu.core import checkpoint
+from rejeu.core.errors import BadEnvironmentError, CheckpointError
 from rejeu.sb3.common.env_util import make_vec_env
 from rejeu.sb3.common.monitor import Monitor
+from rejeu.sb3.common.running_mean_std import RunningMeanStd
 from rejeu.sb3.common.vec_env import (
     DummyVecEnv,
     VecCheckNan,
@@ -173,6 +177,14 @@ def test_successors_are_what_an_episode_ended_in_not_the_next_one_s_beginning(na
     assert np.sign(batch.reward).tolist() == [-1.0 if name == "user's wrapper" else 1.0] * len(batch.reward)
 
 
+def test_normalised_successors_are_those_of_the_episode_too():
+    env = VecNormalize(walks(), clip_obs=100.0)
+    batch = replayed(env)
+    # time is scaled by statistics that move, so only the order is left of it
+    assert (batch.next_obs[:, 0] > batch.obs[:, 0] - 0.5).all()
+    assert 0 < (batch.discount == 0).mean() < 0.5
+
+
 @pytest.mark.parametrize(("forget", "said"), [(True, "no 'terminal_observation'"), (False, r"shape \(3,\).*\(2,\)")])
 def test_a_vector_that_hides_what_episodes_end_in_is_an_error(forget, said):
     agent = rejeu.DQN("MlpPolicy", Forgetful(walks(), forget), **SMALL)
@@ -203,6 +215,30 @@ def test_an_agent_of_scaled_observations_is_not_shown_raw_ones(tmp_path):
         rejeu.record_video(agent, tmp_path / "video")
 
 
+def test_an_agent_gives_back_the_vector_it_was_given():
+    env = VecNormalize(walks())
+    agent = rejeu.DQN("MlpPolicy", env, **SMALL)
+    assert agent.get_env() is env
+    assert agent.get_vec_normalize_env() is env
+    assert agent.env.venv is env
+    dummy = walks()
+    agent.set_env(dummy)
+    assert agent.get_env() is dummy
+    assert agent.get_vec_normalize_env() is None
+    assert agent.get_env().get_attr("rank") == [0, 1]
+
+
+def test_environments_of_envpool_are_returned_as_a_vector_without_access_to_single_ones():
+    agent = rejeu.DQN("MlpPolicy", rejeu.make_vector("CartPole-v1", 1, "envpool"), **SMALL)
+    env = agent.get_env()
+    assert env.reset().shape == (1, 4)
+    assert len(env.step([0])) == 4
+    assert env.env_is_wrapped(Monitor) == [False]
+    assert not env.has_attr("spec")
+    with pytest.raises(AttributeError, match=r"accessed; give the agent gymnasium\.make"):
+        env.env_method("render")
+
+
 def test_learning_begins_new_episodes_after_the_vector_was_stepped_by_hand():
     env = walks()
     agent = rejeu.DQN("MlpPolicy", env, learning_starts=1000, **SMALL).learn(2)
@@ -213,6 +249,31 @@ def test_learning_begins_new_episodes_after_the_vector_was_stepped_by_hand():
     assert agent.history["length"].tolist() == [3, 4, 3]
     batch = agent.replay_buffer.sample(np.random.default_rng(0), (200,))
     np.testing.assert_array_equal(batch.next_obs[:, 0], batch.obs[:, 0] + 1)
+
+
+def test_evaluating_leaves_a_given_vector_open():
+    env = Batch()
+    agent = rejeu.DQN("MlpPolicy", Batch(), **SMALL)
+    assert agent.evaluate(2, env=env).returns.tolist() == [3.0, 6.0]
+    assert not env.closed
+
+
+def test_rollouts_of_whole_episodes_need_no_wrapped_environment_to_wait():
+    agent = rejeu.PPO("MlpPolicy", Doubled(walks(1)), n_episodes=2, **SMALL)
+    taught(agent)
+    assert agent.learn(12).history["length"].tolist() == [3, 3, 3, 3]
+
+
+def test_masks_are_found_in_a_vector():
+    class Masked(Walk):
+        def action_masks(self):
+            return np.array([self.time % 2 == 0, True])
+
+    agent = rejeu.MaskablePPO("MlpPolicy", make_vec_env(Masked, n_envs=2), n_steps=8, batch_size=16, **SMALL)
+    taught(agent)
+    assert agent.learn(16).num_timesteps == 16
+    wrapped = rejeu.MaskablePPO("MlpPolicy", Doubled(make_vec_env(Masked, 2)), n_steps=8, batch_size=16, **SMALL)
+    assert wrapped.learn(16).num_timesteps == 16
 
 
 def test_hindsight_works_in_wrapped_vectors_and_refuses_scaled_goals():
@@ -251,7 +312,44 @@ def test_wrappers_ask_their_environments_what_they_do_not_know():
         env.nothing_like_it  # noqa: B018
 
 
+def test_wrappers_wrap_vectors_only():
+    with pytest.raises(TypeError, match=r"got Walk; try DummyVecEnv"):
+        VecMonitor(Walk())
+    with pytest.raises(AttributeError, match=r"super\(\).__init__\(venv\)"):
+        type("Rash", (Doubled,), {"__init__": lambda self: None})().num_envs  # noqa: B018
+
+
+def test_pictures_are_shown_in_a_window(monkeypatch):
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    import pygame
+
+    env = VecMonitor(DummyVecEnv([lambda: Lamp("rgb_array")] * 2))
+    env.reset()
+    assert env.render("human") is None
+    picture = env.render("rgb_array")
+    shown = pygame.surfarray.array3d(pygame.display.get_surface()).swapaxes(0, 1)
+    np.testing.assert_array_equal(shown, picture)
+    pygame.display.quit()
+    for mode in ("human", "rgb_array", None):
+        with pytest.warns(UserWarning, match=r"render_mode=None; make them with render_mode='rgb_array'"):
+            assert walks().render(mode) is None
+    with pytest.raises(NotImplementedError, match="Batch does not define get_images"):
+        Batch().get_images()
+
+
 # VecNormalize.
+
+
+def test_moments_of_batches_are_those_of_all_values():
+    values = np.random.default_rng(0).normal(3.0, 2.0, (50, 4))
+    moments, other = RunningMeanStd(1e-9, (4,)), RunningMeanStd(1e-9, (4,))
+    for part in np.split(values[:30], 6):
+        moments.update(part)
+    other.update(values[30:])
+    moments.combine(other)
+    np.testing.assert_allclose(moments.mean, values.mean(0), rtol=1e-6)
+    np.testing.assert_allclose(moments.var, values.var(0), rtol=1e-6)
+    assert moments.copy().count == pytest.approx(50)
 
 
 def test_statistics_are_saved_without_pickle(tmp_path):
@@ -272,6 +370,43 @@ def test_statistics_are_saved_without_pickle(tmp_path):
     np.testing.assert_allclose(env.unnormalize_obs(env.normalize_obs(obs)), obs, rtol=1e-5)
 
 
+def test_statistics_without_clipping_are_saved(tmp_path):
+    env = VecNormalize(walks(), clip_obs=math.inf, clip_reward=math.inf)
+    env.reset()
+    path = env.save(tmp_path / "statistics")
+    loaded = VecNormalize.load(path, walks())
+    assert (loaded.clip_obs, loaded.clip_reward) == (math.inf, math.inf)
+    assert loaded.observation_space == env.observation_space
+    far = np.full((2, 3), 1e6, np.float32)
+    np.testing.assert_array_equal(loaded.normalize_obs(far), env.normalize_obs(far))
+    assert loaded.normalize_obs(far).min() > 1e3
+    header, arrays = checkpoint.read(path, "vec_normalize")
+    for key, value in (("gamma", None), ("epsilon", None), ("clip_obs", "Infinity"), ("clip_obs", -1.0)):
+        bad = {"settings": {**header["settings"], key: value}, "keys": None}
+        with pytest.raises(CheckpointError, match=f"{key}="):
+            VecNormalize.load(checkpoint.write(tmp_path / "bad", "vec_normalize", arrays, bad), walks())
+
+
+def test_statistics_of_another_environment_are_refused(tmp_path):
+    path = VecNormalize(walks()).save(tmp_path / "statistics")
+    with pytest.raises(CheckpointError, match=r"obs.mean is float64\[3\], expected float64\[4\]"):
+        VecNormalize.load(path, make_vec_env("CartPole-v1"))
+    with pytest.raises(CheckpointError, match="'vec_normalize', expected 'agent'"):
+        rejeu.SAC.load(path)
+    with pytest.raises(ValueError, match="does not fit these statistics"):
+        VecNormalize(walks()).set_venv(make_vec_env("CartPole-v1"))
+
+
+def test_statistics_move_to_another_vector():
+    env = VecNormalize(walks(2))
+    env.reset()
+    env.set_venv(walks(3))
+    assert env.num_envs == 3
+    before = env.obs_rms.count
+    assert env.reset().shape == (3, 3)
+    assert env.obs_rms.count == before + 3
+
+
 def test_nothing_moves_while_training_is_off():
     env = VecNormalize(walks(), training=False)
     env.reset()
@@ -290,6 +425,11 @@ def test_only_boxes_are_scaled():
         VecNormalize(walks(), norm_obs_keys=["goal"])
 
 
+def test_statistics_are_copied_only_between_vectors_wrapped_alike():
+    with pytest.raises(ValueError, match="VecNormalize where the other is VecMonitor"):
+        sync_envs_normalization(VecNormalize(walks()), VecMonitor(walks()))
+
+
 def test_statistics_that_are_copied_are_of_each_vector_alone():
     training, evaluating = (VecNormalize(walks()) for _ in range(2))
     training.reset()
@@ -304,6 +444,13 @@ def test_statistics_that_are_copied_are_of_each_vector_alone():
 
 
 # Other wrappers.
+
+
+def test_stacked_frames_are_learnt_from():
+    batch = replayed(VecFrameStack(walks(), 3))
+    assert batch.obs.shape == (500, 9)
+    np.testing.assert_array_equal(batch.next_obs[:, 6], batch.obs[:, 6] + 1)
+    np.testing.assert_array_equal(batch.next_obs[:, :6], batch.obs[:, 3:])
 
 
 def test_stacks_are_of_boxes_along_an_axis_that_there_is():
@@ -373,30 +520,8 @@ def test_environments_are_monitored_wrapped_and_seeded(tmp_path):
     assert (env.step(np.zeros((2, 1)))[1] > 0).all()
 
 
-def test_environments_of_envpool_are_returned_as_a_vector_without_access_to_single_ones():
-    agent = rejeu.DQN("MlpPolicy", rejeu.make_vector("CartPole-v1", 1, "envpool"), **SMALL)
-    env = agent.get_env()
-    assert env.reset().shape == (1, 4)
-    assert len(env.step([0])) == 4
-    assert env.env_is_wrapped(Monitor) == [False]
-    assert not env.has_attr("spec")
-    with pytest.raises(AttributeError, match=r"accessed; give the agent gymnasium\.make"):
-        env.env_method("render")
-
-
-def test_pictures_are_shown_in_a_window(monkeypatch):
-    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    import pygame
-
-    env = VecMonitor(DummyVecEnv([lambda: Lamp("rgb_array")] * 2))
-    env.reset()
-    assert env.render("human") is None
-    picture = env.render("rgb_array")
-    shown = pygame.surfarray.array3d(pygame.display.get_surface()).swapaxes(0, 1)
-    np.testing.assert_array_equal(shown, picture)
-    pygame.display.quit()
-    for mode in ("human", "rgb_array", None):
-        with pytest.warns(UserWarning, match=r"render_mode=None; make them with render_mode='rgb_array'"):
-            assert walks().render(mode) is None
-    with pytest.raises(NotImplementedError, match="Batch does not define get_images"):
-        Batch().get_images()
+def test_environments_are_made_by_functions_too():
+    env = make_vec_env(Walk, 2, env_kwargs={"rank": 4}, vec_env_cls=type("Mine", (DummyVecEnv,), {}))
+    assert type(env).__name__ == "Mine"
+    assert env.get_attr("rank") == [4, 4]
+    assert env.render_mode is None

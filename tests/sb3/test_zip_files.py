@@ -18,14 +18,14 @@ import pytest
 
 import rejeu
 from rejeu.agents.conversion import OriginalPolicy, converted, parts_of
-from rejeu.core import checkpoint
+from rejeu.core import checkpoint, spaces
 from rejeu.core.algorithm import Clock, Transition
 from rejeu.core.errors import CheckpointError
 from rejeu.lab.cli import main
 from rejeu.sb3 import algorithms, load_zip
 from tests.hostile_zips import hostile_zips
-from tests.sb3_models import difference_from, loaded
-from tests.tiers import only
+from tests.sb3_models import MadeUp, difference_from, loaded
+from tests.tiers import exhaustive, only
 from tests.torch_files import Tensor, changed, members_of, serialized, torch_file, zipped
 
 pytestmark = pytest.mark.usefixtures("learners_are_shared")
@@ -92,6 +92,22 @@ def test_the_class_of_the_drop_in_loads_a_file_of_the_original(name, file):
     assert (type(agent), agent.gamma, found.gamma) == (kind, expected.config.gamma, 0.5)
     with pytest.raises(CheckpointError, match=f"it is a model of {name}, not of PPO; load it with {name}.load"):
         algorithms.PPO.load(path)
+
+
+@pytest.mark.parametrize("name", only({"sac-her"}, ["dqn-mlp", "sac-her", "ppo-normalized"]))
+def test_training_continues(name):
+    agent = loaded(FOLDER / name)
+    env = MadeUp(agent.observation_space, agent.action_space)
+    before = agent.get_parameters()
+    agent.set_env(env)
+    n_updates = agent.n_updates
+    before_them = agent.num_timesteps
+    agent.learn(150, reset_num_timesteps=False)
+    assert agent.num_timesteps >= before_them + 150
+    assert agent.n_updates > n_updates
+    after = agent.get_parameters()
+    assert all(np.isfinite(value).all() for value in after.values())
+    assert any(not np.array_equal(after[key], before[key]) for key in after if "head" in key)
 
 
 def test_images_are_read_in_the_order_of_channels_of_pytorch(tmp_path):
@@ -196,6 +212,28 @@ def test_what_cannot_be_expressed_is_one_line(changes, message, tmp_path):
     assert "\n" not in str(caught.value)
 
 
+def test_a_missing_file_and_one_that_is_no_zip_file(tmp_path):
+    with pytest.raises(FileNotFoundError, match="nothing"):
+        load_zip(tmp_path / "nothing")
+    with pytest.raises(CheckpointError, match="not a complete zip file"):
+        load_zip(write(tmp_path, b"PK"))
+    with pytest.raises(CheckpointError, match="it is a zip file; rejeu import converts those of Stable-Baselines3"):
+        rejeu.load(write(tmp_path, PPO))
+
+
+def test_environments_of_other_spaces_are_refused():
+    with pytest.raises(CheckpointError, match=r"its observation space is .* and the environment's is"):
+        load_zip(FOLDER / "ppo-normalized.zip", env="Pendulum-v1")
+
+
+def test_hyperparameters_are_those_of_the_file_and_can_be_replaced():
+    agent = load_zip(FOLDER / "dqn-mlp.zip", gamma=0.5)
+    assert (agent.config.gamma, agent.config.buffer_size, agent.config.learning_starts) == (0.5, 500, 50)
+    her = load_zip(FOLDER / "sac-her.zip")
+    assert her.config.replay_buffer_class == "HerReplayBuffer"
+    assert her.config.hindsight.n_sampled_goal == 4
+
+
 def test_recent_episodes_and_outputs_are_those_of_the_file(tmp_path):
     episodes = [{"r": np.float32(1.5), "l": 3, "t": 0.25}] * 5
     data = {"_stats_window_size": 4, "verbose": 1, "tensorboard_log": "logs"}
@@ -208,6 +246,16 @@ def test_recent_episodes_and_outputs_are_those_of_the_file(tmp_path):
     agent = algorithms.PPO.load(path, verbose=0, tensorboard_log=None, stats_window_size=2)
     assert (agent.ep_info_buffer.maxlen, agent.verbose, agent.tensorboard_log) == (2, 0, None)
     assert load_zip(path).tensorboard_log is None
+
+
+@exhaustive
+def test_images_are_what_convolutions_read():
+    leaf = spaces.leaves(gym.spaces.Box(0.0, 1.0, (1, 36, 36), np.float32))[0]
+    weights = {"features_extractor.cnn.0.weight": np.zeros(1), "features_extractor.linear.0.bias": np.zeros(16)}
+    features = [
+        OriginalPolicy(one, (leaf,), [], gym.spaces.Discrete(2), False).n_features(leaf) for one in (weights, {})
+    ]
+    assert features == [16, 36 * 36]
 
 
 @pytest.mark.parametrize("end", only([80], [80, None]))

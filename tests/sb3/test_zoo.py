@@ -324,6 +324,22 @@ def test_a_policy_in_which_large_numbers_cancel_is_exported(tmp_path):
     assert found.difference <= found.allowed
 
 
+@pytest.mark.parametrize(
+    ("changes", "error"), [({"learning_rat": 1e-3}, TypeError), ({"learning_rate": "lin_x"}, ValueError)]
+)
+def test_a_setting_that_is_wrong_is_not_blamed_on_the_file(changes, error, tmp_path):
+    with pytest.raises(error, match="learning_rate") as caught:
+        load_zip(write(tmp_path / "model.zip", PPO), **changes)
+    assert "model.zip" not in str(caught.value)
+
+
+def test_the_note_on_a_schedule_ends_once_it_is_given(tmp_path):
+    pytest.importorskip("yaml")
+    write(tmp_path / "config.yml", CONFIG)
+    assert "--set learning_rate=lin_0.001" in str(notes_beside(tmp_path / "model.zip", None))
+    assert "learning_rate" not in str(notes_beside(tmp_path / "model.zip", None, {"learning_rate": "lin_0.001"}))
+
+
 FOLDERS = sorted(path.parent for path in ZOO.glob("*/*/*.zip") if path.stem != "best_model")
 
 

@@ -17,7 +17,7 @@ from rejeu.algorithms import sac
 from rejeu.callbacks import Checkpoint
 from rejeu.core.algorithm import EXPLAINED_VARIANCE, TD_ERROR, Rollout
 from rejeu.core.checkpoint import read
-from rejeu.core.errors import CheckpointError, NonFiniteError
+from rejeu.core.errors import BadEnvironmentError, CheckpointError, NonFiniteError
 from rejeu.core.normalization import merged, no_moments
 from rejeu.core.spaces import Leaf
 from rejeu.envs.make import InProcess
@@ -27,7 +27,7 @@ from rejeu.replay.ring import Ring
 from rejeu.replay.rollout import RolloutBuffer
 from rejeu.training import finite, learner
 from rejeu.training.learner import Readings
-from tests.environments import Reach, Sampled
+from tests.environments import Counter, Reach, Sampled
 from tests.tiers import exhaustive, only, only_tuples
 
 pytestmark = pytest.mark.usefixtures("learners_are_shared")
@@ -263,6 +263,60 @@ def test_the_message_names_step_update_batch_model_and_what_to_try(tmp_path):
     assert 'nonfinite="skip"' in message
 
 
+def test_the_saved_batch_breaks_a_loaded_model_again(tmp_path):
+    agent = MAKE["SAC"]()
+    agent.report_folder = tmp_path
+    poison(agent, 3, 1e25)
+    with pytest.raises(NonFiniteError) as caught:
+        agent.learn(TOTAL)
+    loaded = rejeu.SAC.load(agent.save(tmp_path / "model"))
+    found = finite.examine(loaded, caught.value.batch)
+    assert found
+    assert found.metrics == ["critic_loss (inf)"]
+    assert not found.batch
+    batch, clock = finite.load_batch(loaded, caught.value.batch)
+    assert batch.reward[0] == np.float32(1e25)
+    assert int(clock.step) == caught.value.step
+    with pytest.raises(CheckpointError, match="a batch of another kind of agent than this A2C"):
+        finite.load_batch(MAKE["A2C"](), caught.value.batch)
+    with pytest.raises(CheckpointError, match="holds 'agent', expected 'batch'"):
+        finite.load_batch(agent, tmp_path / "model")
+
+
+@exhaustive
+def test_next_actions_that_were_not_taken_are_not_blamed(tmp_path):
+    agent = rejeu.ReBRAC("MlpPolicy", box(), **OFF)
+    agent.report_folder = tmp_path
+    poison(agent, 3, 1e25)
+    with pytest.raises(NonFiniteError, match=r"^critic_loss \(inf\)") as caught:
+        agent.learn(TOTAL)
+    batch, _ = finite.load_batch(agent, caught.value.batch)
+    assert np.isnan(batch.next_action).any()
+    assert not finite.examine(agent, caught.value.batch).batch
+
+
+def test_a_batch_never_replaces_another_and_goes_where_logs_or_the_process_are(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    paths = []
+    for folder in (None, None, "logs"):
+        agent = rejeu.SAC("MlpPolicy", box(), tensorboard_log=None if folder is None else tmp_path / folder, **OFF)
+        agent.logger.outputs = [_Nothing()]  # no TensorBoard is needed
+        poison(agent, 1, np.nan)
+        with pytest.raises(NonFiniteError) as caught:
+            agent.learn(TOTAL)
+        paths.append(caught.value.batch.relative_to(tmp_path).as_posix())
+    assert paths == [
+        "nonfinite_batch_10.safetensors",
+        "nonfinite_batch_10_2.safetensors",
+        "logs/nonfinite_batch_10.safetensors",
+    ]
+
+
+class _Nothing:
+    def write(self, step, row):
+        pass
+
+
 USES = {
     "save": lambda agent: agent.save("model"),
     "predict": lambda agent: agent.predict(np.zeros(3)),
@@ -358,7 +412,61 @@ def test_of_a_scan_only_the_broken_step_is_skipped():
         np.testing.assert_allclose(value, two[name], rtol=1e-5, atol=1e-7, err_msg=name)  # two programs, two roundings
 
 
+def spoil(agent, field):
+    """Makes a field of every batch that is drawn NaN."""
+    draw = agent.run.replay.draw
+
+    def spoiled(*arguments):
+        batch, drawn = draw(*arguments)
+        return batch._replace(**{field: getattr(batch, field) * np.float32(np.nan)}), drawn
+
+    agent.run.replay.draw = spoiled
+
+
+def test_updates_that_are_all_skipped_are_an_error_in_the_end(tmp_path):
+    agent = MAKE["SAC"](nonfinite="skip")
+    agent.report_folder = tmp_path
+    agent.learn(20)
+    spoil(agent, "reward")
+    with pytest.raises(NonFiniteError, match=r"^100 updates in a row were skipped, .* the batch held reward") as caught:
+        agent.learn(200)
+    assert caught.value.batch.exists()
+    assert agent.statistics()["train/skipped_updates"] == 100
+
+
+def test_nonfinite_is_saved_with_the_model_and_checked(tmp_path):
+    path = MAKE["PPO"](nonfinite="skip").save(tmp_path / "model")
+    assert rejeu.PPO.load(path).config.nonfinite == "skip"
+    assert rejeu.PPO.load(path, nonfinite="stop").config.nonfinite == "stop"
+    with pytest.raises(ValueError, match="nonfinite='ignore' must be 'stop' or 'skip'"):
+        MAKE["SAC"](nonfinite="ignore")
+
+
 # What environments say
+
+
+class Saying(Counter):
+    """Returns a bad number in the observation of one step (of reset: 0) of one episode."""
+
+    def __init__(self, value=np.nan, at=(1, 2)):
+        super().__init__(lengths=(3,))
+        self.value, self.at = value, at
+
+    def _observe(self):
+        obs = super()._observe()
+        if (self.episode, self.time) == self.at:
+            obs[2] = self.value
+        return obs
+
+
+@pytest.mark.parametrize(("at", "steps"), [((0, 0), 0), ((1, 0), 6)])
+@pytest.mark.parametrize("make", only([rejeu.PPO], [rejeu.SAC, rejeu.PPO]))
+def test_so_does_one_that_reset_returns(make, at, steps):
+    agent = make("MlpPolicy", InProcess([Saying(at=at), Saying(at=(9, 9))], seed=0), seed=0)
+    with pytest.raises(
+        BadEnvironmentError, match=rf"reset returned an observation .* environment 0 after {steps} steps"
+    ):
+        agent.learn(40)
 
 
 class Echo(Sampled):
@@ -367,6 +475,13 @@ class Echo(Sampled):
     def step(self, action):
         _, *rest = super().step(action)
         return np.full(3, action[0], np.float32), *rest
+
+
+def test_an_environment_is_not_blamed_for_an_action_that_was_not_finite():
+    agent = rejeu.SAC("MlpPolicy", InProcess([Echo(gym.spaces.Box(-1.0, 1.0, (3,)))], seed=0), **OFF).learn(12)
+    agent.run.action = np.full((1, 1), np.nan, np.float32)
+    with pytest.raises(NonFiniteError, match=r"the policy chose the action \[nan\] in environment 0 after 12 steps"):
+        agent.learn(3, reset_num_timesteps=False)
 
 
 @pytest.mark.parametrize("overlap", only([False], [True, False]))
@@ -446,30 +561,3 @@ def test_rejeu_train_says_in_one_line_what_broke_and_keeps_the_batch_in_the_run_
     assert "lower learning_rate (it is 1e+30)" in said
     agent = rejeu.load(tmp_path / "run" / "agent")
     assert all(np.isfinite(value).all() for value in agent.get_parameters().values())
-
-
-def test_the_saved_batch_breaks_a_loaded_model_again(tmp_path):
-    agent = MAKE["SAC"]()
-    agent.report_folder = tmp_path
-    poison(agent, 3, 1e25)
-    with pytest.raises(NonFiniteError) as caught:
-        agent.learn(TOTAL)
-    loaded = rejeu.SAC.load(agent.save(tmp_path / "model"))
-    found = finite.examine(loaded, caught.value.batch)
-    assert found
-    assert found.metrics == ["critic_loss (inf)"]
-    assert not found.batch
-    batch, clock = finite.load_batch(loaded, caught.value.batch)
-    assert batch.reward[0] == np.float32(1e25)
-    assert int(clock.step) == caught.value.step
-    with pytest.raises(CheckpointError, match="a batch of another kind of agent than this A2C"):
-        finite.load_batch(MAKE["A2C"](), caught.value.batch)
-    with pytest.raises(CheckpointError, match="holds 'agent', expected 'batch'"):
-        finite.load_batch(agent, tmp_path / "model")
-
-
-def test_an_environment_is_not_blamed_for_an_action_that_was_not_finite():
-    agent = rejeu.SAC("MlpPolicy", InProcess([Echo(gym.spaces.Box(-1.0, 1.0, (3,)))], seed=0), **OFF).learn(12)
-    agent.run.action = np.full((1, 1), np.nan, np.float32)
-    with pytest.raises(NonFiniteError, match=r"the policy chose the action \[nan\] in environment 0 after 12 steps"):
-        agent.learn(3, reset_num_timesteps=False)

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import gymnasium as gym
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -77,6 +78,17 @@ def test_after_the_first_steps_nothing_is_compiled_and_few_programs_run(name):
     jax.clear_caches()
     agent.learn(8 * n, reset_num_timesteps=False)
     assert len(_compilations) - before == case.programs
+
+
+def test_a_further_program_is_counted():
+    """Arithmetic on an array of the device is a program."""
+    agent = CASES["SAC"].make()
+    agent.learn(12)
+    vector = jnp.ones(7) * 3
+    jax.clear_caches()
+    before = len(_compilations)
+    agent.learn(4, lambda *_: bool((vector * 2.5).shape), reset_num_timesteps=False)
+    assert len(_compilations) - before > CASES["SAC"].programs
 
 
 def test_a_further_compilation_is_counted():

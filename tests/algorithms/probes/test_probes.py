@@ -11,9 +11,10 @@ import pytest
 
 import rejeu
 from tests import every_agent, on_policy_agents
-from tests.algorithms.probes.environments import BySightAndAction, Cut, CutByLimit, Endless, Later
+from tests.algorithms.probes.environments import ByAction, BySightAndAction, Cut, CutByLimit, Endless, Later
 from tests.every_agent import env_of, small
-from tests.tiers import only, only_tuples
+from tests.helpers import small_sac
+from tests.tiers import exhaustive, only, only_tuples
 
 GAMMA = 0.5
 ON_POLICY = on_policy_agents.KINDS
@@ -78,6 +79,16 @@ def test_the_best_action_of_a_policy_gradient_depends_on_the_observation(kind):
 
 
 # What SAC alone does.
+
+
+@exhaustive
+def test_the_automatic_temperature_reaches_the_target_entropy():
+    """The policy starts with 0.5 nats and the best action alone would have none left; the target is -2."""
+    entropies = []
+    small_sac(
+        ByAction(), target_entropy=-2.0, learning_rate=3e-3, batch_size=32, learning_starts=64, ent_coef="auto_0.1"
+    ).learn(1000, callback=lambda _, p: entropies.append(p.metrics["entropy"]) if p.step > 700 else None)
+    assert np.mean(entropies) == pytest.approx(-2.0, abs=0.4)
 
 
 @pytest.mark.slow

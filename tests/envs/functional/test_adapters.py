@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from gymnasium import spaces
 
 import rejeu
 from rejeu.envs.functional import cart_pole
@@ -72,6 +73,16 @@ def test_gymnax_terminates_and_truncates_apart_and_is_reset_by_the_caller():
     *_, terminated, truncated = episode(from_gymnax(Line()), jnp.array([0, 1]), 6)
     assert not terminated.any()
     assert truncated.tolist() == [False] * 4 + [True, False]
+
+
+def test_gymnaxs_parameters_and_spaces_are_kept():
+    env = from_gymnax(Line(), Params(speed=0.5, max_steps_in_episode=9))
+    assert env.observation_space == spaces.Box(-10, 10, (1,))
+    assert env.action_space == spaces.Discrete(2)
+    vector = rejeu.make_vector(env, 2)
+    assert vector.max_episode_steps == 9
+    vector.reset(seed=0)
+    np.testing.assert_array_equal(vector.step(np.array([0, 1])).obs, [[0.0], [0.5]])
 
 
 def test_gymnaxs_own_cart_pole_is_ours():

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rejeu.envs.functional import ball
+from rejeu.envs.functional import ball, make
 from rejeu.teaching.ball import Ball as Reference
 
 
@@ -51,3 +51,10 @@ def test_steps_equal_those_of_the_ball_on_the_host(dimension):
     np.testing.assert_array_equal(success, [one.get("is_success", False) for one in info])
     assert np.sum(terminated) > 100
     assert np.sum(truncated) > 100
+
+
+def test_the_first_position_is_uniform_in_the_reach_of_a_push():
+    _, obs = jax.vmap(make("jax/Ball-v0").reset)(jax.random.split(jax.random.key(0), 2_000))
+    assert obs.shape == (2_000, 2)
+    assert -2 <= obs.min() < -1.98
+    assert 1.98 < obs.max() <= 2

@@ -94,3 +94,39 @@ def test_the_point_never_enters_a_wall_and_reaches_every_cell(layout):
     assert np.abs(way.velocity).max() < point_maze.MAX_SPEED
     steps = np.abs(np.diff(np.asarray(way.position), axis=0)).max()
     assert steps < 0.5  # nothing is jumped over
+
+
+def test_every_cell_of_a_maze_can_be_reached_from_every_other():
+    for name in LAYOUTS:
+        free = {tuple(cell) for cell in np.argwhere(~PointMaze(layout=name).walls)}
+        found, border = set(), [min(free)]
+        while border:
+            row, column = border.pop()
+            found.add((row, column))
+            near = {(row + 1, column), (row - 1, column), (row, column + 1), (row, column - 1)}
+            border += (near & free) - found
+        assert found == free, name
+
+
+def test_a_wall_stops_the_point_and_lets_it_slide_along():
+    env = PointMaze(layout="u")
+    state, _ = env.reset(KEY)
+    step = jax.jit(env.step)
+    state = state._replace(position=jnp.array([-1.0, 1.0]), velocity=jnp.zeros(2), goal=jnp.array([1.0, -1.0]))
+    for _ in range(10):
+        state, obs, reward, terminated, _ = step(KEY, state, jnp.array([1.0, 1.0]))
+    assert state.velocity[1] == 0.0  # at the upper wall
+    np.testing.assert_allclose(state.position[1], 1.5 - RADIUS, atol=1e-3)
+    assert state.position[0] > 0.5  # still moving to the right
+    assert (float(reward), bool(terminated)) == (-1.0, False)
+    np.testing.assert_array_equal(obs["achieved_goal"], state.position)
+
+
+def test_the_goal_of_the_maze_ends_the_episode():
+    env = PointMaze()
+    state, _ = env.reset(KEY)
+    for distance, reached in ((0.44, True), (0.46, False)):
+        near = state._replace(position=state.goal + jnp.array([0.0, distance]), velocity=jnp.zeros(2))
+        near, _, reward, terminated, truncated = env.step(KEY, near, jnp.zeros(2))
+        assert (float(reward), bool(terminated), bool(truncated)) == (float(reached) - 1.0, reached, False)
+        assert bool(env.success(near)) == reached

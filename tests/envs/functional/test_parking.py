@@ -11,8 +11,10 @@ from scipy import stats
 
 pytest.importorskip("highway_env")
 
+from rejeu.envs.functional import make
 from rejeu.envs.functional.parking import Parking
 from rejeu.envs.functional.vector import reset_all
+from rejeu.envs.goals import parking_reward
 from rejeu.envs.registry import make_env
 from tests.envs.functional import parking
 
@@ -50,6 +52,12 @@ def test_steps_equal_highway_envs():
 
 
 @equal_to
+@pytest.mark.exhaustive
+def test_twelve_thousand_steps_equal_highway_envs():
+    check(12_000, in_single_precision=True)
+
+
+@equal_to
 def test_first_states_have_highway_envs_distribution():
     env = make_env("parking-v0").unwrapped
     env.reset(seed=0)
@@ -69,3 +77,18 @@ def test_first_states_have_highway_envs_distribution():
     counts = np.array([(ours[:, 8] == goal).sum() for goal in range(28)])
     expected = len(ours) * np.array([0.5 + 0.5 * (goal not in (6, 20)) for goal in range(28)]) / 27
     assert stats.chisquare(counts, expected).pvalue > 1e-4
+
+
+def test_the_limit_is_500_steps():
+    env = make_env("parking-v0").unwrapped
+    env.reset(seed=0)
+    env.time = 99.4
+    assert [env.step(np.zeros(2))[3] for _ in range(3)] == [False, False, True]
+    assert make("jax/Parking-v0").max_episode_steps == 500  # at which steps truncate, as they do when compared
+
+
+def test_rewards_of_goals_are_those_of_hindsight_on_the_host():
+    rng = np.random.default_rng(0)
+    achieved, desired = rng.normal(size=(2, 5, 3, 6)).astype(np.float32)
+    np.testing.assert_allclose(ENV.compute_reward(achieved, desired), parking_reward(achieved, desired), rtol=1e-6)
+    assert ENV.compute_terminated(achieved, desired) is None

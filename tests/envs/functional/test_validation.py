@@ -188,6 +188,21 @@ def test_right_environments_pass():
 
 
 @pytest.mark.exhaustive
+@pytest.mark.parametrize("begin", [lambda: (0.0, jnp.zeros(1)), lambda: (np.float32(0), np.zeros(1, np.float32))])
+def test_numbers_of_python_and_numpy_may_begin_a_state_that_trains_on_the_device(begin):
+    agent = rejeu.PPO(
+        "MlpPolicy",
+        rejeu.make_vector(Walk(begin=begin, wrong=lambda x: (x.sum(), x.reshape(1), ZERO, NO, NO)), 2),
+        n_steps=4,
+        batch_size=4,
+        policy_kwargs={"net_arch": [8]},
+        seed=0,
+    )
+    agent.on_device = True
+    assert agent.learn(16).num_timesteps == 16
+
+
+@pytest.mark.exhaustive
 def test_observations_far_outside_of_their_bounds_are_reported_on_the_device():
     env = Walk(wrong=lambda x: (x, x + 1e6, ZERO, NO, NO))
     agent = rejeu.SAC("MlpPolicy", rejeu.make_vector(env), policy_kwargs={"net_arch": [8]}, seed=0)
@@ -243,3 +258,9 @@ def test_the_checker_of_all_environments_takes_those_in_jax():
     assert "no episode ended in 2,000 steps" in endless
     with pytest.raises(BadEnvironmentError, match=r"Walk: Walk\.step cannot be compiled"):
         rejeu.check_env(Walk(wrong=if_on_a_value))
+
+
+@pytest.mark.parametrize("limit", [0, -1, 2.5, "5", True])
+def test_a_time_limit_that_is_no_positive_whole_number_is_refused(limit: Any) -> None:
+    with pytest.raises(ValueError, match=r"max_episode_steps=.* must be a whole number of at least 1"):
+        rejeu.make_vector("jax/CartPole-v1", max_episode_steps=limit)

@@ -12,10 +12,35 @@ import pytest
 import rejeu
 from rejeu.envs.functional import make, vector
 from rejeu.envs.functional.vector import JaxVector, VectorState, reset_all, reset_done, step_all
+from tests.tiers import exhaustive
 
 CART_POLE = make("jax/CartPole-v1")
 step_cart_poles = jax.jit(partial(step_all, CART_POLE))
 reset_cart_poles = jax.jit(partial(reset_done, CART_POLE))
+
+
+def play(env, key, actions, n):
+    """Returns the observations after each of the steps with ``actions`` ``(n_steps, n)``; ended episodes are reset."""
+    state = jax.jit(partial(reset_all, env, n=n))(key)
+
+    def turn(state: VectorState, action):
+        state, obs, _, terminated, truncated, _ = step_all(env, state, action)
+        state, after = reset_done(env, state, terminated | truncated)
+        return state, (obs, after, terminated)
+
+    return jax.jit(lambda state: jax.lax.scan(turn, state, actions))(state)[1]
+
+
+@exhaustive
+def test_many_environments_equal_single_ones():
+    key, n = jax.random.key(3), 4
+    actions = jax.random.randint(jax.random.key(1), (60, n), 0, 2)
+    obs, after, terminated = play(CART_POLE, key, actions, n)
+    assert terminated.any(axis=0).all()  # each of them was reset
+    more = jnp.concatenate([actions, actions], axis=1)
+    obs_of_more, after_of_more, _ = play(CART_POLE, key, more, 2 * n)
+    np.testing.assert_array_equal(obs_of_more[:, :n], obs)
+    np.testing.assert_array_equal(after_of_more[:, :n], after)
 
 
 def test_an_environment_is_the_single_one_of_its_stream():
@@ -77,6 +102,32 @@ def test_a_vector_is_the_pure_functions_for_the_key_of_its_seed():
             np.testing.assert_allclose(env.reset_done(done), first, atol=1e-6)
     assert np.isnan(env.success(step, 0))
     assert env.goals() is None
+
+
+def test_a_sequence_of_seeds_gives_each_environment_the_episodes_of_a_single_one():
+    together = rejeu.make_vector("jax/Pendulum-v1", 2, seed=[5, 9]).reset()
+    for row, seed in zip(together, (5, 9), strict=True):
+        np.testing.assert_array_equal(rejeu.make_vector("jax/Pendulum-v1", 1, seed=seed).reset()[0], row)
+
+
+def test_resetting_without_a_seed_continues_the_streams():
+    env = rejeu.make_vector("jax/Pendulum-v1", 2, seed=5)
+    first = env.reset().copy()
+    assert (env.reset() != first).any(axis=1).all()
+    np.testing.assert_array_equal(env.reset(seed=5), first)
+
+
+def test_inactive_environments_do_not_move():
+    env = rejeu.make_vector("jax/Pendulum-v1", 2, seed=0)
+    reference = rejeu.make_vector("jax/Pendulum-v1", 2, seed=0)
+    obs = env.reset().copy()
+    reference.reset()
+    step = env.step(np.ones((2, 1)), active=np.array([True, False]))
+    np.testing.assert_array_equal(step.obs[1], obs[1])
+    assert (step.obs[0] != obs[0]).any()
+    assert step.reward[1] == 0.0
+    later = env.step(np.ones((2, 1)), active=np.array([False, True]))
+    np.testing.assert_allclose(later.obs, reference.step(np.ones((2, 1))).obs, atol=1e-6)
 
 
 def test_a_snapshot_continues_in_another_vector():

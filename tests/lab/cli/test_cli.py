@@ -7,6 +7,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import warnings
 from types import SimpleNamespace
 
 import gymnasium as gym
@@ -18,13 +19,17 @@ from rejeu.agents import AGENTS
 from rejeu.algorithms.dqn import FOR_NEW
 from rejeu.callbacks import Evaluate
 from rejeu.checkpoints import run_folder as folder
+from rejeu.lab import cli
 from rejeu.lab.cli import main
 from rejeu.lab.cli.report import goal_of
 from rejeu.lab.cli.session import Session
 from rejeu.lab.cli.train import untuned
 from rejeu.lab.reporting.report.page import plotly_script
 from rejeu.lab.runs import config
+from rejeu.logs.logging import CsvFile
+from tests.full_disk import FullDisk
 from tests.helpers import assert_same_parameters
+from tests.tiers import exhaustive
 
 FILES = {
     "agent.safetensors",
@@ -133,6 +138,14 @@ def test_tables_hold_every_episode_and_evaluation(run):
     assert "train/critic_loss" in rows(run / "metrics.csv")[0]
 
 
+def test_the_best_model_is_that_of_the_best_evaluation(run):
+    table = rows(run / "evaluations.csv")
+    last_best = max(i for i, row in enumerate(table) if row["best"] == "1")
+    assert last_best == np.argmax([float(row["mean_return"]) for row in table])
+    counters = rejeu.load(run / "best.safetensors").num_timesteps
+    assert counters == int(table[last_best]["step"])
+
+
 def test_train_says_what_it_does_and_what_came_of_it(tmp_path, capsys):
     assert train(tmp_path / "run", "--seed", "1", *FEWER_FILES, steps=60) == 0
     text = capsys.readouterr().out
@@ -147,6 +160,17 @@ def test_train_says_what_it_does_and_what_came_of_it(tmp_path, capsys):
 def untrained(monkeypatch):
     """Ends commands before they train."""
     monkeypatch.setattr(Session, "run", lambda self, stop, stopwatch: (0, {}))
+
+
+@pytest.mark.usefixtures("untrained")
+def test_a_preset_for_envpool_trains_on_gymnasium_without_it_and_says_so(tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "envpool", None)
+    assert train(tmp_path / "run", "--seed", "1") == 0
+    said = (
+        'backend       gymnasium; EnvPool would be faster (about 770 MB with its assets): pip install "rejeu[envpool]"'
+    )
+    assert said in capsys.readouterr().out
+    assert json.loads((tmp_path / "run" / "config.json").read_text())["backend"] == "gymnasium"
 
 
 @pytest.mark.usefixtures("untrained")
@@ -207,6 +231,14 @@ def test_evaluate_prints_the_result_repeats_itself_with_a_seed_and_writes_nothin
     assert {path: path.stat().st_mtime_ns for path in run.iterdir()} == before
 
 
+@pytest.mark.usefixtures("untrained")
+def test_a_preset_says_what_a_success_is_where_the_environments_threshold_ranks_by_luck(tmp_path):
+    out = tmp_path / "run"
+    argv = ["train", "Taxi-v4", "--steps", "8", "--out", str(out), "--evaluate-episodes", "1", *FEWER_FILES]
+    assert main(argv) == 0
+    assert json.loads((out / "config.json").read_text("utf-8"))["success_threshold"] == 0.0
+
+
 def test_a_reader_that_closes_the_output_is_no_error(monkeypatch, capsys):
     reader, writer = os.pipe()
     os.close(reader)
@@ -223,6 +255,15 @@ def help_of(capsys, *words):
     text = capsys.readouterr().out
     lists = re.findall(r"^([a-z ]+):\n((?:  .*\n|\n(?=  ))+)", text, re.MULTILINE)
     return {title: re.findall(r"^  (?:-h, )?([\w-]+)", entries, re.MULTILINE) for title, entries in lists}
+
+
+def test_help_lists_commands_by_task(capsys):
+    lists = help_of(capsys)
+    assert [*lists] == ["options", "train", "look", "share", "teach"]
+    assert {"tune": "train", "compare": "look", "export": "share", "class": "teach"}.items() <= {
+        name: title for title, names in lists.items() for name in names
+    }.items()
+    assert sorted(name for title in [*lists][1:] for name in lists[title]) == sorted(cli.COMMANDS)
 
 
 def test_help_of_train_begins_with_what_people_need_first_and_has_five_groups(capsys):
@@ -246,6 +287,13 @@ def test_set_takes_dotted_names_numbers_lists_and_words():
     }
 
 
+def test_set_understands_pythons_false_and_leaves_the_preset_as_it_was():
+    assert config.apply(["policy_kwargs.layer_norm=False"], {}) == {"policy_kwargs": {"layer_norm": False}}
+    preset = rejeu.agents.presets.find("parking-v0")
+    config.apply(["policy_kwargs.net_arch=[1]"], preset.hyperparameters)
+    assert preset.hyperparameters["policy_kwargs"]["net_arch"] != [1]
+
+
 @pytest.mark.usefixtures("untrained")
 def test_without_a_preset_dqn_has_values_of_its_own_but_on_images(tmp_path):
     few, pixels = SimpleNamespace(n_envs=1, observation_space=CUBE), gym.spaces.Box(0, 255, (36, 36, 3), np.uint8)
@@ -262,6 +310,13 @@ def test_without_a_preset_dqn_has_values_of_its_own_but_on_images(tmp_path):
         found = json.loads((out / "config.json").read_text())["hyperparameters"]
         assert (found["n_steps"], found["gradient_steps"]) == (steps, 1)
         assert found["policy_kwargs"]["net_arch"] == [128, 128]
+
+
+@pytest.mark.usefixtures("untrained")
+def test_set_may_be_given_more_than_once(tmp_path):
+    assert train(tmp_path / "run", "--backend", "gymnasium", "--set", "gamma=0.5") == 0
+    hyperparameters = json.loads((tmp_path / "run" / "config.json").read_text())["hyperparameters"]
+    assert (hyperparameters["gamma"], hyperparameters["batch_size"]) == (0.5, 8)
 
 
 @pytest.mark.parametrize(
@@ -336,6 +391,15 @@ def test_a_nan_reward_is_an_error_and_what_was_learnt_until_then_is_saved(capsys
     assert len(rows(tmp_path / "run" / "episodes.csv")) == 2
 
 
+def test_a_table_that_is_gone_on_with_keeps_the_rows_up_to_a_step(tmp_path):
+    path = tmp_path / "metrics.csv"
+    path.write_text("step,a\n1,1.0\n2,2.0\n3,3.0\n4,")  # and the last was cut short
+    table = CsvFile(path, up_to=2)
+    table.write(3, {"a": 3.5, "b": 1.0})
+    table.close()
+    assert [list(row.values()) for row in rows(path)] == [["1", "1.0", ""], ["2", "2.0", ""], ["3", "3.5", "1.0"]]
+
+
 def table(path):
     """A table without what depends on the clock."""
     return [{k: v for k, v in row.items() if "seconds" not in k and not k.startswith("time/")} for row in rows(path)]
@@ -405,6 +469,19 @@ def test_resume_with_steps_pauses_and_keeps_the_goal(run, tmp_path, capsys):
     assert_same_parameters(one, two)
 
 
+@exhaustive
+def test_the_best_model_is_kept_when_a_complete_run_is_trained_further(tmp_path, capsys, monkeypatch):
+    """The last evaluation of the first part, at step 60, is the best by far and must be remembered."""
+    better = iter([10.0, 1.0])
+    evaluation = rejeu.Evaluation
+    fake = lambda *_, **__: evaluation(np.array([next(better)]), np.array([5]), np.array([np.nan]))  # noqa: E731
+    monkeypatch.setattr(rejeu.SAC, "evaluate", fake)
+    assert train(tmp_path / "run", "--evaluate-every", "1000", *FEWER_FILES, steps=60) == 0
+    assert main(["resume", str(tmp_path / "run"), "--steps", "20", *FEWER_FILES]) == 0
+    assert [row["best"] for row in rows(tmp_path / "run" / "evaluations.csv")] == ["1", "0"]
+    assert rejeu.load(tmp_path / "run" / "best.safetensors").num_timesteps == 60
+
+
 def test_resume_explains_what_it_cannot_go_on_with(run, tmp_path, capsys):
     assert "no run folder" in error_of(capsys, "resume", str(tmp_path))
     assert "exclude each other" in error_of(capsys, "resume", str(run), "--steps", "5", "--minutes", "1")
@@ -439,6 +516,49 @@ def test_resume_says_that_it_skipped_a_damaged_checkpoint(run, tmp_path, capsys)
         rf"warning: {re.escape(str(newest))}: the array '?\S+ is damaged .*; resuming from the checkpoint before it\n"
     )
     assert re.fullmatch(warning, said.err)
+
+
+@pytest.mark.filterwarnings("always::UserWarning")
+def test_what_could_not_be_written_is_repeated_at_the_end_of_the_command(tmp_path, capsys, monkeypatch):
+    disk, call = FullDisk(monkeypatch), Evaluate.__call__
+
+    def fill(self, agent, progress):
+        call(self, agent, progress)
+        disk.full = progress.step >= 50
+
+    monkeypatch.setattr(Evaluate, "__call__", fill)
+    out = tmp_path / "run"
+    assert train(out, "--seed", "3", "--evaluate-every", "40", "--backend", "gymnasium", steps=250) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert all(line.startswith("warning: ") for line in lines)
+    said = lines[-1].removeprefix("warning: ")
+    assert said.startswith("not written (No space left on device): ")
+    for name in ("checkpoints", "evaluations.csv", "episodes.csv", "agent.safetensors"):
+        assert str(out / name) in said
+    assert [row["step"] for row in rows(out / "evaluations.csv")] == ["40"]
+    assert not (out / "agent.safetensors").exists()
+    assert rejeu.load(out / "best.safetensors").num_timesteps == 40
+
+
+def test_check_leaves_out_what_only_the_authors_of_a_package_can_change(capsys):
+    assert main(["check", "CartPole-v1"]) == 0
+    text = capsys.readouterr().out
+    assert text.splitlines()[0] == "CartPole-v1: no errors, no warnings"
+    assert re.search(r"\d+ warnings? on what only the authors of gymnasium can change; --all shows it", text)
+    assert main(["check", "CartPole-v1", "--all"]) == 0
+    assert "warning: gymnasium.utils.env_checker" in capsys.readouterr().out
+
+
+def test_a_warning_is_one_line_on_the_command_line(capsys):
+    argv = ["train", "Pendulum-v1", "--algo", "TD3", "--steps", "1"]
+    with pytest.MonkeyPatch.context() as patch:
+        warn = lambda out: warnings.warn("\x1b[33mWARN: one\n  two\x1b[0m", UserWarning, stacklevel=1)  # noqa: E731
+        patch.setattr("rejeu.lab.cli.train.check_free", warn)
+        patch.setattr("rejeu.lab.cli.environment.from_arguments", lambda *_: (_ for _ in ()).throw(ValueError("over")))
+        with warnings.catch_warnings():
+            warnings.simplefilter("always")
+            assert main(argv) == 2
+    assert re.fullmatch(r"warning: one two\nrejeu: error: over \(.*\)\n", capsys.readouterr().err)
 
 
 def test_report_replays_the_episodes_that_record_and_watch_show(run, tmp_path):

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
 import pytest
 
 import rejeu
@@ -54,6 +55,31 @@ def test_a_clone_is_a_run_that_is_evaluated_and_trained_on(shown, tmp_path, caps
     assert printed(capsys, "evaluate", out, "--episodes", 2)["env_id"] == "CartPole-v1"
     resumed = printed(capsys, "resume", out, "--steps", 64, "--no-report", "--no-video")
     assert resumed["steps"] == 64
+
+
+@exhaustive
+def test_critics_learn_after_cloning_and_training_goes_on(shown, tmp_path, capsys):
+    actors, steps = [], []
+    for n in (0, 3):
+        out = tmp_path / str(n)
+        how = ["--algo", "SAC", "--updates", 5, "--critic-updates", n, "--seed", 0, "--out", out]
+        printed(capsys, "clone", shown, *how, *FEWER_FILES, "--set", *TINY, f"demonstrations={shown}")
+        agent = rejeu.SAC.load(out / "agent.safetensors")
+        state = agent.learner.state(agent.run.state)
+        actors, steps = [*actors, state.actor], [*steps, int(state.n_updates)]
+    assert eqx.tree_equal(*actors)
+    assert steps == [0, 3]
+    assert printed(capsys, "resume", out, "--steps", 110, "--no-report", "--no-video")["steps"] == 110
+
+
+@exhaustive
+def test_an_expert_labels_what_the_clone_does(shown, tmp_path, capsys):
+    expert = rejeu.PPO("MlpPolicy", "CartPole-v1", seed=0).save(tmp_path / "expert")
+    how = ["--algo", "PPO", "--updates", 5, "--seed", 0, "--expert", expert, "--rounds", 2, "--round-steps", 30]
+    assert main([*map(str, ["clone", shown, *how, "--out", tmp_path / "clone", *FEWER_FILES, "--set", *TINY])]) == 0
+    text = capsys.readouterr().out
+    assert [text.count(f"round  {i} ") for i in range(4)] == [1, 1, 1, 0]
+    assert "; the demonstrations have " in text
 
 
 def test_what_does_not_fit_is_one_line(shown, tmp_path, capsys):

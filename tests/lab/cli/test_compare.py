@@ -77,6 +77,18 @@ def test_runs_lists_every_run(runs, capsys, monkeypatch):
     assert [len(row["curve"]) for row in content["runs"]] == [40] * 7
 
 
+def test_runs_are_whole_lines_in_a_pipe(runs, capsys):
+    write_run(runs / ("long" * 30), steps=1000)
+    config = runs / "PPO_0" / "config.json"
+    config.write_text(config.read_text(encoding="utf-8").replace("1000", "5000"), encoding="utf-8")
+    (runs / "DQN_0" / "evaluations.csv").unlink()
+    assert cli.main(["runs", str(runs)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert sum("long" * 30 in line and "finished" in line for line in lines) == 1
+    assert any("PPO_0" in line and "1,000 of 5,000 (20%)" in line and "interrupted" in line for line in lines)
+    assert any("DQN_0" in line and " in training" in line for line in lines)
+
+
 @pytest.mark.skipif(os.name == "nt", reason="Windows allows no such name")
 def test_names_cannot_control_the_terminal(runs, capsys):
     write_run(runs / "a\x1b[2J\nb")

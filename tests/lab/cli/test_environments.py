@@ -2,17 +2,26 @@
 
 from __future__ import annotations
 
+import dataclasses
+import io
 import json
 import os
+import random
 import shlex
 import shutil
 import sys
 
 import gymnasium as gym
+import numpy as np
 import pytest
 
 import rejeu
-from rejeu.lab.cli import main
+from rejeu.core.errors import WorkerError
+from rejeu.lab.cli import check, environment, main
+from rejeu.lab.cli.commands import Train
+from rejeu.lab.cli.environment import Environment
+from rejeu.lab.experiments.work import Job, again
+from rejeu.lab.runs.config import RunConfig
 from rejeu.logs.formatting import quoted
 from tests.lab.cli.test_cli import FEWER_FILES, TINY, error_of
 
@@ -88,6 +97,17 @@ def test_the_command_that_train_prints_works_for_an_environment_of_ones_own(name
     assert rejeu.load(f"{out}/agent").num_timesteps == 80
 
 
+def test_commands_to_type_name_what_was_imported():
+    made = Environment("CartPole-v1", RunConfig(env="CartPole-v1", imports=("awac.py",)))
+    assert made.run.again() == " --import awac.py"
+    run = RunConfig(env="my_env.py", seed=0, env_kwargs={"g": 9.8}, wrappers=("my_env:Double",))
+    typed = dataclasses.replace(run, imports=("awac.py",))
+    assert (
+        again([Job(name="seed_0", run=run)], typed)
+        == " --env my_env.py --env-kwargs g=9.8 --wrapper my_env:Double --import awac.py"
+    )
+
+
 def test_a_file_in_a_folder_with_py_in_its_name_and_one_that_registers_a_class(here):
     folder = here / "my.pyproject"
     folder.mkdir()
@@ -111,6 +131,22 @@ def test_a_file_in_a_folder_with_py_in_its_name_and_one_that_registers_a_class(h
 def test_a_file_that_cannot_be_imported_is_one_line(source, message, here, capsys):
     (here / "drift_env.py").write_text(source)
     assert message in error_of(capsys, "check", "drift_env.py")
+
+
+def test_a_step_of_four_values_is_explained(here, capsys):
+    (here / "drift_env.py").write_text(SOURCE.replace("self.gain, False, False, {}", "self.gain, False, {}"))
+    assert "; step must return observation, reward, terminated, truncated and info" in error_of(
+        capsys, "check", "drift_env.py"
+    )
+
+
+def test_a_traceback_from_a_worker_process_keeps_its_lines(monkeypatch, capsys):
+    def fail(arguments):
+        raise WorkerError("environment 0 failed in a worker process:\nTraceback\n  line 3")
+
+    monkeypatch.setattr("rejeu.lab.cli.list.run_list", fail)
+    assert main(["list"]) == 2
+    assert "process:\nTraceback\n  line 3 (" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("problem", ["raise ValueError('no gain')", "return int('no gain')"])
@@ -147,6 +183,14 @@ def test_keyword_arguments_and_wrappers_are_used_while_training_and_named_in_the
 def test_check_takes_a_file_and_keyword_arguments(here, capsys):
     assert main(["check", "drift_env.py", "--env-kwargs", "gain=high"]) == 1
     assert "reward 'high' of type str" in capsys.readouterr().out
+
+
+def test_modules_are_found_in_the_current_folder(here, monkeypatch, capsys):
+    monkeypatch.setattr(
+        sys, "path", [path for path in sys.path if path not in ("", str(here))]
+    )  # as of a console script
+    assert main(["check", "drift_env:Drift-v0"]) == 0
+    assert "Drift-v0: no errors" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -223,6 +267,14 @@ def test_a_run_folder_imports_nothing_and_says_what_to_type(lie, registered_run,
     assert "evil_env" not in sys.modules
 
 
+def test_output_to_a_pipe_whose_encoding_lacks_a_character(registered_run, monkeypatch):
+    pipe = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
+    monkeypatch.setattr(sys, "stdout", pipe)
+    assert main(["evaluate", str(registered_run), "--episodes", "1"]) == 0
+    pipe.flush()
+    assert b" ? " in pipe.buffer.getvalue()
+
+
 def test_a_folder_of_runs_names_the_newest_inside(registered_run, tmp_path, capsys):
     for name, time in (("a", 2.0), ("newest", 3.0), ("z", 1.0)):
         (tmp_path / name).mkdir()
@@ -265,3 +317,14 @@ def test_check_finds_all_errors_and_train_refuses_with_the_same_lines(arguments,
     assert main(["train", f"{name}.py", "--steps", "10", "--out", "run"]) == 2
     assert capsys.readouterr().err.splitlines()[: len(lines)] == lines
     assert not (here / "run").exists()
+
+
+def test_the_check_before_training_draws_no_random_numbers_of_others(here):
+    drawing = SOURCE.replace("self.x = 0.0", "self.x = 0.0 * np.random.random()")
+    (here / "drift_env.py").write_text(drawing, encoding="utf-8")
+    made = environment.from_arguments("drift_env.py", Train(env="drift_env.py"))
+    random.seed(1)
+    np.random.seed(1)  # noqa: NPY002
+    expected = random.getstate(), np.random.get_state()[1].tolist()  # noqa: NPY002
+    check.before_training(made)
+    assert (random.getstate(), np.random.get_state()[1].tolist()) == expected  # noqa: NPY002

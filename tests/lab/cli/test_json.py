@@ -13,6 +13,7 @@ from types import SimpleNamespace
 import gymnasium as gym
 import pytest
 
+from rejeu.agents import presets
 from rejeu.core.interrupt import Stopped
 from rejeu.lab import cli
 from rejeu.lab.cli import main, runs
@@ -114,6 +115,42 @@ def test_evaluate_prints_the_statistics_and_every_episode(run, capsys):
     assert sum(result["returns"]) / 3 == pytest.approx(result["mean_return"])
     assert len(result["lengths"]) == len(result["successes"]) == result["episodes"] == 3
     assert "3 episodes" in messages
+
+
+def test_record_prints_the_path(run, capsys, tmp_path):
+    pytest.importorskip("imageio_ffmpeg")
+    argv = ["record", str(run), "--out", str(tmp_path / "v.mp4"), "--episodes", "1", "--seed", "0"]
+    result, _ = document(capsys, *argv)
+    assert result.keys() == documented_keys("record")
+    assert result["video"] == str(tmp_path / "v.mp4")
+    assert (tmp_path / "v.mp4").stat().st_size
+
+
+def test_list_prints_algorithms_and_presets(capsys):
+    result, messages = document(capsys, "list")
+    assert result.keys() == documented_keys("list")
+    assert "SAC" in result["algorithms"]
+    (parking,) = [one for one in result["presets"] if (one["env_id"], one["algorithm"]) == ("parking-v0", "SAC")]
+    known, preset = presets.find_result("parking-v0", "SAC"), presets.find("parking-v0", "SAC")
+    shown = {key: parking["result"][key] for key in ("measure", "mean", "low", "high", "seeds")}
+    assert shown == {key: getattr(known, key) for key in shown}
+    for key in ("n_envs", "total_steps", "evaluate_every", "evaluate_episodes"):
+        assert parking[key] == getattr(preset, key)
+    assert messages == ""
+
+
+def test_check_prints_its_findings_and_nothing_of_the_environment(capsys):
+    result, messages = document(capsys, "check", "rejeu-test/NoInfo-v0", status=1)
+    assert result.keys() == documented_keys("check")
+    assert result["errors"] == len([one for one in result["findings"] if one["level"] == "error"]) > 0
+    assert "a line of the environment" in messages
+
+
+def test_an_error_leaves_standard_output_empty(capsys):
+    assert main(["evaluate", "no-such-run", "--json"]) == 2
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert re.fullmatch(r"rejeu: error: [^\n]+\n", printed.err)
 
 
 def test_every_command_that_prints_a_result_is_documented_with_its_option():

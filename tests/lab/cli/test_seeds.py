@@ -11,7 +11,7 @@ import pytest
 from rejeu.lab import cli
 from rejeu.lab.cli import sweep
 from rejeu.lab.cli.commands import Train
-from rejeu.lab.experiments import process
+from rejeu.lab.experiments import process, scheduler
 from rejeu.lab.runs.config import RunConfig
 from tests.lab.reporting.test_comparison import write_run
 
@@ -49,6 +49,15 @@ def test_a_seed_that_fails_keeps_its_log_and_does_not_stop_the_others(tmp_path, 
     assert sorted(folders) == [f"seed_{seed}" for seed in range(4)]
     for seed in range(4):
         assert (out / f"seed_{seed}.log").read_text(encoding="utf-8").strip() == f"the seed is {seed}"
+
+
+def test_result_as_json(tmp_path, other_program, capsys):
+    assert (
+        cli.main(["train", "CartPole-v1", "--seeds", "2", "--seed", "2", "--json", "--out", str(tmp_path / "a")]) == 0
+    )
+    content = json.loads(capsys.readouterr().out)
+    assert [(row["seed"], row["exit_status"]) for row in content["runs"]] == [(2, 0), (3, 0)]
+    assert content["comparison"][0]["runs"] == 2
 
 
 def test_options_are_passed_on():
@@ -95,6 +104,21 @@ def test_a_mistake_is_found_before_anything_starts(tmp_path, capsys):
         assert cli.main(["train", "CartPole-v1", "--seeds", "2", option, "typo", "--out", str(out)]) == 2
         assert message in capsys.readouterr().err
         assert not out.exists()
+
+
+def test_a_seed_that_cannot_be_started_is_left_and_said(tmp_path, monkeypatch, other_program, capsys):
+    start = process.LocalLauncher.start
+
+    def full(self, task, log, lock):
+        if "seed_1" in log.name:
+            raise OSError(28, "No space left on device")
+        return start(self, task, log, lock)
+
+    monkeypatch.setattr(process.LocalLauncher, "start", full)
+    out = tmp_path / "out"
+    monkeypatch.setattr(scheduler, "POLL", 0.03)
+    assert cli.main(["train", "CartPole-v1", "--seeds", "2", "--seed", "1", "--out", str(out)]) == 1
+    assert "seed 1 could not be started: [Errno 28] No space left on device" in capsys.readouterr().out
 
 
 @pytest.mark.exhaustive  # starts three processes that train, half a minute

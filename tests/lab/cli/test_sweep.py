@@ -82,6 +82,13 @@ def test_a_supervised_process_stops_when_its_input_ends(child):
     assert process.wait(10) == 143
 
 
+def test_a_mistake_in_the_plan(tmp_path, capsys):
+    path = write_plan(tmp_path, 0)
+    assert cli.main(["sweep", str(path), "--out", str(tmp_path / "out")]) == 2
+    assert capsys.readouterr().err == f"rejeu: error: {path}: steps=0: expected `int` >= 1\n"
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.exhaustive  # trains in four processes
 def test_a_sweep_is_trained_compared_and_not_repeated(tmp_path, capsys):
     path, out = write_plan(tmp_path, 300), tmp_path / "out"

@@ -1,15 +1,19 @@
 """``rejeu tune`` and ``rejeu resume`` of a study: output, exit status, and mistakes in one line."""
 
 import json
+import re
 import subprocess
 import sys
 
 import pytest
 
 from rejeu.lab import cli
-from rejeu.lab.experiments import process, sweep
+from rejeu.lab.cli import environment, tune as tune_command
+from rejeu.lab.experiments import process, study as studies, study_plan, sweep, tune as tuning
+from rejeu.lab.runs.config import RunConfig
 from tests.lab.experiments.fake_training import Pretended
 
+optuna = pytest.importorskip("optuna")
 SMALL = ["--steps", "40", "--evaluate-every", "10", "--only", "learning_rate", "--search", "learning_rate=1e-5..4e-3"]
 
 
@@ -34,6 +38,14 @@ def test_a_study_from_the_command_line(pretend, tmp_path, capsys):
     assert f"preset        {tmp_path / 'study' / 'preset.json'}" in printed
 
 
+def test_the_final_comparison_is_announced_with_its_length(tmp_path):
+    study = studies.open_study(studies.StudyFolder(tmp_path), study_plan.make("Pendulum-v1", "SAC", steps=40, trials=2))
+    found = "\n".join(tune_command.header(study, environment.Environment("Pendulum-v1", RunConfig(env="Pendulum-v1"))))
+    assert "at the end    the best trial and the default: 5 fresh seeds each, 10 trainings of 40 steps\n" in found
+    ended = studies.Trial(0, "complete", 1.0, {}, {}, 60.0, "")
+    assert tuning.announcement(study.plan, [ended] * 2, 2).endswith("10 trainings of 40 steps, about 5 min 0 s")
+
+
 def test_a_terminal_shows_the_trials_that_run(pretend, tmp_path, capsys, monkeypatch):
     from rich.console import Console
 
@@ -47,6 +59,47 @@ def test_a_terminal_shows_the_trials_that_run(pretend, tmp_path, capsys, monkeyp
     assert "1 of 2 trials have ended, best return" in printed
     assert "of 40 steps, return" in printed
     assert "trial   1  complete" in printed
+
+
+def test_result_as_json_and_continuation(pretend, tmp_path, capsys):
+    assert tune("--trials", "2", "--final-seeds", "0", "--json", out=tmp_path / "study") == 0
+    first = json.loads(capsys.readouterr().out)
+    assert [one["state"] for one in first["trials"]] == ["complete"] * 2
+    assert (first["complete"], first["signal"], first["verdict"]) == (True, None, None)
+    assert tune("--trials", "3", "--final-seeds", "0", "--json", out=tmp_path / "study") == 0
+    second = json.loads(capsys.readouterr().out)
+    assert second["trials"][:2] == first["trials"]
+    assert cli.main(["resume", str(tmp_path / "study"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == second
+
+
+def test_a_study_without_a_complete_trial_exits_with_2(pretend, tmp_path, capsys):
+    words = ["--trials", "2", "--search", "learning_rate=6e-3..1e-2"]
+    assert tune(*words, out=tmp_path / "study") == 2
+    printed = capsys.readouterr().out
+    assert "trials        2 failed" in printed
+    assert "best trial    none: no trial is complete" in printed
+    assert "the loss is NaN" in printed
+
+
+def test_a_study_of_which_a_trial_cannot_be_started_goes_on_later(pretend, tmp_path, monkeypatch, capsys):
+    words, start, n_started = ["--trials", "2", "--final-seeds", "0", "--workers", "1"], process.LocalLauncher.start, 0
+
+    def full(self, task, log, lock):
+        nonlocal n_started
+        n_started += 1
+        if n_started > 1:
+            raise OSError(28, "No space left on device")
+        return start(self, task, log, lock)
+
+    monkeypatch.setattr(process.LocalLauncher, "start", full)
+    assert tune(*words, out=tmp_path / "study") == 1
+    printed = capsys.readouterr().out
+    assert "trials        1 complete, 1 running" in printed
+    assert re.search(r"note +trial 0001, seed \d+ could not be started: \[Errno 28\] No space left on device", printed)
+    monkeypatch.setattr(process.LocalLauncher, "start", start)
+    assert tune(*words, out=tmp_path / "study") == 0
+    assert "trials        2 complete" in capsys.readouterr().out
 
 
 def test_folders_of_other_studies_are_one_line(pretend, tmp_path, capsys):

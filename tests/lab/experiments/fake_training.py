@@ -36,7 +36,6 @@ def train(task: dict, say: Callable[[str], object] = print) -> Iterator[None]:
     else:
         state = json.loads(max((path / "checkpoints").glob("run_*.safetensors")).read_text())
         preset = state["preset"]
-        state["rate"] = rate_of(task["changes"].get("learning_rate", state["rate"]))
     (path / "checkpoints").mkdir(parents=True, exist_ok=True)
     with (path.parent / "commands.txt").open("a") as file:
         print("train" if is_new else "resume", path.name, file=file)

@@ -82,6 +82,12 @@ def test_options_of_one_environment():
     assert own.jobs[0].run.env_kwargs == {"map_name": "4x4", "is_slippery": False}
 
 
+def test_a_setting_for_some_algorithms():
+    settings = {"a": {}, "b": {"algorithms": ["DQN"], "tau": 0.5}}
+    plan, _ = read_plan({"environments": ["CartPole-v1"], "algorithms": ["DQN", "PPO"], "settings": settings})
+    assert [(job.run.algorithm, job.setting) for job in plan.jobs] == [("DQN", "a"), ("DQN", "b"), ("PPO", "a")]
+
+
 MISTAKES = [
     (
         "learning_rate",
@@ -125,6 +131,21 @@ def test_a_mistake_is_one_line_with_its_place(tmp_path, old, new, place, problem
     assert message.startswith(f"{path}, {place}: " if place else f"{path}: ")
     assert problem in message
     assert "\n" not in message
+
+
+def test_a_mistake_at_the_end_of_a_plan_is_found_before_any_agent_is_built(monkeypatch):
+    monkeypatch.setattr(rejeu.agents.Agent, "build", lambda *_: pytest.fail("an agent was built"))
+    settings = {f"s{i}": {"learning_rate": 1e-4 * (i + 1)} for i in range(300)} | {"last": {"gama": 0.9}}
+    with pytest.raises(PlanError, match=r"^plan, settings\.last: DQN has no setting 'gama'"):
+        read_plan({"environments": ["CartPole-v1"], "algorithms": ["DQN"], "settings": settings})
+
+
+@pytest.mark.parametrize(
+    "content", [{}, {"environments": []}, {"environments": [1]}, {"environments": "CartPole-v1", "settings": {}}]
+)
+def test_a_plan_needs_environments(content):
+    with pytest.raises(PlanError):
+        read_plan(content)
 
 
 def test_sizes_are_limited(tmp_path):

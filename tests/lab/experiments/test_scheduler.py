@@ -5,6 +5,7 @@ import json
 from pathlib import Path
 
 import pytest
+from filelock import FileLock
 
 from rejeu.agents import AGENTS, SAC
 from rejeu.core.errors import CheckpointError
@@ -156,6 +157,14 @@ def test_a_run_that_is_lost_again_and_again_without_progress_fails(tmp_path):
     assert "without a new checkpoint" in lines[-1]
 
 
+def test_a_run_that_ends_without_a_result_fails_with_one_line(tmp_path):
+    folder, launcher = make_folder(tmp_path, 2), Launcher(results=False)
+    states, lines = work(folder, launcher)
+    assert states == {"job-0": "failed", "job-1": "failed"}
+    assert len(lines) == len(launcher.started) == 2
+    assert all("ended without a result" in line for line in lines)
+
+
 def test_a_stop_ends_all_runs_and_starts_no_more(tmp_path):
     folder, launcher, stop = make_folder(tmp_path), Launcher(ends={f"job-{i}": [None] for i in range(4)}), Interrupt()
 
@@ -181,6 +190,27 @@ def test_jobs_that_another_process_holds_are_left_to_it(tmp_path):
     assert states == {"job-0": "done", "job-1": "running", "job-2": "done", "job-3": "done"}
     claim.release()
     assert held.state() == "waiting"
+
+
+@pytest.mark.parametrize("where", ["start", "claimed"])
+def test_a_run_that_cannot_be_started_is_one_line_and_stops_no_other(tmp_path, monkeypatch, where):
+    folder, launcher = make_folder(tmp_path, 2), Launcher()
+
+    def full(*given):
+        if "job-0" in str(getattr(given[0], "name", given[0])):
+            raise OSError(28, "No space left on device")
+        return real(*given)
+
+    owner = launcher if where == "start" else scheduler
+    real = getattr(owner, where)
+    with monkeypatch.context() as patch:
+        patch.setattr(owner, where, full)
+        states, lines = work(folder, launcher)
+    assert states == {"job-0": "waiting", "job-1": "done"}  # left to a later process
+    assert lines[0] == "job-0 could not be started: [Errno 28] No space left on device"
+    assert folder.works()[0].exit_status() is None
+    states, _ = work(folder, launcher)
+    assert states == {"job-0": "done", "job-1": "done"}
 
 
 def test_a_full_disk_at_the_end_of_a_run_is_one_line(tmp_path, monkeypatch):
@@ -258,22 +288,19 @@ def test_code_that_the_command_line_names_again_is_trusted(tmp_path):
     assert (task.resume, task.folder) == (True, str(tmp_path))
 
 
-@pytest.mark.parametrize("where", ["start", "claimed"])
-def test_a_run_that_cannot_be_started_is_one_line_and_stops_no_other(tmp_path, monkeypatch, where):
-    folder, launcher = make_folder(tmp_path, 2), Launcher()
+def test_a_run_waits_for_a_process_that_still_ends(tmp_path):
+    folder, launcher = make_folder(tmp_path, 1), Launcher()
+    (work,) = folder.works()
+    orphan = FileLock(work.lock)  # of a process that outlived the one that started it
+    orphan.acquire()
+    looks = iter(range(100))
 
-    def full(*given):
-        if "job-0" in str(getattr(given[0], "name", given[0])):
-            raise OSError(28, "No space left on device")
-        return real(*given)
+    def watch():
+        if next(looks) == 6:
+            assert launcher.started == []
+            orphan.release()
 
-    owner = launcher if where == "start" else scheduler
-    real = getattr(owner, where)
-    with monkeypatch.context() as patch:
-        patch.setattr(owner, where, full)
-        states, lines = work(folder, launcher)
-    assert states == {"job-0": "waiting", "job-1": "done"}  # left to a later process
-    assert lines[0] == "job-0 could not be started: [Errno 28] No space left on device"
-    assert folder.works()[0].exit_status() is None
-    states, _ = work(folder, launcher)
-    assert states == {"job-0": "done", "job-1": "done"}
+    one = Scheduler(launcher, Interrupt())
+    one.add([work])
+    one.run(watch)
+    assert work.ending == "done"

@@ -57,6 +57,11 @@ def test_mistakes_are_explained(text, message):
     assert message in str(error.value)
 
 
+def test_a_dimension_of_a_file_is_the_one_that_was_written():
+    for name, dimension in SPACE.items():
+        assert space.from_json(name, space.to_json(dimension)) == dimension
+
+
 @pytest.mark.parametrize(
     "record",
     [
@@ -87,6 +92,10 @@ def test_values_survive_optuna():
     assert space.decoded(SPACE, params) == values
     for name, one in space.distributions(SPACE).items():
         assert one.to_external_repr(one.to_internal_repr(params[name])) == params[name]
+
+
+def test_values_outside_of_the_space_are_left_out():
+    assert space.encoded(SPACE, {"learning_rate": 1.0, "gamma": "lin_0.9", "policy_delay": 1.5, "tau": 0.1}) == {}
 
 
 def test_a_value_replaces_the_start_of_a_schedule():

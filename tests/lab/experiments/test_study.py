@@ -19,6 +19,7 @@ from rejeu.lab.experiments import process, search, study as studies, study_plan 
 from rejeu.lab.experiments.search import Search
 from rejeu.lab.experiments.study import StudyFolder
 from rejeu.lab.runs.config import RunConfig
+from rejeu.logs.tables import Table
 from tests.lab.experiments.fake_training import Pretended
 
 optuna = pytest.importorskip("optuna")
@@ -72,6 +73,20 @@ def commands(folder):
     return [line.split() for path in folder.rglob("commands.txt") for line in path.read_text().splitlines()]
 
 
+def test_a_study_finds_the_best_trial_and_writes_it_as_a_preset(tmp_path):
+    result = run(tuning.open_study(make_plan(), tmp_path / "study"))
+    assert result.complete
+    assert [one.index for one in result.trials] == [0, 1, 2, 3]
+    assert result.trials[0].values == {"learning_rate": 1e-3}  # that of rejeu's preset
+    assert result.best is result.trials[0]
+    assert result.preset.hyperparameters["learning_rate"] == 1e-3
+    assert result.preset.hyperparameters["policy_kwargs"] == {"net_arch": [64, 64]}  # of rejeu's preset
+    assert result.preset.total_steps == 40
+    assert "trial 0 of 4, mean return" in result.preset.source
+    assert not list(tmp_path.rglob("checkpoints"))
+    assert result.final.verdict == "the default itself"
+
+
 def test_a_study_with_one_worker_is_reproducible_and_another_seed_differs(whole, tmp_path):
     one, other = (
         run(tuning.open_study(make_plan(seed=seed, trials=trials, final_seeds=0), tmp_path / f"seed {seed}"))
@@ -112,6 +127,13 @@ def test_a_trial_whose_process_was_killed_is_entered_again_with_its_parameters(w
     assert facts(run(studies.open_study(StudyFolder(tmp_path / "study")))) == facts(whole)
 
 
+def test_a_killed_training_continues_and_the_study_is_the_same(whole, tmp_path, monkeypatch):
+    monkeypatch.setenv("KILLED_AT", "20")  # each training, once
+    result = run(tuning.open_study(make_plan(final_seeds=0), tmp_path / "study"))
+    assert facts(result) == facts(whole)
+    assert [word for word, _ in commands(tmp_path / "study")].count("resume") == 4
+
+
 def test_optuna_opens_the_journal(whole):
     """As its dashboard does."""
     path = str(whole.folder / "journal.log")
@@ -122,12 +144,36 @@ def test_optuna_opens_the_journal(whole):
     assert set(study.trials[0].intermediate_values) == {10, 20, 30, 40}
 
 
+def test_two_processes_share_the_trials_of_a_study(tmp_path):
+    one = tuning.open_study(make_plan(trials=3), tmp_path / "study")
+    two = studies.open_study(StudyFolder(tmp_path / "study"))
+    taken = [one.take(), two.take(), one.take(), two.take()]
+    assert [None if it is None else it[1] for it in taken] == [0, 1, 2, None]
+
+
+def test_several_trials_at_once(tmp_path):
+    result = run(tuning.open_study(make_plan(trials=6, final_seeds=0), tmp_path / "study"), workers=3)
+    assert [one.index for one in result.trials] == list(range(6))
+    assert result.complete
+
+
 def test_a_trial_is_the_mean_over_its_seeds(tmp_path):
     result = run(tuning.open_study(make_plan(trials=1, trial_seeds=3, final_seeds=0), tmp_path / "study"))
     runs = sorted((tmp_path / "study" / "trials" / "0000").glob("seed_*/config.json"))
     seeds = [json.loads(path.read_text())["seed"] for path in runs]
     assert len(seeds) == 3
     assert result.best.value == pytest.approx(1 + sum(seed % 7 for seed in seeds) / 300)
+
+
+def test_a_failed_trial_keeps_its_reason_and_does_not_stop_the_study(tmp_path):
+    rates = {"learning_rate": LogUniform(6e-3, 1e-2)}
+    result = run(tuning.open_study(make_plan(trials=3, search=rates, final_seeds=5), tmp_path / "study"))
+    assert [one.state for one in result.trials] == ["failed"] * 3
+    assert all(one.reason.endswith("failed with exit status 2: at step 20: the loss is NaN") for one in result.trials)
+    assert (result.best, result.final, result.preset) == (None, None, None)
+    again = run(studies.open_study(StudyFolder(tmp_path / "study")))
+    assert facts(again) == facts(result)
+    assert len(commands(tmp_path / "study")) == 3  # failed trials are not repeated
 
 
 def test_a_trial_below_the_median_is_pruned(tmp_path):
@@ -179,6 +225,11 @@ def test_difference_says_whether_zero_is_in_the_interval():
     value, low, high = search.difference([bad], [bad[::-1]], 0)
     assert low < 0 < high
     assert value == pytest.approx(0)
+
+
+def test_what_is_compared_at_the_end_is_the_last_evaluation_and_not_the_best():
+    table = Table({"step": np.arange(3.0), "mean_return": np.array([1.0, 5.0, 3.0])})
+    assert search.last_values([SimpleNamespace(evaluations=table)] * 2, "mean_return").tolist() == [3, 3]
 
 
 @pytest.mark.parametrize(
@@ -315,15 +366,27 @@ def test_processes_are_ended_if_the_search_ends_by_an_error(tmp_path):
     assert [one.poll() for one in begun] == [143]
 
 
-def test_a_study_finds_the_best_trial_and_writes_it_as_a_preset(tmp_path):
-    result = run(tuning.open_study(make_plan(), tmp_path / "study"))
-    assert result.complete
-    assert [one.index for one in result.trials] == [0, 1, 2, 3]
-    assert result.trials[0].values == {"learning_rate": 1e-3}  # that of rejeu's preset
-    assert result.best is result.trials[0]
-    assert result.preset.hyperparameters["learning_rate"] == 1e-3
-    assert result.preset.hyperparameters["policy_kwargs"] == {"net_arch": [64, 64]}  # of rejeu's preset
-    assert result.preset.total_steps == 40
-    assert "trial 0 of 4, mean return" in result.preset.source
-    assert not list(tmp_path.rglob("checkpoints"))
-    assert result.final.verdict == "the default itself"
+def test_a_study_with_fewer_final_seeds_than_are_compared_today_gets_more(tmp_path):
+    with pytest.raises(ValueError, match="final_seeds=4 cannot tell luck from a difference; give 5 or more"):
+        make_plan(final_seeds=4)
+    old = dataclasses.replace(make_plan(), final_seeds=3)  # of an earlier version
+    assert old.fresh_seeds() == make_plan().fresh_seeds()
+    assert dataclasses.replace(old, final_seeds=0).fresh_seeds() == []
+
+
+def test_trainings_of_the_final_comparison_that_were_stopped_have_not_ended(monkeypatch):
+    class Stopping:
+        def __init__(self, launcher, stop, say, waits):
+            self.say = say
+
+        def add(self, works):
+            pass
+
+        def run(self):
+            self.say("stopped")
+
+    said = []
+    monkeypatch.setattr(search, "Scheduler", Stopping)
+    tasks = [SimpleNamespace(name=one, ending=one, reason="") for one in ("done", "failed", "stopped", "stopped")]
+    search.train_final(tasks, 1, Interrupt(), said.append)
+    assert said == ["final comparison: 2 of 4 trainings have ended; stopped"]

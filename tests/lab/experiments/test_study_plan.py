@@ -5,7 +5,8 @@ import json
 
 import pytest
 
-from rejeu.algorithms.search import LogUniform
+from rejeu.agents import presets
+from rejeu.algorithms.search import Integers, LogUniform
 from rejeu.core.errors import CheckpointError
 from rejeu.core.records import json_text
 from rejeu.lab.experiments import study_plan as plans
@@ -18,6 +19,40 @@ def test_a_plan_takes_what_is_not_said_from_the_preset():
     assert (one.evaluate_every, one.evaluate_episodes) == (2_000, 20)
     values = {"learning_rate": 1e-3, "batch_size": 64, "policy_kwargs": {"net_arch": [64, 64]}}
     assert plan.fixed == one.hyperparameters == values
+
+
+def test_trials_count_successes_as_runs_of_the_preset_do():
+    plan = plans.make("Acrobot-v1", preset=presets.named("Rainbow", "Acrobot-v1"))
+    default = dataclasses.replace(plan.default, success_threshold=-90.0)
+    preset = dataclasses.replace(plan, default=default).preset({"gamma": 0.5}, "a test")
+    assert (preset.success_threshold, preset.name) == (-90.0, "")
+
+
+def test_without_a_preset_the_algorithm_is_named_and_its_defaults_are_compared_with():
+    with pytest.raises(ValueError, match="Blackjack-v1 has no preset; name the algorithm to tune, such as --algo PPO"):
+        plans.make("Blackjack-v1")
+    plan = plans.make("Blackjack-v1", "ppo")
+    default = plan.default
+    assert (default.algorithm, default.hyperparameters, default.total_steps) == ("PPO", {}, 100_000)
+
+
+def test_an_environment_in_jax_is_tuned_on_its_own_backend(tmp_path):
+    plan = plans.make("jax/CartPole-v1", "PPO")
+    assert plan.default.backend == "jax"
+    path = presets.write(plan.preset({}, "a test"), tmp_path / "preset.json")
+    assert presets.read(path).backend == "jax"
+
+
+def test_what_is_set_is_not_searched():
+    plan = plans.make("Pendulum-v1", fixed={"gamma": 0.9, "policy_kwargs": {"net_arch": [8]}})
+    assert not {"gamma", "policy_kwargs.net_arch"} & plan.space.keys()
+    assert plan.fixed["gamma"] == 0.9
+    plan = plans.make("CartPole-v1", "PPO", fixed={"policy_kwargs": {"net_arch": [8]}})
+    assert "policy_kwargs.activation_fn" in plan.space
+
+
+def test_hindsight_is_searched_where_it_is_used():
+    assert plans.make("parking-v0").search_space["replay_buffer_kwargs.n_sampled_goal"] == Integers(1, 5)
 
 
 @pytest.mark.parametrize(

@@ -80,6 +80,15 @@ def test_steps_to_the_threshold_are_the_median_of_the_runs(tmp_path):
     assert compare(tmp_path, threshold=15.0, samples=10).groups[0].reached == (1, math.inf)
 
 
+def test_curve_is_a_moving_mean_of_the_returns(tmp_path):
+    run = write_run(tmp_path / "run")
+    (group,) = compare([run], samples=10).groups
+    step = np.arange(10, 1001, 10)
+    returns = 10 * np.minimum(2 * step / 1000, 1)
+    for x, value in zip(group.x[2:], group.curve[0, 2:], strict=True):
+        assert value == pytest.approx(returns[(step > x - 50) & (step <= x)].mean())
+
+
 def test_final_score_by_evaluation_and_over_time(runs):
     comparison = compare(runs, score="evaluation", samples=50)
     np.testing.assert_allclose(comparison.groups[0].scores[0], [11, 12, 13, 14, 15])
@@ -111,6 +120,13 @@ def test_different_budgets_are_cut_to_the_shortest_and_runs_without_an_evaluatio
     assert "a has no evaluation within what is compared and is left out" in comparison.notes
 
 
+def test_absurd_returns_are_damage(tmp_path):
+    folder = write_run(tmp_path / "run")
+    with (folder / "episodes.csv").open("a", encoding="utf-8") as file:
+        file.write("1000,0,1e200,10,nan,10\n")
+    assert compare(folder, samples=10).groups[0].score[0] == 10
+
+
 def test_time_that_was_set_back_is_sorted(tmp_path):
     folder = write_run(tmp_path / "run", steps=40)
     rows = ["step,env,return,length,success,seconds", "10,0,1,10,,3", "20,0,2,10,,1", "30,0,3,10,,2", "40,0,4,10,,10"]
@@ -136,6 +152,43 @@ def test_groups_by_the_settings_that_differ_within_an_algorithm_and_a_note_where
         "DQN: the runs of this group differ in their settings; --by setting separates them",
         "intervals of few runs are too narrow: those of 3 runs contain the true score in 75 % of cases, not in 95 %",
     )
+
+
+def test_settings_that_differ_between_environments_are_no_groups_by_default(tmp_path):
+    for env, gamma in (("A-v0", 0.9), ("B-v0", 0.99)):
+        write_run(tmp_path / env, env=env, hyperparameters={"gamma": gamma})
+    assert compare(tmp_path, samples=10).by == "env"
+    write_run(tmp_path / "more", env="B-v0", hyperparameters={"gamma": 0.9})
+    assert compare(tmp_path, samples=10).by == "setting"
+
+
+def test_settings_whose_labels_begin_alike_are_different_groups(tmp_path):
+    for i, last in enumerate((0.1, 0.2)):
+        noise = {"noise": "normal", "mean": [0.0] * 100, "sigma": [0.0] * 100 + [last]}
+        write_run(tmp_path / str(i), seed=i, hyperparameters={"action_noise": noise}, env_kwargs={"x": [0] * 90 + [i]})
+    comparison = compare(tmp_path, "setting", samples=10)
+    assert len({group.label for group in comparison.groups}) == 2
+    assert len({group.env_id for group in comparison.groups}) == 2
+    assert max(len(group.label) for group in comparison.groups) < 220
+
+
+def test_runs_of_the_same_seed_get_a_note(tmp_path):
+    for i, (algorithm, seed) in enumerate((("DQN", 0), ("DQN", 0), ("PPO", 0), ("PPO", 1))):
+        write_run(tmp_path / str(i), algorithm, seed=seed)
+    note = "DQN: runs of this group have the same seed; they count as several, but are not independent"
+    assert compare(tmp_path, samples=10).notes[0] == note
+    others = compare([tmp_path / "1", tmp_path / "2"], "env", samples=10)  # of two algorithms
+    assert len(others.groups[0].runs) == 2
+    assert not any("same seed" in one for one in others.notes)
+
+
+def test_runs_of_the_same_name_get_that_of_the_folder_above(tmp_path):
+    for parent in ("a", "b"):
+        write_run(tmp_path / parent / "seed_0")
+    (tmp_path / "b" / "seed_0" / "episodes.csv").unlink()
+    comparison = compare(tmp_path, samples=10)
+    assert "b/seed_0 has no episode yet and is left out" in comparison.notes
+    assert comparison.groups[0].runs[0].name == "a/seed_0"
 
 
 def test_several_environments_are_not_averaged_unless_normalized(tmp_path):
@@ -179,6 +232,16 @@ def test_groups_of_different_environments_are_not_compared(tmp_path):
     )
 
 
+def test_runs_without_episodes_are_left_out(runs):
+    folder = write_run(runs / "crashed", seed=9)
+    (folder / "episodes.csv").unlink()
+    comparison = compare(runs, samples=10)
+    assert comparison.notes[0] == "crashed has no episode yet and is left out"
+    assert sum(len(group.runs) for group in comparison.groups) == 10
+    with pytest.raises(ValueError, match="there is nothing to compare; crashed has no episode yet"):
+        compare(folder)
+
+
 @pytest.mark.parametrize("score", ["training", "evaluation"])
 def test_offline_runs_are_compared_by_their_evaluations(tmp_path, score):
     for seed in range(2):
@@ -186,6 +249,18 @@ def test_offline_runs_are_compared_by_their_evaluations(tmp_path, score):
         (folder / "episodes.csv").unlink()
     (group,) = compare(tmp_path, score=score, samples=10).groups
     assert group.scores[0].tolist() == [1.0, 2.0]
+
+
+def test_run_in_progress_is_compared_by_its_means(tmp_path):
+    folder = write_run(tmp_path / "run")
+    (folder / "episodes.csv").unlink()
+    (folder / "metrics.csv").write_text("step,rollout/ep_rew_mean,time/seconds\n500,3,1\n1000,5,2\n", encoding="utf-8")
+    comparison = compare(folder, samples=10)
+    assert comparison.groups[0].score[0] == 5.0
+    assert (
+        comparison.notes[0]
+        == "1 of 1 runs have no episodes on disk; the logged means of their latest episodes are used"
+    )
 
 
 def test_outputs(runs, tmp_path):

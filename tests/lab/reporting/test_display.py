@@ -6,16 +6,18 @@ import builtins
 import math
 from types import SimpleNamespace
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from IPython.core.displaypub import CapturingDisplayPublisher
 from IPython.core.interactiveshell import InteractiveShell
 
 import rejeu
-from rejeu.callbacks import ProgressBar
+from rejeu.callbacks import ProgressBar, progress_bar
 from rejeu.logs.evaluation import Evaluation
 from rejeu.logs.history import History
 from rejeu.logs.logging import CsvFile
+from rejeu.sb3.common.vec_env import DummyVecEnv, VecNormalize
 from rejeu.training.run import Episode, Progress
 
 pytestmark = pytest.mark.usefixtures("learners_are_shared")
@@ -67,6 +69,27 @@ def test_the_progress_bar_is_one_output_that_stays_in_the_notebook(notebook, mon
     assert "return -3.00" in text
 
 
+def test_the_progress_bar_sends_few_messages_in_a_second(notebook):
+    rejeu.PPO("MlpPolicy", "CartPole-v1", n_steps=64, policy_kwargs={"net_arch": [8]}, seed=0).learn(
+        256, progress_bar=True
+    )
+    assert "256/256 steps" in notebook.shown()[0]
+    assert len(notebook.outputs) < 60
+
+
+def test_a_command_in_a_cell_prints_lines_though_the_notebook_forces_colors(monkeypatch, capsys):
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.setattr(progress_bar, "LINE_SECONDS", 0.0)
+    agent = SimpleNamespace(n_envs=1, ep_info_buffer=[], ep_success_buffer=[], seconds=SECONDS)
+    bar = ProgressBar(2, None)
+    for step in (1, 2):
+        bar(agent, Progress(step, [], None))
+    bar.close()
+    text = capsys.readouterr().out
+    assert [line[:4] for line in text.splitlines()] == [" 50%", "100%"]
+    assert "\x1b" not in text
+
+
 def test_verbose_training_keeps_one_table_up_to_date(notebook, tmp_path, capsys):
     agent = rejeu.PPO("MlpPolicy", "CartPole-v1", n_steps=64, policy_kwargs={"net_arch": [8]}, seed=0, verbose=1)
     rows = CsvFile(tmp_path / "metrics.csv")
@@ -77,6 +100,14 @@ def test_verbose_training_keeps_one_table_up_to_date(notebook, tmp_path, capsys)
     (table,) = notebook.shown()
     assert table.startswith(f"step {int(steps[-1]):,}")
     assert capsys.readouterr().out == ""
+
+
+def test_a_configured_logger_prints_every_row(capsys):
+    logger = rejeu.logs.logging.configure(format_strings=["stdout"])
+    for step in range(3):
+        logger.record("train/loss", 0.5)
+        logger.dump(step)
+    assert capsys.readouterr().out.count("step ") == 3
 
 
 def test_an_evaluation_shows_its_numbers():
@@ -105,6 +136,13 @@ def test_a_history_shows_a_summary():
         "<History: 1 episode in 9 steps; mean of the last 1: return -1.00, length 9.0>"
     )
     assert repr(History()) == "<History: no episodes>"
+
+
+def test_vector_environments_show_what_they_step():
+    assert repr(rejeu.make_vector("Pendulum-v1", 2, "gymnasium")) == "<InProcess: 2 x Pendulum-v1, backend 'gymnasium'>"
+    inside = DummyVecEnv([lambda: gym.make("CartPole-v1")] * 2)
+    assert repr(inside).startswith("<DummyVecEnv: 2 environments, observations Box(")
+    assert repr(VecNormalize(inside)).endswith("actions Discrete(2)>")
 
 
 def test_what_is_stored_is_counted(tmp_path):

@@ -1,6 +1,7 @@
 """Runs of Stable-Baselines3 and TensorBoard; the recorded files are those of real runs (golden/record_monitor.py)."""
 
 import csv
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +32,21 @@ def test_recorded_monitor_files_are_one_run_of_two_environments():
     assert (np.diff(run.episodes.step) > 0).all()
 
 
+def test_single_monitor_file():
+    run = run_list.read(ZOO / "0.monitor.csv")
+    expected = rows(ZOO / "0.monitor.csv")
+    np.testing.assert_array_equal(run.episodes.step, np.cumsum([row["l"] for row in expected]))
+    np.testing.assert_array_equal(run.episodes.seconds, [row["t"] for row in expected])
+
+
+def test_the_clocks_of_several_files_begin_with_the_first(tmp_path):
+    for i, (start, row) in enumerate([(100.0, "1,5,30"), (120.0, "2,5,15")]):
+        head = f'#{{"t_start": {start}, "env_id": "CartPole-v1"}}'
+        (tmp_path / f"{i}.monitor.csv").write_text(f"{head}\nr,l,t\n{row}\n", encoding="utf-8")
+    episodes = read_monitor(tmp_path).episodes
+    assert (episodes.seconds.tolist(), episodes.returns.tolist()) == ([30, 35], [1, 2])
+
+
 def test_hostile_monitor_file(tmp_path):
     path = tmp_path / "monitor.csv"
     path.write_bytes(b'#{"t_start": "now", "env_id": ["<b>"]}\nr,l,t\n1e999,5,1\nx,-3,nan\n2,1e300,3\n3,4,4\n5,')
@@ -52,6 +68,13 @@ def test_tensorboard_files():
     assert np.isfinite(run.metrics.column("rollout/ep_rew_mean")).all()
     (group,) = compare(run, x="time", samples=10).groups
     assert group.x[-1] == run.seconds > 0
+
+
+def test_tensorboard_files_without_the_package_are_left_out(monkeypatch):
+    monkeypatch.setitem(sys.modules, "tensorboard.backend.event_processing.event_file_loader", None)
+    runs, notes = run_list.read_all([ZOO, RECORDED / "tb"])
+    assert [run.format for run in runs] == ["monitor"]
+    assert "PPO_1 is left out: reading TensorBoard files needs" in notes[0]
 
 
 def test_damaged_tensorboard_file(tmp_path):

@@ -30,6 +30,12 @@ def test_one_coordinate_is_drawn_against_steps(shape):
     assert walls == {-20, 20}
 
 
+def test_infinite_bounds_are_not_drawn():
+    (panel,) = plots.trajectory(random_course(2), low=-np.inf, high=np.inf).axes
+    assert not panel.patches
+    assert np.isfinite(panel.get_xlim()).all()
+
+
 def test_the_ball_draws_its_own_trajectory_where_it_left_included(tmp_path):
     ball = Ball(3, sigma=0.0)
     ball.reset(seed=0)

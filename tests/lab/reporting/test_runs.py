@@ -46,6 +46,13 @@ def folder(tmp_path):
     return path
 
 
+def aged(folder):
+    """Makes the files of a folder look an hour old."""
+    for path in folder.iterdir():
+        os.utime(path, (path.stat().st_mtime - 3600,) * 2)
+    return folder
+
+
 def test_complete_run(folder):
     run = read_run(folder)
     assert (run.name, run.algorithm, run.env_id, run.seed, run.n_envs) == ("run", "DQN", "CartPole-v1", 3, 2)
@@ -56,6 +63,16 @@ def test_complete_run(folder):
     np.testing.assert_array_equal(run.evaluations.column("mean_return"), [25.0])
     assert run.versions == {"python": "3.11.7"}
     assert run.notes == ()
+
+
+def test_changed_hyperparameters_and_command(folder):
+    run = read_run(folder)
+    assert run.changed == {"gamma": (0.9, 0.99), "policy_kwargs.net_arch": ([64, 64], None)}
+    assert run.command == (
+        "rejeu train CartPole-v1 --env-kwargs sutton_barto_reward=true --algo DQN --steps 100 --envs 2 "
+        "--backend gymnasium --seed 3 --evaluate-every 50 --evaluate-episodes 5 --set gamma=0.9 batch_size=32 "
+        "'policy_kwargs.net_arch=[64, 64]'"
+    )  # the default batch_size too, since the preset has another
 
 
 def test_command_has_wrappers_nulls_and_long_values(folder):
@@ -97,6 +114,13 @@ def test_a_run_of_minutes_is_finished_when_nearly_all_of_them_are_over(folder):
         assert read_run(folder).state == state
 
 
+def test_interrupted_and_crashed_run(folder):
+    (folder / "config.json").write_text(json.dumps({**CONFIG, "steps": 500}), encoding="utf-8")
+    assert read_run(folder).state == "interrupted"
+    (folder / "agent.safetensors").unlink()
+    assert read_run(aged(folder)).state == "crashed"
+
+
 def test_steps_without_an_episode_are_those_of_the_newest_checkpoint(folder):
     for name in ("episodes", "evaluations", "metrics"):
         (folder / f"{name}.csv").write_bytes(b"step\n")
@@ -111,6 +135,15 @@ def test_running_run_by_its_lock(folder):
     with FileLock(folder / "checkpoints" / "lock"):
         assert read_run(folder).state == "running"
     assert read_run(folder).state == "finished"
+
+
+def test_crash_before_the_first_row(folder):
+    for name in ("episodes.csv", "evaluations.csv", "agent.safetensors"):
+        (folder / name).unlink()
+    (folder / "metrics.csv").write_bytes(b"")
+    run = read_run(aged(folder))
+    assert (run.state, run.steps, len(run.episodes), len(run.metrics)) == ("crashed", 0, 0, 0)
+    assert run.notes == ("there is no episodes.csv", "metrics.csv is empty", "there is no evaluations.csv")
 
 
 def test_truncated_and_damaged_rows_are_left_out(folder):
@@ -180,6 +213,13 @@ def test_named_pipe_does_not_block(folder):
     (folder / "metrics.csv").unlink()
     os.mkfifo(folder / "metrics.csv")
     assert "metrics.csv cannot be read: metrics.csv is not a regular file" in read_run(folder).notes
+
+
+def test_folder_without_a_run(tmp_path):
+    with pytest.raises(FileNotFoundError, match="is no run folder"):
+        read_run(tmp_path)
+    with pytest.raises(FileNotFoundError, match="there is no run folder"):
+        read_run(tmp_path / "none")
 
 
 def test_the_defaults_of_every_algorithm_are_known():

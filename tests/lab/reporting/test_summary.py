@@ -55,6 +55,22 @@ def test_each_network_is_named_with_its_number_of_parameters_but_no_target():
     assert n_parameters(learner.critics) == 2 * critic
 
 
+def test_layers_add_up_to_their_network():
+    rows = rows_of(describe(*state(SHAPE)))
+    counts = [int(row[-1].replace(",", "")) for row in rows]
+    begins = [i for i, row in enumerate(rows) if len(row) == 2]
+    for begin, end in zip(begins, [*begins[1:], len(rows)], strict=True):
+        assert counts[begin] == sum(counts[begin + 1 : end])
+
+
+def test_the_parts_of_a_nested_observation_are_listed():
+    space = spaces.Dict(camera=spaces.Box(0, 255, (36, 36, 4), np.uint8), gear=spaces.Discrete(5))
+    assert describe(*state(PolicyConfig(), space)).split("\n\n")[-1].split("\n") == [
+        "observation camera: image (36, 36, 4)",
+        "observation gear: categorical ()",
+    ]
+
+
 def test_an_agent_shows_its_layers_as_model_files_name_them():
     agent = rejeu.SAC("MlpPolicy", "Pendulum-v1", policy_kwargs={"net_arch": [8]}, seed=0)
     assert agent.summary().split("\n") == [

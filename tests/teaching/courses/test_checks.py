@@ -1,5 +1,7 @@
 """The checks accept right answers, and name the mistake in typical wrong ones, in both languages."""
 
+import string
+
 import gymnasium as gym
 import jax
 import numpy as np
@@ -69,6 +71,29 @@ def test_a_typical_mistake_is_named(check, wrong, message, capsys):
     assert len(english.splitlines()) == len(french.splitlines()) == 1
 
 
+@pytest.mark.parametrize("course", ["base", "dqn_ppo", "box", "goals"])
+def test_messages_are_in_both_languages_with_the_same_values(course):
+    for exercise in checks.messages(course).values():
+        for name, message in exercise.items():
+            if name in ("case", "where", "right", "each", "compiles"):
+                continue
+            assert message.keys() - {"result"} == {"en", "fr"}
+            texts = (message["en"], message["fr"])
+            fields = [{part[1] for part in string.Formatter().parse(text) if part[1]} for text in texts]
+            assert fields[0] == fields[1] or course == "base"
+
+
+@pytest.mark.parametrize(
+    ("check", "answers"),
+    [(goals.future, [lambda *_: [[1], [1, 2]]]), (goals.steps_needed, [10**400]), (goals.saving, [None, None, 3])],
+)
+def test_an_answer_of_another_kind_gives_one_line(check, answers, capsys):
+    assert not check(*answers)
+    printed = capsys.readouterr().out
+    assert "the check cannot use your answer (" in printed
+    assert printed.count("\n") == 1
+
+
 def test_other_right_answers_pass():
     assert dqn_ppo.replay_memory(dqn_ppo_answers.WithoutReplacement)
     assert goals.steps_needed(4096)
@@ -82,6 +107,13 @@ def test_a_cell_that_lacks_an_answer_stops_with_one_line():
     with pytest.raises(Exception, match="needs your ratio, choose, agent") as raised:
         checks.require("epsilon", "ratio", "choose", agent=...)
     assert raised.value._render_traceback_() == [str(raised.value)]
+
+
+def test_a_wrong_answer_after_a_right_one_counts():
+    dqn_ppo.ratio(dqn_ppo_answers.ratio)
+    dqn_ppo.ratio(None)
+    with pytest.raises(Exception, match="needs your ratio"):
+        checks.require("ratio")
 
 
 def save_all(agent, folder):

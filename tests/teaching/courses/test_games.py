@@ -29,3 +29,8 @@ def test_the_scores_are_yours_and_those_of_the_agent_are_printed(monkeypatch, ca
     monkeypatch.setattr("rejeu.teaching.play.play", lambda *_, **__: SimpleNamespace(players=players))
     assert courses.by_hand("Mountain", episodes=1, against=object()) == [-150.0]
     assert capsys.readouterr().out == "DQN [-110.0]\n"
+
+
+def test_numbers_of_steps_are_divided_for_a_quick_look(monkeypatch):
+    monkeypatch.setenv("REJEU_COURSE_SPEED", "100")
+    assert (courses.steps(450), courses.steps(20)) == (4, 1)

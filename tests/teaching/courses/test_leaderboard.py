@@ -122,6 +122,24 @@ def test_zip_files_are_models_and_a_run_folder_is_one_entrant(entrants):
     assert model["name"] == "ben"
 
 
+def test_a_leaderboard_in_french_which_the_setting_asks_for(folder, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("REJEU_LANGUAGE", "fr")
+    text = run(folder, tmp_path / "board.md")
+    out = capsys.readouterr().out
+    assert out.startswith("CartPole-v1, 3 épisodes pour chacun des 6 modèles\nanna : retour moyen ")
+    assert "\ncut : le fichier est endommagé" in out
+    assert "| place | modèle | algorithme | pas | graine | retour moyen |" in text
+    assert "| 1 à 2 | anna | DQN | 0 | 0 |" in text
+    assert "il a été entraîné sur MountainCar-v0, et non sur CartPole-v1" in text
+    broken = "le fichier est endommagé, ou ce n'est pas un modèle que rejeu peut évaluer"
+    assert [line.split(": ")[1] for line in text.splitlines() if line.startswith(("- cut", "- empty", "- flip"))] == (
+        [broken] * 3
+    )
+    monkeypatch.setenv("REJEU_LANGUAGE", "de")
+    assert main(["class", str(folder)]) == 2
+    assert "language 'de' must be one of en, fr" in capsys.readouterr().err
+
+
 def test_names_are_escaped_in_markdown(folder, tmp_path):
     row = next(line for line in run(folder, tmp_path / "board.md").splitlines() if "second" in line)
     assert r"second/&lt;script&gt;alert(1)&lt;\_script&gt; \| \*x\*" in row

@@ -48,6 +48,23 @@ def cells(language, version):
     return [(cell.cell_type, cell.source) for cell in courses.notebook(SOURCE, language, version).cells]
 
 
+def test_an_exercise_has_what_is_to_do_in_place_of_the_solution():
+    assert cells("en", "exercise") == [
+        ("markdown", "Why is it so?"),
+        ("markdown", "*Your answer:* ..."),
+        ("code", 'x = 1\ndef f():\n    # TODO: think.\n    y = ...\nprint("en")'),
+    ]
+
+
+def test_a_solution_has_the_code_and_the_answers():
+    assert cells("fr", "solution") == [
+        ("markdown", "Pourquoi\N{NO-BREAK SPACE}? `a ? b` et $a : b$"),
+        ("code", 'x = 2\ndef f():\n    y = {"a": 1}\n    # because it is\n    return y\nprint("fr")'),
+        ("code", 'print("solution")'),
+    ]
+    assert ("markdown", "Because.") in cells("en", "solution")
+
+
 @pytest.mark.parametrize(
     ("source", "message"),
     [

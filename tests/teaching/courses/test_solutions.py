@@ -13,6 +13,7 @@ from tests.tiers import only
 
 SOURCES = courses.sources()
 EACH = pytest.mark.parametrize("source", SOURCES, ids=lambda source: source.name)
+EACH_LANGUAGE = pytest.mark.parametrize("language", courses.LANGUAGES)
 
 
 def made(source, language, version):
@@ -62,3 +63,20 @@ def test_a_notebook_that_does_not_end_or_is_none_is_not_graded(tmp_path, capsys)
     assert "took longer than 1 second" in grading.grade(endless, 1).error
     assert main(["course", "grade", str(other)]) == 2
     assert len(capsys.readouterr().out.splitlines()) == 1
+
+
+@pytest.mark.exhaustive
+@EACH
+@EACH_LANGUAGE
+def test_a_notebook_that_is_not_filled_in_has_one_line_for_each_cell_that_needs_an_answer(source, language):
+    nbclient = pytest.importorskip("nbclient")
+    pytest.importorskip("ipykernel")
+    notebook = made(source, language, "exercise")
+    client = nbclient.NotebookClient(notebook, timeout=600, kernel_name="python3", allow_errors=True)
+    client.execute(env=without_display() | {"REJEU_COURSE_SPEED": "100"})
+    outputs = [output for cell in notebook.cells for output in cell.get("outputs", ())]
+    errors = [output for output in outputs if output["output_type"] == "error"]
+    assert errors
+    assert {error["ename"] for error in errors} == {"NotReady"}
+    assert {len("\n".join(error["traceback"]).splitlines()) for error in errors} == {1}
+    assert {"en": "Not yet", "fr": "Pas encore"}[language] in "".join(output.get("text", "") for output in outputs)

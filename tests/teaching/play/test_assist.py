@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import signal
+
 import gymnasium as gym
 import numpy as np
 import pytest
 
 import rejeu
-from rejeu.demonstrations import dagger, read
+from rejeu.demonstrations import clone, dagger, read, record
 from rejeu.lab.cli import main
 from rejeu.teaching.play.assist import Assist, Expert
 from rejeu.teaching.play.window import Window
 from tests.playing import LEVER, Pull, down, error_of, pygame, up
+from tests.tiers import exhaustive
 
 pytestmark = pytest.mark.usefixtures("learners_are_shared")
 SMALL = {"policy_kwargs": {"net_arch": [8]}, "seed": 0}
@@ -92,6 +95,25 @@ def test_a_person_takes_over_from_a_clone(monkeypatch):
     assert labeled.n_steps == 20  # of 40
 
 
+def test_a_clone_that_nobody_corrects_stays_as_it_is(monkeypatch):
+    at_steps(monkeypatch, {})
+    env = gym.make(SLIDE, render_mode="rgb_array")
+    shown = record(Zero(), env, 2, seed=0)
+    one, other = (rejeu.PPO("MlpPolicy", env, **SMALL) for _ in range(2))
+    clone(one, shown, 20, seed=0)
+    labeled = dagger(other, Expert(env), env, shown, takes_over=True, rounds=2, steps=10, updates=20)
+    assert labeled.n_steps == shown.n_steps
+    obs = np.ones(1, np.float32)
+    assert one.predict(obs, deterministic=True)[0] == other.predict(obs, deterministic=True)[0]
+
+
+class Zero:
+    """Plays 0."""
+
+    def predict(self, obs, deterministic=True):
+        return np.zeros(1, np.float32), None
+
+
 def test_a_run_is_assisted(monkeypatch, tmp_path):
     pytest.importorskip("minari")
     at_steps(monkeypatch, {2: lambda: down("d"), 5: lambda: up("d")})
@@ -100,6 +122,19 @@ def test_a_run_is_assisted(monkeypatch, tmp_path):
     small = ["--evaluate-episodes", "1", "--import", __name__, "--set", "policy_kwargs.net_arch=[8]", "buffer_size=100"]
     assert main(["train", SLIDE, "--assist", *how, *small]) == 0
     assert read(out / "assisted").n_steps == 3
+
+
+@exhaustive
+def test_a_clone_is_corrected_by_hand(monkeypatch, tmp_path, capsys):
+    pytest.importorskip("minari")
+    record(Zero(), gym.make(SLIDE, render_mode="rgb_array"), 1, tmp_path / "shown", seed=0)
+    played = ["--updates", "5", "--by-hand", "--rounds", "1", "--round-steps", "10", "--algo", "PPO", "--seed", "0"]
+    rest = ["--no-report", "--no-video", "--evaluate-episodes", "1", "--import", __name__]
+    at_steps(monkeypatch, {2: lambda: down("d"), 5: lambda: up("d")})
+    assert (
+        main(["clone", str(tmp_path / "shown"), "--env", SLIDE, *played, *rest, "--out", str(tmp_path / "clone")]) == 0
+    )
+    assert "round  1      13 labeled steps" in capsys.readouterr().out
 
 
 def test_what_cannot_be_assisted_is_one_line(tmp_path, capsys):
@@ -115,3 +150,27 @@ def test_what_cannot_be_assisted_is_one_line(tmp_path, capsys):
     with pytest.raises(ValueError, match="needs one environment"):
         agent.learn(10, Assist())
     assert Pull().predict(None, deterministic=True)[0] == 2
+
+
+def test_without_a_screen_nothing_is_trained_first(monkeypatch, tmp_path, capsys):
+    pygame.quit()
+    monkeypatch.setenv("SDL_VIDEODRIVER", "x11")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    how, out = [SLIDE, "--assist", "--algo", "SAC", "--set", "policy_kwargs.net_arch=[8]"], tmp_path / "run"
+    assert "cannot open a window" in error_of(capsys, "train", *how, "--out", str(out))
+    assert not out.exists()
+    with pytest.raises(OSError, match="cannot open a window"):
+        Expert(gym.make(SLIDE, render_mode="rgb_array"))
+
+
+def test_a_pause_ends_with_the_training(monkeypatch):
+    """After Ctrl-C nobody waits for a key in a window that is paused."""
+
+    def stop():
+        pygame.event.post(pygame.event.Event(pygame.KEYDOWN, key=pygame.K_p))
+        signal.raise_signal(signal.SIGINT)
+
+    at_steps(monkeypatch, {3: stop})
+    env = gym.make(SLIDE, render_mode="rgb_array")
+    agent = rejeu.SAC("MlpPolicy", env, learning_starts=1000, **SMALL).learn(30, Assist())
+    assert 0 < agent.num_timesteps < 10

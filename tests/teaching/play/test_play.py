@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import re
 import sys
+import time
 import warnings
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
 import rejeu
 from rejeu.envs.registry import make_env
 from rejeu.lab.cli import main
-from rejeu.teaching.play import play
-from tests.playing import LEVER, down, error_of, hold, lever, perform, pygame, tap, up
+from rejeu.teaching.play import Game, play, watch
+from rejeu.teaching.play.game import Player
+from rejeu.teaching.play.keys import keys_for
+from rejeu.teaching.play.window import Window, legend, message, score_summary
+from tests.playing import LEVER, Pull, down, error_of, hold, lever, perform, pygame, tap, up
 from tests.tiers import exhaustive
 
 
@@ -74,6 +79,29 @@ def test_keys_held_move_the_environment_as_they_say(env_id, keys, what, read, si
     assert np.sign(found[0] - found[1]) == sign, what
 
 
+@exhaustive
+def test_the_brake_slows_the_car_down():
+    box2d("CarRacing-v3")
+    speeds = []
+
+    def script(brake):
+        def script(window, game):
+            down("w")
+            for _ in range(25):
+                yield
+            up("w")
+            down(*brake)
+            for _ in range(15):
+                yield
+            speeds.append(game.players[0].env.unwrapped.car.hull.linearVelocity.length)
+
+        return script
+
+    perform(script(["s"]), play, "Car", seed=0)
+    perform(script([]), play, "Car", seed=0)
+    assert speeds[0] < 0.8 * speeds[1]
+
+
 LOST = "lose the keyboard"
 STEPS = "rejeu-play-test/Steps-v0"
 HELD = {
@@ -110,6 +138,18 @@ def test_keys_are_held_tapped_and_let_go(case):
     perform(script, play, env_id)
 
 
+def test_own_keys_are_given_on_the_command_line_and_a_space_bar_that_is_bound_does_not_pause():
+    def script(window, game):
+        tap("j")
+        down("space")
+        yield
+        yield
+        assert not game.paused
+        assert lever(game).actions == [2, 0]
+
+    assert perform(script, main, ["play", LEVER, "--keys", "j=2", "space=0", "none=1"]) == 0
+
+
 def test_restart_begins_the_same_start_anew_and_the_episode_does_not_count():
     def script(window, game):
         player = game.players[0]
@@ -143,6 +183,21 @@ def test_scores_are_summed_the_best_is_kept_and_each_round_has_the_next_seed():
     perform(script, play, LEVER, seed=3)
 
 
+def test_the_end_of_a_round_stays_for_a_second_and_a_half():
+    def script(window, game):
+        down("d")
+        while game.phase != "over":
+            yield
+        up("d")
+        turns = 0
+        while game.phase == "over":
+            yield
+            turns += 1
+        assert turns == 30  # at 20 steps a second
+
+    perform(script, play, LEVER)
+
+
 @pytest.mark.parametrize("key", ["q", "escape"])
 def test_keys_close_the_window(key):
     def script(window, game):
@@ -152,6 +207,119 @@ def test_keys_close_the_window(key):
         raise AssertionError("the window is still open")
 
     assert perform(script, play, LEVER).closed
+
+
+def test_episodes_close_the_game_and_the_scores_are_printed(capsys):
+    def script(window, game):
+        down("d")
+        while True:
+            yield
+
+    assert perform(script, main, ["play", LEVER, "--episodes", "2", "--seed", "1"]) == 0
+    assert capsys.readouterr().out.endswith("you: 2 episodes, mean 10.00, best 10.00\n")
+
+
+def test_the_rate_is_the_environments_own_or_what_is_asked_for(monkeypatch):
+    rates = []
+
+    def script(window, game):
+        monkeypatch.setattr(window, "wait", rates.append)
+        yield
+
+    perform(script, play, LEVER)
+    perform(script, play, LEVER, fps=7)
+    assert {*rates} == {20, 7}
+
+
+def test_the_window_keeps_the_rate():
+    with Window("rate") as window:
+        window.wait(100)
+        began = time.perf_counter()
+        for _ in range(20):
+            window.wait(100)
+        assert 0.19 <= time.perf_counter() - began < 0.4
+
+
+def test_the_window_shows_both_pictures_side_by_side_and_the_keys_held():
+    def script(window, game):
+        down("d")
+        yield
+        yield
+        shown = pygame.surfarray.array3d(window.canvas).swapaxes(0, 1)
+        grey = (shown == 80).all(2)  # what the lever looks like after two steps
+        columns = np.flatnonzero(grey.sum(0) > 250)
+        assert len(columns) == 800
+        assert len(np.flatnonzero(np.diff(columns) > 1)) == 1
+        legend = shown[-30:]
+        held = (legend == (40, 104, 190)).all(2).sum()
+        up("d")
+        yield
+        yield
+        shown = pygame.surfarray.array3d(window.canvas).swapaxes(0, 1)
+        assert held > 100 > (shown[-30:] == (40, 104, 190)).all(2).sum()
+
+    perform(script, play, LEVER, against=Pull())
+
+
+def test_a_lost_episode_is_called_failed_and_scores_are_summed_up_once_there_is_one(monkeypatch):
+    player = Player("you", None, None, steps=5, over=True, success=0.0)
+    assert message(Game([player], 0), player) == "failed: 0"
+    assert score_summary(player, by_hand=False) == score_summary(player, by_hand=True) == ""
+    player.scores.append(-3.0)
+    assert score_summary(player, by_hand=False) == "mean -3 of 1 episode   best -3"
+    assert score_summary(player, by_hand=True) == "best -3"
+    monkeypatch.setenv("REJEU_LANGUAGE", "fr")
+    assert score_summary(player, by_hand=False) == "moyenne -3 sur 1 épisode   meilleur -3"
+    player.score, player.success = 2.5, 1.0
+    assert message(Game([player], 0), player) == "réussi : 2.5"
+    entries = legend(keys_for("LunarLander-v3", gym.spaces.Discrete(4), None))
+    assert [entry.label for entry in entries][:3] == ["gauche", "droite", "moteur principal"]
+
+
+def test_a_rival_plays_the_same_starts_at_the_same_pace():
+    def script(window, game):
+        you, rival = game.players
+        for seed in (11, 12):
+            assert game.phase == "ready"
+            np.testing.assert_array_equal(you.obs, rival.obs)
+            assert rival.env.unwrapped.seeds[-1] == you.env.unwrapped.seeds[-1] == seed
+            assert rival.steps == 0
+            down("a")
+            yield
+            assert (you.steps, rival.steps) == (1, 1)
+            while game.phase != "over":
+                yield
+            assert (you.score, rival.score) == (0, 10)
+            up("a")
+            while game.phase == "over":
+                yield
+        assert (you.scores, rival.scores) == ([0, 0], [10, 10])
+
+    perform(script, play, LEVER, seed=11, against=Pull())
+
+
+def test_a_round_is_over_when_both_are():
+    def script(window, game):
+        you, rival = game.players
+        down("d")
+        while not you.over:
+            yield
+        assert not rival.over
+        steps = you.steps
+        while game.phase != "over":
+            yield
+        assert rival.over
+        assert you.steps == steps
+
+    class Balance:
+        """Pushes the cart under its pole."""
+
+        def predict(self, obs, state=None, episode_start=None, deterministic=False):
+            return np.int64(obs[2] + obs[3] > 0), None
+
+    perform(
+        script, play, lambda **given: gym.make("CartPole-v1", max_episode_steps=60, **given), seed=0, against=Balance()
+    )
 
 
 @pytest.fixture(scope="module")
@@ -181,6 +349,10 @@ def test_the_agent_of_a_model_file_plays_as_it_predicts(model, capsys):
     assert re.search(rf"you: 1 episode, .*\nDQN: 1 episode, mean {expected:.2f}, ", capsys.readouterr().out)
 
 
+def test_an_agent_of_another_environment_is_refused(model, capsys):
+    assert "plays CartPole-v1, not MountainCar-v0" in error_of(capsys, "play", "Mountain", "--against", str(model))
+
+
 def test_watch_shows_an_agent_without_waiting_and_prints_its_mean(model, capsys):
     scores = []
 
@@ -194,6 +366,25 @@ def test_watch_shows_an_agent_without_waiting_and_prints_its_mean(model, capsys)
     assert perform(script, main, ["watch", str(model), "--episodes", "3", "--seed", "5"]) == 0
     mean, best = np.mean(scores[0]), max(scores[0])
     assert capsys.readouterr().out.endswith(f"DQN: 3 episodes, mean {mean:.2f}, best {best:.2f}\n")
+
+
+def test_watch_can_be_paused_begun_anew_and_closed():
+    def script(window, game):
+        yield
+        yield
+        tap("p")
+        yield
+        yield
+        assert game.players[0].steps == 2
+        tap("r")
+        yield
+        assert (game.players[0].steps, game.players[0].env.unwrapped.seeds) == (1, [4, 4])
+        tap("q")
+        yield
+        yield
+        raise AssertionError("the window is still open")
+
+    perform(script, watch, Pull(), LEVER, seed=4)
 
 
 @pytest.mark.parametrize(
@@ -227,3 +418,11 @@ def test_without_a_screen_there_is_an_error_and_no_hidden_window(capsys, monkeyp
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     assert "cannot open a window" in error_of(capsys, "play", LEVER)
+
+
+def test_environments_are_closed_and_the_window_is_gone_after_a_game():
+    game = perform(lambda window, game: iter(()), play, "CartPole-v1")
+    assert isinstance(game, Game)
+    assert not pygame.display.get_init() or pygame.display.get_surface() is None
+    with Window("again") as window:
+        assert window.title == "again"

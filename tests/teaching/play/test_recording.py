@@ -10,7 +10,9 @@ import pytest
 
 from rejeu.envs.registry import make_env
 from rejeu.lab.cli import main
+from rejeu.logs.video import HOLD_SECONDS
 from rejeu.teaching.play import play
+from tests.logs.test_video import decode
 from tests.playing import LEVER, Lever, down, error_of, hold, perform, tap, up
 
 minari = pytest.importorskip("minari")
@@ -69,6 +71,15 @@ def test_an_environment_that_cannot_be_described_or_has_no_id_is_recorded_all_th
     assert (dataset[0].actions.tolist()[:3], dataset.env_spec) == ([2, 2, 2], None)
 
 
+def test_a_recording_is_also_a_video(tmp_path):
+    play_and_record(tmp_path / "played")
+    found = decode(tmp_path / "played" / "video.mp4")
+    assert found.fps == 20
+    held = round(HOLD_SECONDS * 20)
+    expected = [0, 40, 80, 120, 160, 200] + [200] * held + [0, 40, 80] + [80] * held
+    np.testing.assert_allclose(found.frames.mean((1, 2, 3)), expected, atol=4)
+
+
 def test_goals_and_continuous_actions_are_recorded(tmp_path, monkeypatch):
     found = []
     perform(hold(["w", "d"], 4, lambda e: None, found), play, "parking-v0", seed=0, record=tmp_path / "played")
@@ -78,6 +89,15 @@ def test_goals_and_continuous_actions_are_recorded(tmp_path, monkeypatch):
     assert len(episode.actions) >= 3
     assert set(episode.observations) == {"observation", "achieved_goal", "desired_goal"}
     assert len(episode.observations["desired_goal"]) == len(episode.actions) + 1
+
+
+def test_the_dataset_has_the_spaces_and_arguments_of_the_environment_that_was_played(tmp_path, monkeypatch):
+    command = ["play", "rejeu/Ball-v0", "--env-kwargs", "dimension=3", "--record", str(tmp_path / "played")]
+    perform(hold(["d", "w"], 4, lambda e: None, []), main, command)
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "played"))
+    dataset = minari.load_dataset("rejeu/Ball-v0/human-v0")
+    assert dataset[0].actions.tolist() == [[2, 2, 0]] * len(dataset[0].actions)
+    assert (dataset.observation_space.shape, dataset.recover_environment().observation_space.shape) == ((3,), (3,))
 
 
 def test_nothing_played_leaves_nothing_behind_and_nothing_is_overwritten(tmp_path, capsys):
@@ -108,12 +128,3 @@ def test_a_recording_without_minari_names_the_extra(capsys, tmp_path, monkeypatc
     monkeypatch.setitem(sys.modules, package, None)
     text = error_of(capsys, "play", LEVER, "--record", str(tmp_path / "played"))
     assert 'pip install "rejeu[play]"' in text
-
-
-def test_the_dataset_has_the_spaces_and_arguments_of_the_environment_that_was_played(tmp_path, monkeypatch):
-    command = ["play", "rejeu/Ball-v0", "--env-kwargs", "dimension=3", "--record", str(tmp_path / "played")]
-    perform(hold(["d", "w"], 4, lambda e: None, []), main, command)
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "played"))
-    dataset = minari.load_dataset("rejeu/Ball-v0/human-v0")
-    assert dataset[0].actions.tolist() == [[2, 2, 0]] * len(dataset[0].actions)
-    assert (dataset.observation_space.shape, dataset.recover_environment().observation_space.shape) == ((3,), (3,))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import rejeu
-from rejeu.callbacks import Checkpoint
+from rejeu.callbacks import Checkpoint, Evaluate
 from rejeu.training.compiled.trainer import DeviceTrainer
 from tests.jax_environments import Reach
 from tests.sharing import shared_learners
@@ -165,6 +165,23 @@ def test_a_resumed_run_continues_bit_for_bit(tmp_path: Path, priorities: dict[st
     assert_same_runs(whole, resumed, 0.0)
 
 
+def test_evaluations_take_place_at_multiples_of_their_interval() -> None:
+    evaluate = Evaluate("jax/CartPole-v1", every=60, episodes=2, seed=0)
+    agent = make(rejeu.DQN, "jax/CartPole-v1").learn(130, evaluate)
+    assert [result.step for result in evaluate.results] == [60, 120]
+    assert agent.num_timesteps == 130
+
+
+def test_unsupported_settings_train_on_the_host_with_a_warning() -> None:
+    agent = make(rejeu.DQN, "jax/CartPole-v1", priorities={}, gradient_steps=-1, train_freq=(1, "episode"))
+    with pytest.warns(UserWarning, match="priorities with gradient_steps=-1"):
+        agent.learn(30)
+    assert agent.num_timesteps == 30
+    agent.on_device = True
+    with pytest.raises(ValueError, match="priorities with gradient_steps=-1"):
+        agent.learn(30)
+
+
 @pytest.mark.exhaustive
 def test_priorities_continue_from_the_loop_of_the_host_and_back() -> None:
     """Also with the TD errors of several gradient steps that are still to set priorities."""
@@ -202,3 +219,21 @@ def test_a_chunk_that_is_interrupted_is_completed(monkeypatch: pytest.MonkeyPatc
     assert len(interrupted.history) < len(other.history)
     interrupted.history = other.history
     assert_same_runs(interrupted, other, 0)
+
+
+@pytest.mark.exhaustive
+def test_steps_are_copied_to_the_host_when_they_are_read() -> None:
+    sizes: list[int] = []
+
+    def look(agent: Any, progress: Any) -> None:
+        copied = agent.run.fetch is None
+        if progress.step >= 100:
+            sizes.append(agent.replay_buffer.size())
+            assert sizes[-1] == progress.step
+            assert agent.run.fetch is None
+        assert not copied
+
+    agent = make(rejeu.SAC, "jax/Pendulum-v1").learn(150, look)
+    assert agent.stops is not None
+    assert sizes
+    assert sizes[-1] == 150

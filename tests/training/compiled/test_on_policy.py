@@ -81,3 +81,11 @@ def test_a_resumed_run_continues_bit_for_bit(tmp_path: Path) -> None:
     assert resumed.resumed.exact
     resumed.learn()
     assert_same_runs(whole, resumed, 0.0)
+
+
+@pytest.mark.exhaustive
+def test_rollouts_of_whole_episodes_train_on_the_host_with_a_warning() -> None:
+    agent = make(rejeu.PPO, "jax/CartPole-v1", **PPO, n_episodes=1)
+    with pytest.warns(UserWarning, match="n_episodes"):
+        agent.learn(40)
+    assert agent.num_timesteps == 40

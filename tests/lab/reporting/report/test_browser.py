@@ -6,7 +6,7 @@ from rejeu.lab.reporting.comparison import compare
 from rejeu.lab.reporting.report import write_report
 from tests.lab.reporting.report.folders import write, write_hostile
 from tests.lab.reporting.test_comparison import write_run
-from tests.tiers import crossed
+from tests.tiers import crossed, exhaustive
 
 
 class Opened:
@@ -124,3 +124,12 @@ def test_policy_stops_an_injected_script_and_requests(browser, report):
         page.wait_for_timeout(300)
         assert page.evaluate("window.hacked") is None
         assert len([text for text in opened.messages if "Content Security Policy" in text]) >= 3
+
+
+@exhaustive
+def test_million_episodes_are_drawn_quickly(browser, tmp_path):
+    path = write_report(write(tmp_path / "run", episodes=1_000_000, videos=False))
+    assert path.stat().st_size < 3e6
+    with Opened(browser, path.as_uri()) as opened:
+        assert opened.page.locator(".points .point").count() < 2000
+        assert opened.messages == []

@@ -1,5 +1,6 @@
 """Pages about runs: their content, and everything that can be wrong with a run folder. No browser; see test_browser.py."""
 
+import dataclasses
 import json
 import re
 import shutil
@@ -11,10 +12,10 @@ import pytest
 import rejeu
 from rejeu.lab.cli import main
 from rejeu.lab.reporting import runs
-from rejeu.lab.reporting.report import page, write_report
+from rejeu.lab.reporting.report import page, record, sections, write_report
 from rejeu.logs import charts
 from rejeu.logs.evaluation import Evaluation
-from rejeu.logs.tables import Episodes, Table
+from rejeu.logs.tables import EMPTY, Episodes, Table
 from rejeu.training.run import Episode
 from tests.lab.reporting.report.folders import CONFIG, EVIL, MP4, write, write_hostile
 
@@ -52,6 +53,14 @@ def test_page_of_a_run(tmp_path):
     assert sum(data["histograms"]["run0-episodes"]["counts"]) == 60
 
 
+def test_the_last_evaluation_of_a_running_run_is_not_called_final(tmp_path):
+    run = dataclasses.replace(runs.read_run(write(tmp_path / "run")), state="running")
+    assert [one.title for one in sections.tiles(run)][:2] == [
+        "Best evaluation, step 2,000",
+        "Newest evaluation, step 3,000",
+    ]
+
+
 def test_several_runs_share_a_page(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     path = write_report([write(tmp_path / "a"), write(tmp_path / "b", videos=False)])
@@ -84,6 +93,18 @@ def test_page_is_complete_without_a_file(tmp_path, missing):
     text = text_of(folder)
     assert text.rstrip().endswith("</html>")
     assert "<h2>Configuration</h2>" in text
+
+
+def test_run_that_crashed_before_the_first_evaluation(tmp_path):
+    folder = write(tmp_path / "run", episodes=0, videos=False)
+    for name in ("evaluations.csv", "metrics.csv", "agent.safetensors"):
+        (folder / name).unlink()
+    (folder / "warnings.txt").write_text("BadEnvironmentError: reward is NaN\n", encoding="utf-8")
+    text = text_of(folder)
+    assert "none yet" in text
+    assert "There is no evaluation yet." in text
+    assert "BadEnvironmentError: reward is NaN" in text
+    assert data_of(text) == {"charts": {}, "histograms": {}}
 
 
 def test_videos_are_embedded_within_the_budget_and_else_linked(tmp_path, monkeypatch):
@@ -167,6 +188,28 @@ def test_charts_have_minutes_and_the_range_of_each_bin(tmp_path):
     assert (band["low"][4:6], mean["y"][4:6], band["high"][4:6]) == ([5, 5], [6.5, 7.5], [8, 10])
 
 
+def test_interval_of_a_single_episode_is_unknown_and_large_returns_keep_their_deviation():
+    values = 1e9 + np.array([0.0, 1.0, 0.0, 1.0])
+    curve = charts.smooth(Episodes(np.arange(4.0), *[np.zeros(4)] * 5), values)
+    assert np.isnan(curve.low[0])
+    np.testing.assert_allclose(
+        (curve.high - curve.mean)[2], 1.959964 * np.std([0, 1, 0], ddof=1) / np.sqrt(3), rtol=1e-5
+    )
+
+
+def test_episodes_behind_a_bar_have_their_exact_steps():
+    histogram = charts.histogram(np.array([0.5]), {"episode": np.array([1.0]), "step": np.array([12_345_678.0])})
+    (row,) = [row for rows in histogram["rows"] for row in rows]
+    assert row == [1, 12_345_678]
+
+
+def test_command_writes_where_asked(tmp_path, capsys):
+    folder = write(tmp_path / "run")
+    assert main(["report", str(folder), "--out", str(tmp_path / "page.html")]) == 0
+    assert capsys.readouterr().out == f"{tmp_path / 'page.html'}\n"
+    assert (tmp_path / "page.html").is_file()
+
+
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
@@ -223,3 +266,19 @@ def test_value_of_an_episode_is_drawn_beside_what_followed():
     ]
     (one,) = charts.value_chart(values, np.zeros(0))["series"]
     assert one["name"] == "what the critic expects"
+
+
+@pytest.mark.parametrize(("given", "changed"), [({}, False), ({"net_arch": [8]}, True)])
+def test_widths_that_follow_from_the_observations_are_no_change(given, changed):
+    agent = rejeu.PPO("MlpPolicy", "CartPole-v1", policy_kwargs=given)
+    assert any("net_arch" in name for name in record(agent, Path("agent"), []).changed) is changed
+
+
+def test_the_interval_of_mean_lengths_stays_between_them():
+    length = np.array([50.0, 50, 4, 50, 50, 50, 3, 50])
+    episodes = Episodes(np.arange(8.0), *[np.zeros(8)] * 2, length, *[np.zeros(8)] * 2)
+    band = next(
+        one for one in charts.episode_chart(episodes, EMPTY, "length")["series"] if one["name"] == "95 % interval"
+    )
+    assert max(high for high in band["high"] if high is not None) == 50
+    assert min(low for low in band["low"] if low is not None) >= 3
