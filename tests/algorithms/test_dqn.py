@@ -208,8 +208,9 @@ def test_several_soft_moves_at_once_equal_as_many_in_turn():
 
 def test_target_takes_the_network_from_before_the_gradient_step():
     algorithm, state = make(target_update_interval=10, learning_rate=0.1)
-    state, _ = algorithm.update(state, random_batch(), CLOCK._replace(step=np.uint32(9)))
-    after, _ = algorithm.update(state, random_batch(1), CLOCK._replace(step=np.uint32(10)))
+    update = jax.jit(algorithm.update)
+    state, _ = update(state, random_batch(), CLOCK._replace(step=np.uint32(9)))
+    after, _ = update(state, random_batch(1), CLOCK._replace(step=np.uint32(10)))
     jax.tree.map(np.testing.assert_array_equal, after.target_network, state.network)
     assert (after.network.head.weight != state.network.head.weight).any()
 

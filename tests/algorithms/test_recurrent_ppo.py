@@ -28,6 +28,7 @@ from tests.tiers import exhaustive, only, only_tuples
 CLOCK = Clock(np.uint32(0), np.uint32(0), np.float32(0.0))
 OBS_SPACE = gym.spaces.Box(-5.0, 5.0, (3,), np.float32)
 SIZE = 4
+unrolled_samples = jax.jit(recurrent_ppo.unrolled_samples, static_argnums=2)
 
 
 # Independent cells in float64, in the words of PyTorch's documentation.
@@ -191,7 +192,7 @@ def test_what_is_learnt_from_is_what_the_memory_of_each_episode_says(kind, share
     that the step left, at a time limit the true one."""
     config, _, state = made(kind, shared)
     rollout = drawn_rollout(network=state.network)
-    data, started = jax.jit(recurrent_ppo.unrolled_samples, static_argnums=2)(state.network, rollout, config.gae_lambda)
+    data, started = unrolled_samples(state.network, rollout, config.gae_lambda)
     log_prob, value, advantage = by_hand(state.network, rollout, config.gae_lambda)
     np.testing.assert_allclose(data.log_prob, log_prob, atol=2e-5)
     np.testing.assert_allclose(data.value, value, atol=2e-5)
@@ -276,7 +277,7 @@ def test_the_gradient_reaches_through_time(kind):
     """Along random directions in all weights, float64 differences of an independent loss agree with the gradient."""
     config, _, state = made(kind, ent_coef=0.1)
     rollout = drawn_rollout(seed=1, network=state.network)
-    data, started = recurrent_ppo.unrolled_samples(state.network, rollout, config.gae_lambda)
+    data, started = unrolled_samples(state.network, rollout, config.gae_lambda)
     rng = np.random.default_rng(5)
     moved = jax.tree.map(lambda x: x + rng.normal(0, 0.05, x.shape).astype(np.float32), state.network)
     loss_of = jax.jit(lambda n: recurrent_ppo.loss(n, (data, started, rollout.carry), config, CLOCK)[0])
@@ -302,9 +303,10 @@ def test_the_value_does_not_train_a_memory_that_both_share():
     """As in sb3-contrib. With advantages of 0 only the value's loss has a gradient."""
     config, _, state = made(shared=True, ent_coef=0.0)
     rollout = drawn_rollout(network=state.network)
-    data, started = recurrent_ppo.unrolled_samples(state.network, rollout, config.gae_lambda)
+    data, started = unrolled_samples(state.network, rollout, config.gae_lambda)
     data = data._replace(advantage=np.zeros_like(data.advantage))
-    slope = jax.grad(lambda n: recurrent_ppo.loss(n, (data, started, rollout.carry), config, CLOCK)[0])(state.network)
+    loss = lambda n: recurrent_ppo.loss(n, (data, started, rollout.carry), config, CLOCK)[0]  # noqa: E731
+    slope = jax.jit(jax.grad(loss))(state.network)
     assert not any(x.any() for x in jax.tree.leaves(slope.cells))
     assert all(x.any() for x in jax.tree.leaves(slope.readers.value_torso))
 

@@ -51,11 +51,11 @@ def test_dropout_equals_numpy_and_each_critic_and_layer_has_its_own():
     _, _, state = made()
     batch = box_batch(0, BATCH)
     dropped = with_dropout(state.critics, jax.random.PRNGKey(5))
-    values = action_values(dropped, batch.obs, batch.action)
+    values = jax.jit(action_values)(dropped, batch.obs, batch.action)
     np.testing.assert_allclose(values, numpy_values(dropped, batch.obs, batch.action), atol=1e-5)
     keys = np.concatenate([np.asarray(drop.key) for drop in dropped.torso.dropouts])
     assert len(np.unique(keys, axis=0)) == 2 * 3
-    whole = action_values(state.critics, batch.obs, batch.action)
+    whole = jax.jit(action_values)(state.critics, batch.obs, batch.action)
     np.testing.assert_allclose(whole, numpy_values(state.critics, batch.obs, batch.action), atol=1e-5)
     assert with_dropout(state.critics, None) is state.critics
 
