@@ -134,9 +134,12 @@ def is_deep(value: Any, most: int) -> bool:
 
 
 def shown(value: Any, length: int = 100) -> str:
-    """Returns a value from a file as an error message may contain it: on one line, and shortened."""
-    text = str(value)
-    text = text if text.isprintable() else ascii(text)[1:-1]
+    r"""Returns a value from a file as an error message may contain it: on one line, and shortened.
+
+    >>> print(shown("héros\u202e\n"))
+    héros\u202e\n
+    """
+    text = "".join(one if one.isprintable() else ascii(one)[1:-1] for one in str(value))
     return text if len(text) <= length else text[: length - 3] + "..."
 
 

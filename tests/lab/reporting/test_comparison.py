@@ -335,3 +335,11 @@ def test_hostile_names_are_escaped(tmp_path):
 def test_invalid_arguments(runs, arguments):
     with pytest.raises(ValueError, match="must be"):
         compare(runs, **arguments)
+
+
+def test_equal_scores_are_one_step_of_the_profile(tmp_path):
+    for seed in range(3):
+        write_run(tmp_path / str(seed), "DQN", seed=seed, level=10.0)
+    (group,) = rejeu.compare(tmp_path, samples=50).groups
+    np.testing.assert_allclose([group.levels[0], group.levels[-1]], [9, 11])
+    assert [group.profile[0, 0], group.profile[0, -1]] == [1, 0]

@@ -421,7 +421,9 @@ def make_group(
     """Returns a group with its statistics; the levels of its profile are those of all groups of the environment."""
     scores = finals[key]
     peers = np.concatenate([one for other in finals if other[0] == key[0] for one in finals[other]])
-    levels = np.linspace(peers.min(), peers.max(), N_LEVELS)
+    least, most = peers.min(), peers.max()
+    margin = 0.0 if least < most else max(1.0, abs(least) / 10)  # equal scores are a step
+    levels = np.linspace(least - margin, most + margin, N_LEVELS)
     samples = statistics.resampled(scores, draws)
     points = [one.points() for one in members]
     curves = strata(members, points)

@@ -182,7 +182,10 @@ def read_run(path: str | Path, columns: Collection[str] | None = None) -> RunSum
             steps_asked=config.steps,
             minutes_asked=config.minutes,
         )
-    return replace(run, state=state_of(run))
+    state = state_of(run)
+    if state == "running":  # nothing was evaluated yet
+        run = replace(run, notes=tuple(note for note in run.notes if not note.endswith(" is empty")))
+    return replace(run, state=state)
 
 
 def best_row(evaluations: Table) -> int | None:

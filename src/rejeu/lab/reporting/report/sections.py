@@ -189,8 +189,8 @@ def tiles(run: RunSummary) -> list[Tile]:
     best = best_row(run.evaluations)
     if best is not None:
         headline += evaluation_tiles(run, "Best evaluation", best)
-        newest = "Newest evaluation" if run.state == "running" else "Final evaluation"
-        headline += evaluation_tiles(run, newest, int(np.flatnonzero(np.isfinite(mean))[-1]))
+        last = {"running": "Newest evaluation", "finished": "Final evaluation"}.get(run.state, "Last evaluation")
+        headline += evaluation_tiles(run, last, int(np.flatnonzero(np.isfinite(mean))[-1]))
     else:
         headline += training_tiles(run)
     done = f"of {run.steps_asked:,}" if run.steps_asked else ""
