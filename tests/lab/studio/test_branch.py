@@ -14,7 +14,7 @@ def test_a_run_is_branched_with_other_settings(browser, common):
     with opened(browser, common, "/run?run=trained") as page:
         page.get_by_role("button", name="Branch").click()
         page.get_by_label("from step").wait_for()
-        for label, text in (("settings that change", "learning_rate=0.5"), ("steps, by default", "64")):
+        for label, text in (("settings that change", "learning_rate=0.5"), ("train for so many more steps", "64")):
             page.get_by_label(label).fill(text)
         page.get_by_label("new folder").fill("../elsewhere")
         page.get_by_role("button", name="Start").click()

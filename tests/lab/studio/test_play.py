@@ -58,6 +58,9 @@ def test_two_agents_are_shown_side_by_side_from_the_same_start(browser, common):
         check_widths(page)
         page.keyboard.press("p")
         page.wait_for_selector("text=pause >> nth=0")
+        page.get_by_role("switch", name="I play").click()
+        page.get_by_role("button", name="Start").click()
+        page.wait_for_url("**/play?env=CartPole-v1&agent=anna.safetensors&agent=*&seed=3")  # a reload keeps the game
 
 
 def test_an_error_is_one_line_on_the_page(browser, common):

@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from tests.lab.studio.conftest import Served, serving
+from tests.lab.studio.conftest import Served, opened, serving
 
 
 @pytest.fixture(scope="module")
@@ -76,6 +76,15 @@ def test_without_the_extra_there_is_one_line(tmp_path):
     assert (ended.returncode, ended.stdout) == (2, "")
     expected = 'rejeu: error: the studio needs nicegui, which is not installed; run: pip install "rejeu[studio]"'
     assert ended.stderr.strip() == expected
+
+
+def test_an_empty_folder_says_so_and_leads_to_a_new_run(browser, served):
+    with opened(browser, served, "/run?run=mistyped") as page:
+        page.wait_for_selector("text=there is no run of this name below the folder: mistyped")
+    with opened(browser, served) as page:
+        page.wait_for_selector("text=There are no runs below this folder yet.")
+        page.locator(".page").get_by_role("link", name="New run").click()
+        page.wait_for_url("**/new")
 
 
 def test_ctrl_c_ends_it(tmp_path):

@@ -21,7 +21,7 @@ def open_form(studio: Studio, name: str, path: Path) -> None:
         ui.label("A new run from a checkpoint of this one").classes("text-weight-medium")
         step = ui.select(steps, label="from step", value=next(iter(steps), None)).classes("w-full")
         settings = ui.input("settings that change", placeholder="learning_rate=1e-4 gamma=0.9").classes("w-full")
-        more = ui.input("steps, by default to the goal of this run").classes("w-full")
+        more = ui.input("train for so many more steps (empty: to the goal of this run)").classes("w-full")
         folder = ui.input("new folder", value=f"{name}-branch").classes("w-full")
         said = ui.label().classes("text mono")
 

@@ -54,11 +54,12 @@ def build(studio: Studio, request: Request) -> None:
     async def begin() -> None:
         button.disable()
         spinner.set_visibility(True)
-        said.text = ""
+        said.text, button.text = "", "Starting ..."
         try:
             said.text = await start(studio, {name: one.value for name, one in fields.items()}, said.set_text)
         except (ValueError, OSError) as error:
             said.text = str(error)
+        button.text = "Start"
         button.enable()
         spinner.set_visibility(False)
 

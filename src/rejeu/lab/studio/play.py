@@ -11,7 +11,7 @@ from nicegui import ui
 from rejeu.agents import presets
 from rejeu.core.language import said
 from rejeu.lab.studio.games import Playing, Wanted
-from rejeu.lab.studio.layout import follow
+from rejeu.lab.studio.layout import address, follow
 from rejeu.lab.studio.screen import CSS, Screen
 from rejeu.lab.studio.state import Studio
 from rejeu.teaching.play.game import Event
@@ -48,8 +48,14 @@ def build(studio: Studio, request: Request) -> None:
         by_hand = ui.switch("I play", value="watch" not in asked)
         record = ui.switch("record").bind_enabled_from(by_hand, "value")
         number = ui.number("seed", value=int(seed) if seed.isdecimal() else None, min=0, precision=0).classes("w-20")
-        start = ui.button("Start", icon="play_arrow")
+        start = ui.button("Start", icon="play_arrow").props("no-caps")
     place = ui.column().classes("w-full")
+
+    def start_anew() -> None:
+        seed = "" if number.value is None else str(int(number.value))
+        query = {"env": env.value or "", "agent": agents.value, "seed": seed, "watch": [] if by_hand.value else [""]}
+        ui.navigate.history.replace(address("/play", **{name: value for name, value in query.items() if value}))
+        begin()
 
     def begin() -> None:
         from_seed = None if number.value is None else int(number.value)
@@ -69,7 +75,7 @@ def build(studio: Studio, request: Request) -> None:
 
     env.on_value_change(lambda: offer())
     follow(studio, offer)
-    start.on_click(begin)
+    start.on_click(start_anew)
     if chosen or named:
         begin()
 

@@ -23,7 +23,7 @@ from rejeu.lab.runs import requests
 from rejeu.lab.studio import processes
 from rejeu.lab.studio.branch import open_form
 from rejeu.lab.studio.figures import Figure
-from rejeu.lab.studio.layout import EVERY
+from rejeu.lab.studio.layout import EVERY, address
 from rejeu.lab.studio.player import BEST, CURRENT, Episode, Player, lower_priority
 from rejeu.lab.studio.runs import COLORS
 from rejeu.lab.studio.screen import CSS, Screen
@@ -48,9 +48,16 @@ def build(studio: Studio, request: Request) -> None:
     name = request.query_params.get("run", "")
     row = studio.row(name)
     if row is None:
-        text = "there is no run of this name below the folder" if studio.version else "reading the folder"
-        ui.label(f"{text}: {name}").classes("text")
-        ui.timer(EVERY, lambda: ui.navigate.reload() if studio.row(name) is not None else None)
+        said = ui.label().classes("text")
+
+        def look() -> None:
+            text = "there is no run of this name below the folder" if studio.version else "reading the folder"
+            said.text = f"{text}: {name}"
+            if studio.row(name) is not None:
+                ui.navigate.reload()
+
+        look()
+        ui.timer(EVERY, look)
         return
     ui.add_css(CSS)
     RunPage(studio, name, Path(row["path"]))
@@ -62,6 +69,7 @@ class RunPage:
     def __init__(self, studio: Studio, name: str, path: Path) -> None:
         self.studio, self.name, self.path = studio, name, path
         self.figures: dict[str, Figure] = {}
+        self.places: dict[str, Any] = {}
         self.seen: Row | None = None
         self.due = 0.0
         self.is_ours = RunFolder(path).config.is_file()
@@ -120,11 +128,11 @@ class RunPage:
         """Draws charts, and adds those that are new."""
         for group in groups:
             new = [one for one in group["charts"] if one["id"] not in self.figures]
-            if new:
+            if new and group["title"] not in self.places:
                 with self.groups, ui.expansion(group["title"], value=group["title"] in FIRST).classes("w-full"):
-                    place = ui.element("div").classes("charts w-full")
+                    self.places[group["title"]] = ui.element("div").classes("charts w-full")
             for one in new:
-                with place, ui.card().classes("card").props("flat bordered"):
+                with self.places[group["title"]], ui.card().classes("card").props("flat bordered"):
                     ui.label(one["title"]).classes("text-weight-medium text")
                     self.figures[one["id"]] = Figure()
             for one in group["charts"]:
@@ -162,6 +170,10 @@ def show_actions(page: RunPage, row: Row) -> None:
         )
         resume.props("outline dense no-caps padding='2px 10px'")
     if page.is_ours:
+        play = address("/play", agent=page.name)
+        ui.button("Play", icon="sports_esports", on_click=lambda: ui.navigate.to(play)).props(
+            "outline dense no-caps padding='2px 10px'"
+        )
         branch = ui.button("Branch", icon="call_split", on_click=lambda: open_form(page.studio, page.name, page.path))
         branch.props("outline dense no-caps padding='2px 10px'")
 

@@ -68,6 +68,9 @@ def build(studio: Studio, request: Request) -> None:
         ui.space()
         count = ui.label().classes("quiet")
         compare = ui.button("Compare", icon="stacked_line_chart").props("outline no-caps")
+    with ui.row().classes("items-center") as empty:
+        ui.label("There are no runs below this folder yet.")
+        ui.link("New run", "/new").classes("run")
     table = ui.table(rows=[], columns=COLUMNS, row_key="key", pagination={"rowsPerPage": 50}, selection="multiple")
     table.classes("w-full").props("flat bordered dense wrap-cells")
     compare.bind_enabled_from(table, "selected", bool)
@@ -78,6 +81,7 @@ def build(studio: Studio, request: Request) -> None:
         rows = sorted(chosen(studio.rows, words.value or ""), key=ORDERS[order.value])
         labels = labels_of(rows, studio.summaries, grouping.value)
         table.rows = [*lines(rows, labels, opened)]
+        empty.set_visibility(bool(studio.version) and not studio.rows)
         running = sum(row["state"] == "running" for row in rows)
         count.text = f"{counted(len(rows), 'run')}, {running} running" if studio.version else "reading the folder"
 

@@ -74,7 +74,7 @@ class Studio:
     def _follow(self) -> None:
         while not self._ended.is_set():
             rows = self._reader.read(EVERY)
-            if rows != self.rows:
+            if rows != self.rows or not self.version:  # an empty folder was read too
                 self.rows, self.summaries = rows, self._reader.summaries()
                 self.version += 1
             self._ended.wait(EVERY)
