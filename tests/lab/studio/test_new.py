@@ -9,7 +9,7 @@ pytest.importorskip("nicegui", reason="needs nicegui, which is in the extra stud
 
 from rejeu.lab.cli.commands import Train
 from rejeu.lab.runs.config import options
-from rejeu.lab.studio.new import LEFT_OUT, command, problem_of
+from rejeu.lab.studio.new import LEFT_OUT, command, problem_of, require_known
 
 OPTIONS = {one.field: one for one in options(Train)}
 
@@ -53,6 +53,13 @@ def test_a_mistake_is_one_line(texts, message):
     with pytest.raises(ValueError, match=message) as raised:
         command(texts, Path("runs"))
     assert "\n" not in str(raised.value)
+
+
+def test_an_unknown_environment_is_refused_at_once_with_similar_ones():
+    with pytest.raises(ValueError, match="no environment is called 'CartPoole-v1'; did you mean CartPole-v1"):
+        require_known(Train(env="CartPoole-v1"))
+    for known in ({"env": "Acrobot-v1"}, {"env": "my_env:Any-v0"}, {"env": "Any-v0", "imports": ("my_env",)}):
+        require_known(Train(**known))
 
 
 def test_a_field_says_what_is_wrong_while_it_is_filled():

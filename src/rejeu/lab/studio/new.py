@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import re
 import shlex
+import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -16,8 +17,10 @@ from nicegui import ui
 from rejeu.agents import AGENTS, presets
 from rejeu.checkpoints.run_folder import dated
 from rejeu.core.validation import field_docs
+from rejeu.envs.registry import in_envpool, register, unknown_environment
 from rejeu.lab.cli import parsing
 from rejeu.lab.cli.commands import COMMANDS, TASKS, Train, check_options
+from rejeu.lab.cli.environment import imports
 from rejeu.lab.runs.config import Option, Topic, options
 from rejeu.lab.studio import processes
 from rejeu.lab.studio.layout import address
@@ -156,6 +159,7 @@ async def start(studio: Studio, texts: Texts, say: Callable[[str], object]) -> s
     """
     words, arguments = command(texts, studio.folder)
     if presets.find(arguments.env, None) is None:
+        await asyncio.to_thread(require_known, arguments)
         say("rejeu check tries the environment for a few seconds ...")
         status, printed = await check(arguments)
         if status:
@@ -163,6 +167,17 @@ async def start(studio: Studio, texts: Texts, say: Callable[[str], object]) -> s
         say(printed)
     studio.trust(arguments)
     return await lead_to(studio, words, Path(arguments.out or ""))
+
+
+def require_known(arguments: Train) -> None:
+    """Raises an error for an id that no package registers; a process of ``rejeu check`` would take seconds for that.
+
+    Raises:
+        ValueError: with similar ids.
+    """
+    env_id = arguments.env
+    if not (imports(env_id) or arguments.imports or register(env_id) or in_envpool(env_id)):
+        raise ValueError(unknown_environment(env_id))
 
 
 async def lead_to(studio: Studio, words: Sequence[str], path: Path) -> str:
@@ -178,13 +193,14 @@ async def lead_to(studio: Studio, words: Sequence[str], path: Path) -> str:
 
 
 async def check(arguments: Train) -> tuple[int, str]:
-    """Returns exit status and output of ``rejeu check`` for the environment of a run."""
-    words = ["check", *arguments.environment_words()]
-    process = await asyncio.create_subprocess_exec(
-        *(sys.executable, "-m", "rejeu", *words),
-        stdin=asyncio.subprocess.DEVNULL,
-        stdout=asyncio.subprocess.PIPE,
-        stderr=asyncio.subprocess.STDOUT,
+    """Returns exit status and output of ``rejeu check`` for the environment of a run.
+
+    A thread waits for it: a process of uvloop's own is a fork, against which JAX warns.
+    """
+    command = [sys.executable, "-m", "rejeu", "check", *arguments.environment_words()]
+    ended = await asyncio.to_thread(
+        lambda: subprocess.run(
+            command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, check=False
+        )
     )
-    printed, _ = await process.communicate()
-    return process.returncode or 0, processes.plain(printed.decode("utf-8", "replace"))
+    return ended.returncode, processes.plain(ended.stdout.decode("utf-8", "replace"))
