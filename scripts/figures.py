@@ -23,6 +23,7 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 from gymnasium import spaces
+from scipy import stats
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "src")]
@@ -177,6 +178,45 @@ def learned(folder: str, length: str = "") -> str:
     shown = {"short": slice(0, 5), "own": [0, 1, 2, 3, 5, 6, 7]}.get(length, slice(None))
     kept = np.arange(len(header))[shown]
     return table([header[i] for i in kept], [[row[i] for i in kept] for row in rows])
+
+
+def goals(choice: str = "") -> str:
+    """Success in goal environments after so many steps: the table, or with ``choice`` the runs by which settings were chosen."""
+    marks = (50_000, 100_000, 300_000)
+    rows = []
+    for path in sorted((DATA / "learning" / "goals").glob("*.json")):
+        content = load(path.name, path.parent)
+        words, runs = shlex.split(content["command"]), content["runs"]
+        if path.name.startswith("choice-") != bool(choice):
+            continue
+        curves = [dict(run["success_curve"]) for run in runs]
+        minutes = [run["seconds"] / 60 for run in runs]
+        options = " ".join(words[4:]).replace("--continue", "")
+        rows.append(
+            [
+                words[2],
+                words[3],
+                *(success([curve[mark] for curve in curves if mark in curve]) for mark in marks),
+                f"{success([run['success_rate'] for run in runs])} at {runs[0]['steps']:,}",
+                " to ".join(dict.fromkeys(f"{one:.1f}" for one in (min(minutes), max(minutes)))),
+                str(len(runs)),
+                content["commit"],
+                code(re.sub(r" *--out \S+", "", options).strip()),
+            ]
+        )
+    columns = ["environment", "algorithm", *(f"at {mark:,}" for mark in marks), "at the end", "minutes", "seeds"]
+    return table([*columns, "commit", "options"], rows)
+
+
+def success(rates: list[float]) -> str:
+    """Formats the mean of success rates of seeds, with the 95 % interval of Student's t where there are three or more."""
+    if not rates:
+        return ""
+    mean = 100 * float(np.mean(rates))
+    if len(rates) < 3:
+        return f"{mean:.0f} %"
+    half = 100 * float(stats.t.ppf(0.975, len(rates) - 1) * stats.sem(rates))
+    return f"{mean:.1f} % ({max(mean - half, 0):.0f} to {min(mean + half, 100):.0f})"
 
 
 def curve(algorithm: str) -> str:
@@ -446,6 +486,7 @@ BLOCKS: dict[str, Callable[..., str]] = {
     "data": data,
     "curve": curve,
     "equal-time": equal_time,
+    "goals": goals,
     "learned": learned,
     "hyperparameters": hyperparameters,
     "shared-hyperparameters": shared_hyperparameters,
