@@ -181,7 +181,7 @@ def learned(folder: str, length: str = "") -> str:
 
 
 def goals(choice: str = "") -> str:
-    """Success in goal environments after so many steps: the table, or with ``choice`` the runs by which settings were chosen."""
+    """Success in goal environments after so many steps; with ``choice`` of the runs by which settings were chosen."""
     marks = (50_000, 100_000, 300_000)
     rows = []
     for path in sorted((DATA / "learning" / "goals").glob("*.json")):

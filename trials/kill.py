@@ -37,14 +37,14 @@ def live(folder: str, last: int) -> None:
     """Trains until step ``last``, from the newest checkpoint if there is one, and prints every step."""
     import rejeu
     from rejeu.callbacks import Checkpoint
-    from rejeu.checkpoints.run_folder import run_files
+    from rejeu.checkpoints.run_folder import checkpoint_files
 
     def say(agent: rejeu.SAC, turn: object) -> bool:
         os.write(1, b"%d\n" % agent.num_timesteps)
         return agent.num_timesteps < last
 
     callbacks = [say, Checkpoint(folder, every=EVERY)]
-    if run_files(Path(folder)):
+    if checkpoint_files(Path(folder)):
         agent = rejeu.SAC.resume(folder)
         if agent.num_timesteps < last:
             agent.learn(callback=callbacks)

@@ -133,7 +133,7 @@ def live(name: str, folder: str, kept: bool) -> None:
     """Trains to the end, from the newest checkpoint if there is one. Prints the first step and a final digest."""
     import rejeu
     from rejeu.callbacks import Checkpoint
-    from rejeu.checkpoints.run_folder import run_files
+    from rejeu.checkpoints.run_folder import checkpoint_files
 
     case = CASES[name]
     agent_class = rejeu.AGENTS[case.algorithm]
@@ -148,7 +148,7 @@ def live(name: str, folder: str, kept: bool) -> None:
         return said
 
     env.restore = timed
-    if kept and run_files(Path(folder)):
+    if kept and checkpoint_files(Path(folder)):
         agent = agent_class.resume(folder, env)
         say(resumed=agent.num_timesteps, exact=agent.resumed.exact, replay=seconds[0], trained=agent.seconds["total"])
         if agent.num_timesteps < case.steps:

@@ -15,7 +15,7 @@ import pytest
 
 import rejeu
 from rejeu.callbacks import Checkpoint, Evaluate
-from rejeu.checkpoints.run_folder import run_files
+from rejeu.checkpoints.run_folder import checkpoint_files
 from rejeu.core import checkpoint, xla
 from rejeu.core.errors import BadEnvironmentError, CheckpointError, RunInUseError
 from rejeu.envs.functional.gym_env import GymnasiumEnv
@@ -188,7 +188,7 @@ def test_two_checkpoints_are_kept_and_only_the_rows_they_need(tmp_path):
     (tmp_path / ".run_000000000010.safetensors.1a2b.tmp").write_bytes(b"half")  # of a process that died
     agent = cut_run(tmp_path, 100, 95, buffer_size=25)
     assert not list(tmp_path.glob(".*"))
-    assert [path.name for path in run_files(tmp_path)] == [
+    assert [path.name for path in checkpoint_files(tmp_path)] == [
         "run_000000000095.safetensors",
         "run_000000000090.safetensors",
     ]
@@ -200,13 +200,13 @@ def test_two_checkpoints_are_kept_and_only_the_rows_they_need(tmp_path):
 
 def test_a_damaged_checkpoint_is_passed_over_for_the_one_before_it(tmp_path):
     cut_run(tmp_path)
-    newest = run_files(tmp_path)[0]
+    newest = checkpoint_files(tmp_path)[0]
     newest.write_bytes(newest.read_bytes()[:-10])
     with pytest.warns(UserWarning, match="resuming from the checkpoint before it"):
         agent = rejeu.SAC.resume(tmp_path)
     assert agent.num_timesteps == 20
     assert agent.learn(callback=Checkpoint(tmp_path, every=10)).num_timesteps == 60
-    assert [path.name for path in run_files(tmp_path)] == [
+    assert [path.name for path in checkpoint_files(tmp_path)] == [
         "run_000000000060.safetensors",
         "run_000000000050.safetensors",
     ]
@@ -217,7 +217,7 @@ def test_rows_that_are_missing_or_damaged_are_noticed(tmp_path):
     with pytest.raises(FileNotFoundError, match="no checkpoint"):
         rejeu.SAC.resume(tmp_path)
     cut_run(tmp_path)
-    path, older = run_files(tmp_path)
+    path, older = checkpoint_files(tmp_path)
     whole, (header, arrays) = path.read_bytes(), checkpoint.read(path, "run")
     header["rows"].pop(1)
     checkpoint.write(path, "run", arrays, {k: v for k, v in header.items() if k not in checkpoint.RESERVED})
@@ -238,13 +238,13 @@ def test_rows_that_are_missing_or_damaged_are_noticed(tmp_path):
 
 def test_the_algorithm_and_the_number_of_environments_must_be_the_same(tmp_path):
     cut_run(tmp_path)
-    run_files(tmp_path)[1].unlink()
+    checkpoint_files(tmp_path)[1].unlink()
     with pytest.raises(CheckpointError, match="holds a SAC agent, not DDPG"):
         rejeu.DDPG.resume(tmp_path)
     with pytest.raises(CheckpointError, match="had 1 environments, and 2 are given"):
         rejeu.SAC.resume(tmp_path, vector(BALL, 2)())
     cut_run(tmp_path / "given", env=gym.make("Pendulum-v1"))
-    run_files(tmp_path / "given")[1].unlink()
+    checkpoint_files(tmp_path / "given")[1].unlink()
     with pytest.raises(CheckpointError, match="give it again"):
         rejeu.SAC.resume(tmp_path / "given")
     assert rejeu.SAC.resume(tmp_path / "given", gym.make("Pendulum-v1")).resumed.exact
@@ -292,7 +292,7 @@ def test_where_the_state_cannot_be_carried_new_episodes_begin_and_a_warning_says
 
 def test_the_number_of_threads_is_saved_and_a_resumed_run_says_if_it_has_another(tmp_path, monkeypatch):
     cut_run(tmp_path)
-    header, _ = checkpoint.read(run_files(tmp_path)[0], "run")
+    header, _ = checkpoint.read(checkpoint_files(tmp_path)[0], "run")
     assert header["threads"] == xla.threads()
     asked = []
     monkeypatch.setattr(xla, "start_device", asked.append)
@@ -388,7 +388,7 @@ def test_minutes_between_checkpoints(tmp_path, monkeypatch):
 
     seen = []
     small_sac(BALL).learn(
-        30, [tick, Checkpoint(tmp_path, minutes=1), lambda a, t: seen.append(run_files(tmp_path)[0].name)]
+        30, [tick, Checkpoint(tmp_path, minutes=1), lambda a, t: seen.append(checkpoint_files(tmp_path)[0].name)]
     )
     small = sorted({int(name[4:16]) for name in seen})
     assert small == [0, 9, 18, 27]

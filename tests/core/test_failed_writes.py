@@ -14,7 +14,7 @@ import pytest
 
 import rejeu
 from rejeu.callbacks import Checkpoint, Evaluate
-from rejeu.checkpoints.run_folder import run_files
+from rejeu.checkpoints.run_folder import checkpoint_files
 from rejeu.core import failed_writes
 from rejeu.core.failed_writes import FailedWrites
 from rejeu.logs.logging import CsvFile, TensorBoard
@@ -134,7 +134,7 @@ def test_a_checkpoint_that_failed_is_tried_again_after_a_minute(tmp_path, disk, 
 
     with pytest.warns(UserWarning, match="checkpoints in"):
         small_sac(BALL).learn(60, [tick, Checkpoint(tmp_path, every=30)])
-    steps = [int(path.name[4:16]) for path in run_files(tmp_path)]
+    steps = [int(path.name[4:16]) for path in checkpoint_files(tmp_path)]
     assert steps == [50, 36]  # six turns of ten seconds after it failed
 
 

@@ -15,7 +15,7 @@ import pytest
 import rejeu
 from rejeu.callbacks import Checkpoint
 from rejeu.checkpoints.resume import like, restore_buffer
-from rejeu.checkpoints.run_folder import run_files
+from rejeu.checkpoints.run_folder import checkpoint_files
 from rejeu.core import checkpoint
 from rejeu.core.errors import CheckpointError
 from tests import hostile_files
@@ -49,7 +49,7 @@ def resumed(run, tmp_path, change, **hyperparameters):
     """Resumes the run with ``change(header, values of the run, arrays)`` made to its newest file; checksums are right."""
     kind, whole, compiled = run
     folder = shutil.copytree(whole, tmp_path / "run")
-    path = run_files(folder)[0]
+    path = checkpoint_files(folder)[0]
     header, arrays = checkpoint.read(path, "run")
     change(header, header["run"]["dict"], arrays)
     checkpoint.write(path, "run", arrays, {k: v for k, v in header.items() if k not in checkpoint.RESERVED})
@@ -139,7 +139,7 @@ def test_a_rollout_that_is_full_is_refused(run, tmp_path):
 
 def files_of(folder):
     """The files of a run with one checkpoint: the run itself, and its newest rows if it has any."""
-    return [run_files(folder)[0], *sorted(folder.glob("rows_*"))[-1:]]
+    return [checkpoint_files(folder)[0], *sorted(folder.glob("rows_*"))[-1:]]
 
 
 def replaced(run, folder, path, content, size=None):
@@ -218,7 +218,7 @@ def test_environments_that_were_made_for_a_refused_run_are_closed(tmp_path):
             agent.made_from_id = True
             agent.learn(10, Checkpoint(tmp_path, keep=1))
             agent.env.close()
-            path = run_files(tmp_path)[0]
+            path = checkpoint_files(tmp_path)[0]
             header, arrays = checkpoint.read(path, "run")
             header["run"]["dict"]["logger"] = None
             checkpoint.write(path, "run", arrays, {k: v for k, v in header.items() if k not in checkpoint.RESERVED})

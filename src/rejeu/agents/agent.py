@@ -13,7 +13,7 @@ from rejeu.agents import policy, summary, training
 from rejeu.agents.base import BaseAgent
 from rejeu.callbacks.base import Callback
 from rejeu.checkpoints import model_files, resume
-from rejeu.checkpoints.run_files import CheckpointFolder, run_folder
+from rejeu.checkpoints.run_files import CheckpointFolder, folder_of
 from rejeu.checkpoints.run_folder import find_model
 from rejeu.core import algorithm as core, checkpoint, devices, spaces
 from rejeu.core.validation import number, whole
@@ -286,9 +286,9 @@ class Agent(BaseAgent):
         """
         return resume.resume(cls, Path(folder), env, changes)
 
-    def run_folder(self, folder: str | Path) -> CheckpointFolder:
+    def checkpoint_folder(self, folder: str | Path) -> CheckpointFolder:
         """Returns a folder for the checkpoints of its run, which :class:`rejeu.callbacks.Checkpoint` writes."""
-        return run_folder(self, Path(folder))
+        return folder_of(self, Path(folder))
 
     def get_env(self) -> Any:
         """Returns the training environments with the interface of Stable-Baselines3's ``VecEnv``; None if there are none.

@@ -155,7 +155,7 @@ class BaseAgent(ABC):
     """Class names and states of callbacks in a resumed checkpoint, until ``learn`` restores them."""
     resumed: Resumed | None = None
     """Where :meth:`resume` continued the run; None for a new or loaded agent."""
-    run_folders: dict[Path, Any]
+    checkpoint_folders: dict[Path, Any]
     """Folders that contain its checkpoints, by path."""
     failed_writes: FailedWrites
     """What ``learn`` could not write, such as checkpoints and log rows when the disk is full."""
@@ -230,7 +230,7 @@ class BaseAgent(ABC):
         self.history, self.logger, self.failed_writes = History(), Logger(), FailedWrites()
         self.ep_info_buffer = deque(maxlen=self.stats_window_size)
         self.ep_success_buffer = deque(maxlen=self.stats_window_size)
-        self.run_folders = {}
+        self.checkpoint_folders = {}
         xla.enable_cache()
 
     def set_outputs(

@@ -69,7 +69,7 @@ class Checkpoint(TrainingCallback):
             RunInUseError: if another process trains there.
             FileExistsError: if it contains the checkpoints of another run.
         """
-        folder = agent.run_folder(self.folder)
+        folder = agent.checkpoint_folder(self.folder)
         folder.open()
         self._run_folder = folder
         self._last_step, self._last_time = agent.run.step, time.monotonic()
@@ -110,7 +110,7 @@ class Checkpoint(TrainingCallback):
         began, run = time.monotonic(), agent.run
         if self._saved == (run.step, run.n_updates) and not reason:
             return None
-        path = agent.run_folder(self.folder).save(self.keep, reason)
+        path = agent.checkpoint_folder(self.folder).save(self.keep, reason)
         self._saved, self._last_step, self._last_time = (run.step, run.n_updates), run.step, time.monotonic()
         self.seconds += self._last_time - began
         return path

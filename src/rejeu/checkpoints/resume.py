@@ -16,8 +16,8 @@ from jax import Array
 
 from rejeu.agents.base import BaseAgent, Best, Resumed, fill_windows
 from rejeu.checkpoints import model_files
-from rejeu.checkpoints.run_files import PER_ENV, SCALARS, RowFiles, RunHeader, SavedBest, SavedRun, run_folder, versions
-from rejeu.checkpoints.run_folder import run_files
+from rejeu.checkpoints.run_files import PER_ENV, SCALARS, RowFiles, RunHeader, SavedBest, SavedRun, folder_of, versions
+from rejeu.checkpoints.run_folder import checkpoint_files
 from rejeu.core import checkpoint, devices, records, spaces, xla
 from rejeu.core.algorithm import PyTree
 from rejeu.core.errors import CheckpointError
@@ -37,7 +37,7 @@ A = TypeVar("A", bound=BaseAgent)
 
 def resume(cls: type[A], folder: Path, env: Any, changes: dict[str, Any]) -> A:
     """Returns the agent of the newest complete checkpoint, or of the one that is named; see :meth:`Agent.resume`."""
-    found = [folder] if folder.is_file() else run_files(folder)
+    found = [folder] if folder.is_file() else checkpoint_files(folder)
     if not found:
         raise FileNotFoundError(f"there is no checkpoint in {folder}")
     skipped: list[str] = []
@@ -126,7 +126,7 @@ def _resume_within(made: ExitStack, file: checkpoint.Contents, cls: type[A], env
     if parts:
         ring = agent.run.replay.ring
         heads = [part["head"] for part in parts]
-        run_folder(agent, path.parent).row_files = RowFiles(
+        folder_of(agent, path.parent).row_files = RowFiles(
             list(zip(header.rows, heads, strict=True)), ring, ring.version
         )
     return agent

@@ -31,7 +31,7 @@ from msgspec import Meta
 
 from rejeu.agents.base import BaseAgent
 from rejeu.checkpoints import model_files
-from rejeu.checkpoints.run_folder import run_files, step_of
+from rejeu.checkpoints.run_folder import checkpoint_files, step_of
 from rejeu.core import atomic, checkpoint, records, xla
 from rejeu.core.algorithm import PyTree
 from rejeu.core.errors import CheckpointError, RunInUseError
@@ -75,17 +75,17 @@ class RowFiles:
         self.files = [one for one in self.files if (one[1] >= oldest).any()]
 
 
-def run_folder(agent: BaseAgent, folder: Path) -> CheckpointFolder:
+def folder_of(agent: BaseAgent, folder: Path) -> CheckpointFolder:
     """Returns the folder of an agent's checkpoints, always the same object for the same path."""
     path = folder.resolve()
-    if path not in agent.run_folders:
-        agent.run_folders[path] = CheckpointFolder(agent, folder)
-    found: CheckpointFolder = agent.run_folders[path]
+    if path not in agent.checkpoint_folders:
+        agent.checkpoint_folders[path] = CheckpointFolder(agent, folder)
+    found: CheckpointFolder = agent.checkpoint_folders[path]
     return found
 
 
 class CheckpointFolder:
-    """A folder with the checkpoints of an agent's run. Mutable; see :meth:`Agent.run_folder`."""
+    """A folder with the checkpoints of an agent's run. Mutable; see :meth:`Agent.checkpoint_folder`."""
 
     def __init__(self, agent: BaseAgent, folder: Path) -> None:
         self.agent = agent
@@ -112,7 +112,7 @@ class CheckpointFolder:
             self._check_owner()
             for path in self.folder.glob(".*.tmp"):  # of a process that died while it wrote
                 path.unlink(missing_ok=True)
-            for path in run_files(self.folder):
+            for path in checkpoint_files(self.folder):
                 if step_of(path) > self.agent.run.step:  # a damaged one, which resume has skipped
                     path.replace(path.with_name(f"{path.name}.damaged"))
         except BaseException:
@@ -127,7 +127,7 @@ class CheckpointFolder:
 
     def is_empty(self) -> bool:
         """Returns whether the folder contains no checkpoint."""
-        return not run_files(self.folder)
+        return not checkpoint_files(self.folder)
 
     def save(self, keep: int, reason: str = "") -> Path:
         """Writes a checkpoint of the run as it is now, deletes all but the newest ``keep``, and returns its path.
@@ -151,7 +151,7 @@ class CheckpointFolder:
             path = checkpoint.write(self.folder / f"run_{run.step:012d}.safetensors", "run", arrays, header)
             self._named[path], agent.last_saved = header["rows"], path
         except OSError as error:
-            left = run_files(self.folder)
+            left = checkpoint_files(self.folder)
             raise OSError(
                 error.errno,
                 f"the checkpoint of step {run.step} could not be written ({error}); "
@@ -161,7 +161,7 @@ class CheckpointFolder:
         return path
 
     def _check_owner(self) -> None:
-        for path in run_files(self.folder):
+        for path in checkpoint_files(self.folder):
             try:
                 header = checkpoint.read_header(path, "run")
             except CheckpointError:
@@ -184,7 +184,7 @@ class CheckpointFolder:
 
     def _delete_old(self, keep: int) -> None:
         """Deletes all but the newest ``keep`` checkpoints, and the files of rows that none of these needs."""
-        found = run_files(self.folder)
+        found = checkpoint_files(self.folder)
         for path in found[keep:]:
             _remove(path)
             self._named.pop(path, None)

@@ -136,7 +136,7 @@ def find_model(run: str | Path, which: Literal["best", "last"] = "best") -> Path
     raise FileNotFoundError(f"{str(path)!r} is a folder without a model{newest}")
 
 
-def run_files(folder: Path) -> list[Path]:
+def checkpoint_files(folder: Path) -> list[Path]:
     """Returns the checkpoints in a folder, newest first."""
     if not folder.is_dir():
         return []
@@ -152,5 +152,5 @@ def step_of(path: Path) -> int:
 
 def newest_step(folder: Path) -> int:
     """Returns the environment step of the newest checkpoint in a folder, -1 if there is none."""
-    found = run_files(folder)
+    found = checkpoint_files(folder)
     return step_of(found[0]) if found else -1

@@ -17,7 +17,7 @@ from typing import Any
 
 from rejeu.agents import Agent, agent_of_file
 from rejeu.algorithms import config as configs
-from rejeu.checkpoints.run_folder import RunFolder, check_free, create, run_files, step_of
+from rejeu.checkpoints.run_folder import RunFolder, check_free, checkpoint_files, create, step_of
 from rejeu.core import devices
 from rejeu.core.errors import RunInUseError
 from rejeu.core.interrupt import Interrupt
@@ -99,7 +99,7 @@ def nearest(checkpoints: Path, step: int | None) -> Path:
     Raises:
         FileNotFoundError: if there is none.
     """
-    every = run_files(checkpoints)
+    every = checkpoint_files(checkpoints)
     found = next((path for path in every if step is None or step_of(path) <= step), None)
     if found is None:
         steps = ", ".join(f"{step_of(path):,}" for path in reversed(every))

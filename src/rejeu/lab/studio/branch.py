@@ -7,7 +7,7 @@ from pathlib import Path
 
 from nicegui import ui
 
-from rejeu.checkpoints.run_folder import RunFolder, run_files, step_of
+from rejeu.checkpoints.run_folder import RunFolder, checkpoint_files, step_of
 from rejeu.lab.cli import parsing
 from rejeu.lab.cli.commands import COMMANDS, TASKS
 from rejeu.lab.studio.new import below, lead_to
@@ -16,7 +16,7 @@ from rejeu.lab.studio.state import Studio
 
 def open_form(studio: Studio, name: str, path: Path) -> None:
     """Opens the form over the page of a run; ``name`` is that of its row."""
-    steps = {step_of(one): f"{step_of(one):,}" for one in run_files(RunFolder(path).checkpoints)}
+    steps = {step_of(one): f"{step_of(one):,}" for one in checkpoint_files(RunFolder(path).checkpoints)}
     with ui.dialog(value=True) as form, ui.card().classes("w-full").style("max-width: 30rem"):
         ui.label("A new run from a checkpoint of this one").classes("text-weight-medium")
         step = ui.select(steps, label="from step", value=next(iter(steps), None)).classes("w-full")
