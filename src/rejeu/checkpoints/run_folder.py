@@ -65,6 +65,8 @@ class RunFolder:
     """Request to show the current policy; see :mod:`rejeu.lab.runs.requests`."""
     stop = File("stop")
     """Request to stop."""
+    paused = File("paused")
+    """Says of a run that is not complete that it ended as ``--pause``, ``--steps`` or ``--minutes`` had asked."""
     live = File("live.safetensors")
     """The current model, while it is watched."""
     videos = File("videos")

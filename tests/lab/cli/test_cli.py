@@ -463,7 +463,10 @@ def test_resume_with_steps_pauses_and_keeps_the_goal(run, tmp_path, capsys):
     assert f"paused; everything is saved; rejeu resume {out} continues" in text
     paused = rejeu.load(out / "agent.safetensors").num_timesteps
     assert paused == 200
+    assert main(["status", str(out)]) == 3
+    assert "paused" in capsys.readouterr().out
     assert main(["resume", str(out), *FEWER_FILES]) == 0
+    assert not (out / "paused").exists()
     one, two = (rejeu.load(path / "agent.safetensors") for path in (run, out))
     assert one.num_timesteps == two.num_timesteps == 850
     assert_same_parameters(one, two)

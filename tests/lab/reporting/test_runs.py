@@ -117,6 +117,8 @@ def test_a_run_of_minutes_is_finished_when_nearly_all_of_them_are_over(folder):
 def test_interrupted_and_crashed_run(folder):
     (folder / "config.json").write_text(json.dumps({**CONFIG, "steps": 500}), encoding="utf-8")
     assert read_run(folder).state == "interrupted"
+    (folder / "paused").touch()
+    assert read_run(folder).state == "paused"
     (folder / "agent.safetensors").unlink()
     assert read_run(aged(folder)).state == "crashed"
 

@@ -492,7 +492,7 @@ class Runs:
 
 @dataclass(frozen=True)
 class Status:
-    """Shows how far a run is, also while it trains; exit status 3 if it was interrupted, 4 if it crashed."""
+    """Shows how far a run is, also while it trains; exit status 3 if it was interrupted or paused, 4 if it crashed."""
 
     run: RunPath
     json: PrintJson = False

@@ -16,7 +16,7 @@ from rejeu.logs import formatting
 if TYPE_CHECKING:
     from rich.table import Table
 
-EXIT = {"running": 0, "finished": 0, "unknown": 0, "interrupted": 3, "crashed": 4}
+EXIT = {"running": 0, "finished": 0, "unknown": 0, "paused": 3, "interrupted": 3, "crashed": 4}
 """Exit status of ``rejeu status`` by the state of a run."""
 WIDE = 10_000
 """Columns of a table that is not written to a terminal, so that no cell is folded."""
@@ -40,7 +40,7 @@ def run_runs(arguments: Runs) -> tuple[int, dict[str, Any]]:
 
 
 def run_status(arguments: Status) -> tuple[int, Row]:
-    """Prints the row of a run; the exit status is 3 if it was interrupted, 4 if it crashed."""
+    """Prints the row of a run; the exit status is 3 if it was interrupted or paused, 4 if it crashed."""
     row = {"run": arguments.run.name, **describe(run_list.read(arguments.run))}
     if not arguments.json:
         show([row], arguments.run)

@@ -26,7 +26,7 @@ from rejeu.lab.cli.environment import Environment
 from rejeu.lab.cli.output import Stopwatch, as_dict, echo, noted_in, reporter, summary
 from rejeu.lab.reporting import report
 from rejeu.lab.runs.config import DecidedRun
-from rejeu.lab.runs.requests import Requests
+from rejeu.lab.runs.requests import Requests, ask
 from rejeu.logs import plots, video
 from rejeu.logs.formatting import counted, quoted
 from rejeu.logs.history import EpisodeTable
@@ -149,6 +149,8 @@ class Session(NamedTuple):
                     if self.has_video:
                         record_video(agent, folder, environment, self.config.seed, learning.outputs)
             else:
+                if stop.signal is None:
+                    ask(folder.paused)
                 self.plot_curve(evaluate)
                 again = f"rejeu record {quoted(folder.path)}{environment.run.again()}"
                 echo(f"no video of a run that was stopped; {again} makes one")

@@ -36,7 +36,7 @@ POINTS = 40
 COLUMNS = ("run", "environment", "algorithm", "state", "steps", "best", "rate", "curve")
 """Titles of a table, in the order of :func:`cells`."""
 BARS = "▁▂▃▄▅▆▇█"
-FILES = (CONFIG, EPISODES, METRICS, EVALUATIONS, WARNINGS, "agent.safetensors", "checkpoints", "video.mp4")
+FILES = (CONFIG, EPISODES, METRICS, EVALUATIONS, WARNINGS, "agent.safetensors", "checkpoints", "paused", "video.mp4")
 PICTURES = ("video.mp4", "curve.png")
 SHARE = 20.0
 """A run whose reading takes a second is read at most once in so many seconds, ..."""

@@ -45,7 +45,7 @@ MAX_STEP = 2**53
 RECENT = 60.0
 """Seconds since the last write up to which a run without a lock counts as running."""
 
-State = Literal["running", "finished", "interrupted", "crashed", "unknown"]
+State = Literal["running", "finished", "paused", "interrupted", "crashed", "unknown"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -240,7 +240,7 @@ def ordered(table: Table) -> Table:
 
 
 def state_of(run: RunSummary) -> State:
-    """Returns the state of a run, from its lock and from what was written; no file is believed to say it."""
+    """Returns the state of a run, from its lock and from what was written; a file says only that a pause was meant."""
     has_model = "agent.safetensors" in run.models
     process = has_process(run.path)
     if process or (process is None and not has_model and is_recent(run.path)):
@@ -249,7 +249,9 @@ def state_of(run: RunSummary) -> State:
     reached_minutes = run.minutes_asked is not None and run.seconds >= 0.98 * 60 * run.minutes_asked
     if has_model and run.steps in run.evaluations.column("step") and (reached_steps or reached_minutes):
         return "finished"
-    return "interrupted" if has_model else "crashed"
+    if not has_model:
+        return "crashed"
+    return "paused" if is_file(RunFolder(run.path).paused) else "interrupted"
 
 
 def has_process(folder: Path) -> bool | None:

@@ -66,8 +66,8 @@ class Requests(TrainingCallback):
         self._next = now + EVERY
 
     def withdraw(self) -> None:
-        """Removes the files of requests and of what was shown."""
-        for path in (self.folder.stop, self.folder.watch, self.folder.live):
+        """Removes the files of requests and of what was shown, and the mark of a pause."""
+        for path in (self.folder.stop, self.folder.watch, self.folder.live, self.folder.paused):
             with suppress(OSError):
                 path.unlink(missing_ok=True)
 

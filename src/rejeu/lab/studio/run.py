@@ -163,7 +163,7 @@ def show_actions(page: RunPage, row: Row) -> None:
         ui.button("Stop", icon="stop", on_click=lambda event: stop(event.sender, folder)).props(
             "outline dense no-caps padding='2px 10px'"
         )
-    if row["state"] in ("interrupted", "crashed") and page.is_ours:
+    if row["state"] in ("paused", "interrupted", "crashed") and page.is_ours:
         words, text = ["resume", str(page.path)], "The run continues from its newest checkpoint."
         resume = ui.button(
             "Resume", icon="play_arrow", on_click=lambda event: command(event.sender, words, page.path, text)
