@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import stat
 import time
 from collections.abc import Collection, Iterator, Mapping
@@ -183,8 +184,10 @@ def read_run(path: str | Path, columns: Collection[str] | None = None) -> RunSum
             minutes_asked=config.minutes,
         )
     state = state_of(run)
-    if state == "running":  # nothing was evaluated yet
-        run = replace(run, notes=tuple(note for note in run.notes if not note.endswith(" is empty")))
+    if state == "running":  # in its first seconds nothing was written
+        run = replace(
+            run, notes=tuple(one for one in run.notes if not re.fullmatch(r"(there is no )?\w+\.csv( is empty)?", one))
+        )
     return replace(run, state=state)
 
 

@@ -190,14 +190,20 @@ def stop(button: Any, folder: RunFolder) -> None:
 
 
 def command(button: Any, words: Sequence[str], run: Path, text: str) -> None:
-    """Starts a command about a run in a process of its own, and says so or why not."""
+    """Starts a command about a run in a process of its own, and says so or why not, also when it has ended with an error."""
+
+    def is_under_way() -> bool:
+        if process.poll():
+            ui.notify(processes.read_log(run).strip().rpartition("\n")[2], type="negative")
+        return process.returncode is None
+
     try:
         process = processes.start(words, run)
     except (OSError, ValueError) as error:
         ui.notify(brief(error), type="negative")
     else:
         ui.notify(text)
-        disable_while(button, lambda: process.poll() is None)
+        disable_while(button, is_under_way)
 
 
 def disable_while(button: Any, is_under_way: Callable[[], bool]) -> None:
