@@ -31,7 +31,9 @@ def test_a_game_is_played_by_keys_recorded_and_read_again(browser, common):
     with opened(browser, common, "/play?env=FrozenLake-v1&seed=1") as page:
         page.wait_for_selector("text=press a key to begin")
         page.get_by_role("switch", name="record").click()
+        page.evaluate("document.querySelector('.screen').id = 'before'")
         page.get_by_role("button", name="Start").click()
+        page.wait_for_selector("#before", state="detached")  # that game has made way for another
         page.wait_for_selector("text=press a key to begin")
         before = pictures(page)
         for i, key in enumerate(("ArrowRight", "d", "ArrowDown")):
