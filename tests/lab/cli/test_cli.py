@@ -415,7 +415,7 @@ def test_a_run_that_was_killed_goes_on_to_the_same_end(tmp_path, capsys, monkeyp
             shutil.copytree(tmp_path / "whole", tmp_path / "cut")
 
     monkeypatch.setattr(Evaluate, "__call__", call)
-    argv += ["--backend", "gymnasium", "--evaluate-episodes", "2", "--checkpoint-minutes", "1e-6"]
+    argv += ["--backend", "gymnasium", "--evaluate-episodes", "2", "--checkpoint-minutes", "3e-4"]
     argv += ["--out", str(tmp_path / "whole")]
     assert main([*argv, "--set", *TINY]) == 0
     monkeypatch.undo()
