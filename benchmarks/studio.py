@@ -33,6 +33,8 @@ from typing import Any
 from playwright.sync_api import Page, sync_playwright
 
 from rejeu.logs.tables import read_table
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from tests.lab.reporting.report.folders import CONFIG, write
 
 LOADING, WHILE = 8, 15
