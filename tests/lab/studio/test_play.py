@@ -12,7 +12,7 @@ import pytest
 from rejeu.demonstrations import read
 from rejeu.lab.cli import main, studio as command
 from rejeu.lab.runs.config import RunConfig
-from rejeu.lab.studio.games import Playing, Wanted
+from rejeu.lab.studio.games import HostedGame, Wanted
 from rejeu.lab.studio.state import Studio
 from rejeu.teaching.play import opened as game_opened
 from tests.lab.cli.test_cli import error_of
@@ -101,7 +101,7 @@ class Shown:
         start = partial(
             game_opened, LEVER, settings.pop("agents", {}), settings.pop("by_hand", True), seed=4, **settings
         )
-        self.playing = Playing(start, lambda *what: self.seen.put(what))
+        self.playing = HostedGame(start, lambda *what: self.seen.put(what))
 
     def next(self):
         return self.seen.get(timeout=20)
@@ -143,7 +143,7 @@ def test_a_slow_game_acts_at_once_when_a_key_is_pressed():
 
 
 def test_an_error_of_a_game_is_what_it_says():
-    playing = Playing(partial(game_opened, "rejeu-play-test/Dark-v0", {}), lambda *what: None)
+    playing = HostedGame(partial(game_opened, "rejeu-play-test/Dark-v0", {}), lambda *what: None)
     while not playing.ended:
         pass
     assert "cannot be rendered to arrays" in playing.said

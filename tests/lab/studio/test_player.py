@@ -14,7 +14,7 @@ from rejeu.checkpoints.run_folder import RunFolder
 from rejeu.lab.cli.commands import RunOptions
 from rejeu.lab.runs.config import RunConfig
 from rejeu.lab.studio import player
-from rejeu.lab.studio.player import BEST, Episode, Player
+from rejeu.lab.studio.player import BEST, LiveEpisode, LivePlayer
 from rejeu.lab.studio.state import Studio
 from tests.lab.reporting.report.folders import CONFIG, write
 
@@ -43,7 +43,9 @@ def watched(folder, monkeypatch):
     monkeypatch.setattr(player, "REST", 0.3)
     monkeypatch.setattr(player, "RENEW", 0.05)
     shown = []
-    one = Player(folder.path, RunOptions(), lambda pictures, captions: shown.append((pictures[0].shape, captions[0])))
+    one = LivePlayer(
+        folder.path, RunOptions(), lambda pictures, captions: shown.append((pictures[0].shape, captions[0]))
+    )
     yield one, shown
     one.close()
 
@@ -96,7 +98,7 @@ def test_what_cannot_be_shown_is_said_in_one_line(folder, monkeypatch):
         ({"env_argument": "my_env.py"}, "name it again: --env my_env.py"),
     ):
         folder.config.write_text(json.dumps({**config, **change}), encoding="utf-8")
-        one = Player(folder.path, RunOptions(), lambda *_: None)
+        one = LivePlayer(folder.path, RunOptions(), lambda *_: None)
         until(lambda one=one: one.problem)
         one.close()
         assert problem in one.problem
@@ -114,7 +116,7 @@ def test_an_environment_that_was_typed_may_be_imported(tmp_path):
 
 
 def test_the_return_that_follows_a_step_is_discounted():
-    episode = Episode("current", 0, 0, rewards=[1.0, 2.0, 4.0])
+    episode = LiveEpisode("current", 0, 0, rewards=[1.0, 2.0, 4.0])
     np.testing.assert_allclose(episode.to_go(0.5), [3.0, 4.0, 4.0])
 
 

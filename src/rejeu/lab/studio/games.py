@@ -78,7 +78,7 @@ def find_agent(studio: Studio, name: str) -> tuple[Path, Environment]:
     return model, environment.environment_of(model, studio.given(name))
 
 
-class Playing:
+class HostedGame:
     """A game that a thread plays until it is closed. Mutable.
 
     Args:

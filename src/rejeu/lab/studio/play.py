@@ -10,7 +10,7 @@ from nicegui import ui
 
 from rejeu.agents import presets
 from rejeu.core.language import said
-from rejeu.lab.studio.games import Playing, Wanted
+from rejeu.lab.studio.games import HostedGame, Wanted
 from rejeu.lab.studio.layout import address, follow
 from rejeu.lab.studio.screen import CSS, Screen
 from rejeu.lab.studio.state import Studio
@@ -97,7 +97,7 @@ def show(studio: Studio, wanted: Wanted, begun: Callable[[str], object]) -> None
     status = ui.label("The environment is made, and agents are compiled ...").classes("text")
     screen = Screen(lambda event: playing.handle(event))
     buttons = ui.row().classes("gap-1 items-center")
-    playing = Playing(lambda: wanted.open(studio), screen.show)
+    playing = HostedGame(lambda: wanted.open(studio), screen.show)
     screen.on_leave = lambda: playing.handle(Event("close"))
 
     def look() -> None:
@@ -114,7 +114,7 @@ def show(studio: Studio, wanted: Wanted, begun: Callable[[str], object]) -> None
     timer = ui.timer(LOOK, look)
 
 
-def show_keys(playing: Playing, keys: KeyMap | None) -> None:
+def show_keys(playing: HostedGame, keys: KeyMap | None) -> None:
     """Shows what each key does, as buttons that are that key."""
     entries = [] if keys is None else legend(keys)
     for entry in entries:

@@ -44,7 +44,7 @@ CURRENT, BEST = "current", "best"
 
 
 @dataclass
-class Episode:
+class LiveEpisode:
     """An episode that was watched. Mutable until it ends."""
 
     model: str
@@ -66,7 +66,7 @@ class Episode:
         return result
 
 
-class Player:
+class LivePlayer:
     """A thread in which an agent acts until ``close``. Mutable: ``choose`` changes who acts.
 
     Args:
@@ -77,9 +77,9 @@ class Player:
 
     def __init__(self, folder: Path, given: RunOptions, show: Callable[..., object]) -> None:
         self.folder, self.given, self.show = RunFolder(folder), given, show
-        self.episode: Episode | None = None
+        self.episode: LiveEpisode | None = None
         """The episode that is played, or was played last."""
-        self.complete: Episode | None = None
+        self.complete: LiveEpisode | None = None
         """The last episode that was played to its end."""
         self.gamma = 1.0
         self.problem = ""
@@ -126,13 +126,13 @@ class Player:
             agent, name = self._load(agent), self.model
             playing = for_agent(agent, env)
             self.gamma = float(getattr(agent.config, "gamma", 1.0))
-            self.episode = Episode(name, self._next_seed if self.seed is None else self.seed, self._step)
+            self.episode = LiveEpisode(name, self._next_seed if self.seed is None else self.seed, self._step)
             self._next_seed += self.seed is None
             self._play(agent, playing, self.episode)
             self.complete = self.episode if self.episode.is_over else self.complete
             self._changed.wait(REST)
 
-    def _play(self, agent: Agent, env: gym.Env, episode: Episode) -> None:
+    def _play(self, agent: Agent, env: gym.Env, episode: LiveEpisode) -> None:
         """Plays one episode, with new weights as they come; another choice ends it."""
         obs, _ = env.reset(seed=episode.seed)
         fps, memory, due = max(playback_fps(env), LEAST_FPS), None, time.perf_counter()
@@ -157,7 +157,7 @@ class Player:
             due = max(due + period, time.perf_counter() - period)
             self._changed.wait(max(due - time.perf_counter(), 0.0))
 
-    def _show(self, env: gym.Env, episode: Episode) -> None:
+    def _show(self, env: gym.Env, episode: LiveEpisode) -> None:
         self.show([rgb_frame(env)], [caption(episode)])
 
     def _load(self, agent: Agent | None) -> Agent:
@@ -203,7 +203,7 @@ def value_of(agent: Agent, obs: Any, memory: Any, action: Any) -> list[float]:
     return [float(agent.q_values(obs, action, "mean"))] if algorithm.action_values is not None else []
 
 
-def caption(episode: Episode) -> dict[str, Any]:
+def caption(episode: LiveEpisode) -> dict[str, Any]:
     """Returns the texts of the picture."""
     ends = {1.0: "reached", 0.0: "not reached"}
     return {

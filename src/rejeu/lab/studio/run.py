@@ -24,7 +24,7 @@ from rejeu.lab.studio import processes
 from rejeu.lab.studio.branch import open_form
 from rejeu.lab.studio.figures import Figure
 from rejeu.lab.studio.layout import EVERY, address
-from rejeu.lab.studio.player import BEST, CURRENT, Episode, Player, lower_priority
+from rejeu.lab.studio.player import BEST, CURRENT, LiveEpisode, LivePlayer, lower_priority
 from rejeu.lab.studio.runs import COLORS
 from rejeu.lab.studio.screen import CSS, Screen
 from rejeu.lab.studio.state import Studio
@@ -76,7 +76,7 @@ class RunPage:
         self.head = Head(self)
         with ui.row().classes("w-full items-start gap-4"):
             with ui.column().classes("col-grow gap-2").style("flex-basis: 320px; max-width: 720px"):
-                self.live = Live(self) if self.is_ours else None
+                self.live = LiveView(self) if self.is_ours else None
             with ui.column().classes("gap-2").style("flex: 1 1 300px"):
                 self.tiles = ui.row().classes("gap-2 w-full")
                 self.values = Values() if self.is_ours else None
@@ -274,7 +274,7 @@ class Head:
                     ui.label(text).classes("warning text")
 
 
-class Live:
+class LiveView:
     """The agent that acts, and who of the course of training it is. Mutable."""
 
     def __init__(self, page: RunPage) -> None:
@@ -285,7 +285,7 @@ class Live:
             self.slider = ui.slider(min=0, max=0, value=0, on_change=self.chosen).props("label-always=false")
             self.label = ui.label().classes("quiet").style("min-width: 9em")
             ui.button("best", on_click=lambda: self.choose(BEST)).props("outline dense no-caps padding='2px 10px'")
-        self.player = Player(page.path, page.studio.given(page.name), self.screen.show)
+        self.player = LivePlayer(page.path, page.studio.given(page.name), self.screen.show)
         self.screen.on_leave = self.player.close
         ui.add_body_html(SEEN)
         ui.on("seen", lambda event: setattr(self.player, "is_seen", bool(event.args)))
@@ -330,7 +330,7 @@ class Values:
             self.title = ui.label().classes("text-weight-medium text")
             self.figure = Figure()
 
-    def show(self, episode: Episode | None, gamma: float) -> None:
+    def show(self, episode: LiveEpisode | None, gamma: float) -> None:
         """Draws an episode, as far as it is."""
         if episode is not None and episode.rewards:
             self.title.text = f"Value of each step, seed {episode.seed}"
