@@ -117,7 +117,7 @@ def count(name: str, params: Params, inputs: Sequence[np.ndarray]) -> int:
     return sum(one.size for one in inputs)
 
 
-class Operation(NamedTuple):
+class ArrayOperation(NamedTuple):
     """An operation on arrays, which are named by numbers."""
 
     name: str
@@ -150,7 +150,7 @@ class NumpyProgram:
         self._inputs, self._outputs = description["inputs"], description["outputs"]
         self._constants, self._steps = dict(enumerate(constants)), []
         known, left = self._known(examples), MOST_NUMBERS
-        for step in (Operation(*one) for one in description["operations"]):
+        for step in (ArrayOperation(*one) for one in description["operations"]):
             left -= count(step.name, step.params, [known[i] for i in step.inputs])
             if left < 0:
                 raise ValueError(f"it computes more than {MOST_NUMBERS} numbers for one observation")
