@@ -28,6 +28,7 @@ import math
 import sys
 import time
 import tomllib
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +41,7 @@ from scipy import stats
 import rejeu
 from rejeu.agents import presets
 from rejeu.algorithms import config as configs
-from rejeu.callbacks import Evaluate
+from rejeu.callbacks.evaluate import Evaluate, Evaluated
 from rejeu.core import validation
 from rejeu.core.records import convert
 from rejeu.envs import make_vector
@@ -70,7 +71,8 @@ def train_one(preset: presets.Preset, seed: int, arguments: argparse.Namespace) 
     callback = None
     if arguments.best or arguments.curve:
         test_env = environments(10, 2_000_000 + 100 * seed)
-        callback = Evaluate(test_env, arguments.curve or preset.evaluate_every, preset.evaluate_episodes)
+        every = arguments.curve or preset.evaluate_every
+        callback = Evaluate(test_env, every, preset.evaluate_episodes, report=partial(print_evaluation, seed))
     steps, minutes = arguments.steps or (None if arguments.minutes else preset.total_steps), arguments.minutes
     left = minutes and minutes - (time.perf_counter() - began) / 60
     agent.learn(steps, callback=callback, minutes=left)
@@ -95,6 +97,15 @@ def train_one(preset: presets.Preset, seed: int, arguments: argparse.Namespace) 
         "episodes": arguments.episodes,
         **(curves_of(callback) if callback else {}),
     }
+
+
+def print_evaluation(seed: int, one: Evaluated, is_best: bool) -> None:
+    """Prints an evaluation on the way, so that a long run can be followed."""
+    result = one.evaluation
+    print(
+        f"seed {seed}, step {one.step:,}: return {result.mean_return:.1f}, success {result.success_rate:.2f}",
+        flush=True,
+    )
 
 
 def curves_of(callback: Evaluate) -> dict[str, list]:
