@@ -1336,12 +1336,10 @@ def distributions(lib: Library) -> Any:
     return [*found, plain(total(given))]
 
 
-@case("TanhBijector.epsilon StateDependentNoiseDistribution.action_dim,use_expln,squash_output,epsilon", 1e-4)
+@case("StateDependentNoiseDistribution.action_dim,use_expln,squash_output,epsilon", 1e-4)
 def distribution_of_states(lib: Library) -> Any:
-    bijector, kind = lib("common.distributions", "TanhBijector", "StateDependentNoiseDistribution")
-    x, found = lib.tensor(np.array([[0.3, -0.4], [0.9, 0.1]], np.float32)), []
-    for one in (bijector(), bijector(epsilon=0.1)):
-        found += [plain(one.forward(x)), plain(one.inverse(one.forward(x))), plain(one.log_prob_correction(x))]
+    kind, found = lib("common.distributions", "StateDependentNoiseDistribution"), []
+    x = lib.tensor(np.array([[0.3, -0.4], [0.9, 0.1]], np.float32))
     hidden = lib.tensor(np.array([[0.5, -1.0, 2.0], [0.2, 0.3, 0.1]], np.float32))
     log_std = lib.tensor(np.array([[-0.5, 0.5], [0.2, -2.0], [0.1, 0.3]], np.float32))
     for given in ({}, {"use_expln": True}, {"squash_output": True}, {"epsilon": 0.1}):
@@ -1435,15 +1433,15 @@ class Holder:
 
 
 @case(
-    "recursive_getattr.obj,attr recursive_setattr.obj,attr,val is_json_serializable.item open_path.path,mode,verbose,suffix open_path_str.path,mode,suffix open_path_pathlib.path,mode,suffix save_to_pkl.path,obj,verbose load_from_pkl.path,verbose"
+    "recursive_getattr.obj,attr recursive_setattr.obj,attr,val open_path.path,mode,verbose,suffix open_path_str.path,mode,suffix open_path_pathlib.path,mode,suffix save_to_pkl.path,obj,verbose load_from_pkl.path,verbose"
 )
 def saving(lib: Library) -> Any:
-    names = ("recursive_getattr", "recursive_setattr", "is_json_serializable", "open_path", "save_to_pkl")
-    get, put, serializable, opened, save, load = lib("common.save_util", *names, "load_from_pkl")
+    names = ("recursive_getattr", "recursive_setattr", "open_path", "save_to_pkl", "load_from_pkl")
+    get, put, opened, save, load = lib("common.save_util", *names)
     outer, outer_in = Holder(), Holder()
     outer.inner, outer_in.value = outer_in, 3
     put(outer, "inner.value", 5)
-    found: list[Any] = [get(outer, "inner.value"), [serializable(x) for x in (1, "a", [None], {1: 2}, Holder(), {3})]]
+    found: list[Any] = [get(outer, "inner.value")]
     for path, mode, suffix in (("a", "w", "zip"), (Path("deep/b"), "w", "pkl"), ("a", "r", "zip"), ("c.x", "w", "zip")):
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
@@ -1457,7 +1455,7 @@ def saving(lib: Library) -> Any:
 
 
 @case(
-    "is_vectorized_observation.observation is_vectorized_box_observation.observation is_vectorized_discrete_observation.observation is_vectorized_multidiscrete_observation.observation is_vectorized_multibinary_observation.observation is_vectorized_dict_observation.observation check_shape_equal.space1,space2 set_random_seed.seed,using_cuda check_for_nested_spaces.obs_space preprocess_obs.obs,normalize_images configure_logger.verbose,tensorboard_log,tb_log_name,reset_num_timesteps get_system_info.print_info polyak_update.params,target_params,tau"
+    "is_vectorized_observation.observation is_vectorized_box_observation.observation is_vectorized_discrete_observation.observation is_vectorized_multidiscrete_observation.observation is_vectorized_multibinary_observation.observation is_vectorized_dict_observation.observation set_random_seed.seed,using_cuda check_for_nested_spaces.obs_space preprocess_obs.obs,normalize_images configure_logger.verbose,tensorboard_log,tb_log_name,reset_num_timesteps get_system_info.print_info polyak_update.params,target_params,tau"
 )
 def helpers(lib: Library) -> Any:
     kinds = ("box", "discrete", "multidiscrete", "multibinary", "dict")
@@ -1470,20 +1468,12 @@ def helpers(lib: Library) -> Any:
         one = space.sample()
         many = {k: np.stack([x, x]) for k, x in one.items()} if isinstance(one, dict) else np.stack([one, one])
         found += [[bool(check(x, space)) for check in (is_vector[0], is_vector[1 + i])] for x in (one, many)]
-    equal, nests, seeds = lib("common.utils", "check_shape_equal", "zip_strict", "set_random_seed")
-    nests = lib("common.preprocessing", "check_for_nested_spaces")
-    for check in (
-        lambda: equal(BOX, spaces.Box(-1, 1, (3,))),
-        lambda: equal(nested, nested),
-        lambda: equal(nested, spaces.Dict(a=BOX)),
-        lambda: nests(nested),
-        lambda: nests(spaces.Dict(a=nested)),
-        lambda: nests(spaces.Tuple([nested])),
-    ):
+    seeds, nests = lib("common.utils", "set_random_seed"), lib("common.preprocessing", "check_for_nested_spaces")
+    for space in (nested, spaces.Dict(a=nested), spaces.Tuple([nested])):
         try:
-            check()
+            nests(space)
             found.append("")
-        except (AssertionError, NotImplementedError, KeyError) as error:
+        except NotImplementedError as error:
             found.append(type(error).__name__)
     seeds(7, using_cuda=False)
     found.append(np.random.rand(2))

@@ -424,7 +424,7 @@ def test_files_by_path_or_open(tmp_path):
 
 
 def test_state_dependent_noise_has_the_variance_of_its_matrix():
-    from rejeu.sb3.common.distributions import StateDependentNoiseDistribution, TanhBijector
+    from rejeu.sb3.common.distributions import StateDependentNoiseDistribution
 
     latent, log_std = np.array([[0.5, -1.0]]).repeat(4000, axis=0), np.log(np.array([[0.4], [0.3]]))
     distribution = StateDependentNoiseDistribution(1)
@@ -435,8 +435,6 @@ def test_state_dependent_noise_has_the_variance_of_its_matrix():
     std = np.sqrt((0.5 * 0.4) ** 2 + (1.0 * 0.3) ** 2)
     assert np.exp(made.distribution.log_std[0, 0]) == pytest.approx(std, rel=1e-4)
     assert made.get_actions().std() == pytest.approx(std, rel=0.06)
-    assert TanhBijector.inverse(TanhBijector.forward(np.array([0.7]))) == pytest.approx(0.7)
-    assert TanhBijector(0.0).log_prob_correction(0.7) == pytest.approx(np.log(1 - np.tanh(0.7) ** 2))
 
 
 def test_stacks_of_observations_by_hand():

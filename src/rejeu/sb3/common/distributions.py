@@ -28,7 +28,6 @@ __all__ = [
     "MultiCategoricalDistribution",
     "SquashedDiagGaussianDistribution",
     "StateDependentNoiseDistribution",
-    "TanhBijector",
     "kl_divergence",
     "make_proba_distribution",
     "sum_independent_dims",
@@ -175,28 +174,6 @@ class StateDependentNoiseDistribution(GaussianDistribution):
         return self._shown(jnp.tanh(noisy) if self.kind is TanhNormal else noisy)
 
 
-class TanhBijector:
-    """The hyperbolic tangent, its inverse and the logarithm of its derivative; ``epsilon`` keeps both finite."""
-
-    def __init__(self, epsilon: float = 1e-6) -> None:
-        self.epsilon = epsilon
-
-    @staticmethod
-    def forward(x: Any) -> np.ndarray:
-        """Returns tanh(x)."""
-        return Tensor.of(np.tanh(np.asarray(x)))
-
-    @staticmethod
-    def inverse(y: Any) -> np.ndarray:
-        """Returns artanh(y), of ``y`` within (-1, 1)."""
-        limit = 1.0 - np.finfo(np.float32).eps
-        return Tensor.of(np.arctanh(np.clip(np.asarray(y), -limit, limit)))
-
-    def log_prob_correction(self, x: Any) -> np.ndarray:
-        """Returns the logarithm of the derivative at ``x``."""
-        return Tensor.of(np.log(1.0 - np.square(np.tanh(np.asarray(x))) + self.epsilon))
-
-
 class LogitsDistribution(Distribution):
     """A distribution that ``action_dim`` logits determine. Abstract."""
 
@@ -288,16 +265,6 @@ def kl_divergence(dist_true: Distribution, dist_pred: Distribution) -> np.ndarra
     p, q = dist_true.distribution, dist_pred.distribution
     if type(p) is not type(q):
         raise TypeError(f"the distributions are of different kinds: {type(p).__name__} and {type(q).__name__}")
-    if isinstance(p, Normal | TanhNormal):
-        variance = jnp.exp(2 * (p.log_std - q.log_std))
-        return Tensor.of(
-            0.5 * (variance + jnp.square((p.mean - q.mean) / jnp.exp(q.log_std)) - 1) + q.log_std - p.log_std
-        )
-    if isinstance(p, Categorical):
-        log_p, log_q = jax.nn.log_softmax(p.logits), jax.nn.log_softmax(q.logits)
-        return Tensor.of(jnp.sum(jnp.exp(log_p) * (log_p - log_q), axis=-1))
-    if isinstance(p, MultiCategorical):
-        parts = zip(p.parts, q.parts, strict=True)
-        return Tensor.of(sum(kl_divergence(Distribution(a), Distribution(b)) for a, b in parts))
-    log = lambda b, sign: jax.nn.log_sigmoid(sign * b.logits)  # noqa: E731
-    return Tensor.of(sum(jnp.exp(log(p, sign)) * (log(p, sign) - log(q, sign)) for sign in (1, -1)))
+    if isinstance(p, Normal | TanhNormal | Bernoulli):  # those of rejeu sum over the last axis
+        p, q = (type(one)(*(part[..., None] for part in one)) for one in (p, q))
+    return Tensor.of(p.kl_divergence(q))

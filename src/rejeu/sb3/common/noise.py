@@ -41,17 +41,3 @@ class VectorizedActionNoise:
     def __call__(self) -> np.ndarray:
         """Returns the noise of the next step, ``(n_envs, action_dim)``."""
         return np.stack([noise() for noise in self.noises])
-
-    @property
-    def noises(self) -> list[Any]:
-        """The processes, one for each environment."""
-        return self._noises
-
-    @noises.setter
-    def noises(self, noises: Sequence[Any]) -> None:
-        noises = list(noises)
-        if len(noises) != self.n_envs:
-            raise AssertionError(f"there are {len(noises)} noises for {self.n_envs} environments")
-        if wrong := [noise for noise in noises if type(noise) is not type(self.base_noise)]:
-            raise ValueError(f"noises contains {wrong[0]!r}, expected {type(self.base_noise).__name__} only")
-        self._noises = noises

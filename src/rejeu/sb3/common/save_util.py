@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import json
 import warnings
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,6 @@ from typing import Any
 import msgspec
 
 __all__ = [
-    "is_json_serializable",
     "load_from_pkl",
     "open_path",
     "open_path_pathlib",
@@ -31,15 +29,6 @@ def recursive_setattr(obj: Any, attr: str, val: Any) -> None:
     """Sets an attribute of an attribute."""
     parent, _, name = attr.rpartition(".")
     setattr(recursive_getattr(obj, parent) if parent else obj, name, val)
-
-
-def is_json_serializable(item: Any) -> bool:
-    """Returns whether JSON has such a value."""
-    try:
-        json.dumps(item)
-    except (TypeError, ValueError):
-        return False
-    return True
 
 
 def open_path(path: Any, mode: str, verbose: int = 0, suffix: str | None = None) -> Any:

@@ -29,7 +29,6 @@ __all__ = [
     "LinearSchedule",
     "Tensor",
     "check_for_correct_spaces",
-    "check_shape_equal",
     "configure_logger",
     "constant_fn",
     "explained_variance",
@@ -46,7 +45,6 @@ __all__ = [
     "set_random_seed",
     "should_collect_more_steps",
     "update_learning_rate",
-    "zip_strict",
 ]
 
 TABLE_INTERVALS = 1_000
@@ -271,17 +269,6 @@ def check_for_correct_spaces(env: Any, observation_space: gym.Space, action_spac
             raise ValueError(f"{kind} spaces do not match: {own} != {other}")
 
 
-def check_shape_equal(space1: gym.Space, space2: gym.Space) -> None:
-    """Raises ``AssertionError`` if two spaces, or the parts of two Dict spaces, have different shapes."""
-    if isinstance(space1, spaces.Dict) and isinstance(space2, spaces.Dict):
-        if space1.spaces.keys() != space2.spaces.keys():
-            raise AssertionError(f"spaces must have the same keys: {list(space1)} != {list(space2)}")
-        for key in space1.spaces:
-            check_shape_equal(space1[key], space2[key])
-    elif isinstance(space1, spaces.Box) and space1.shape != space2.shape:
-        raise AssertionError(f"spaces must have the same shape: {space1.shape} != {space2.shape}")
-
-
 def is_vectorized_observation(observation: Any, observation_space: gym.Space) -> bool:
     """Returns whether an observation is a batch of observations of the space.
 
@@ -316,11 +303,6 @@ is_vectorized_multidiscrete_observation = is_vectorized_observation
 def safe_mean(arr: Any) -> float:
     """Returns the mean, NaN of nothing."""
     return float("nan") if len(arr) == 0 else float(np.mean(arr))
-
-
-def zip_strict(*iterables: Iterable[Any]) -> Iterator[Any]:
-    """Returns ``zip(*iterables, strict=True)``."""
-    return zip(*iterables, strict=True)
 
 
 def polyak_update(params: Iterable[np.ndarray], target_params: Iterable[np.ndarray], tau: float) -> None:
