@@ -198,7 +198,29 @@ class BaseCallback(TrainingCallback):
         """Override it to act after the last step."""
 
 
-class EventCallback(BaseCallback):
+class ParentCallback(BaseCallback):
+    """A callback that contains others. Abstract: subclasses define ``_children``."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Returns its own state, and that of each callback in it with the name of its class."""
+        parts = [[type(child).__name__, child.state_dict()] for child in self._children()]
+        return {"self": super().state_dict(), "inside": parts}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restores what :meth:`state_dict` returned.
+
+        Raises:
+            ValueError: if the callbacks differ.
+        """
+        super().load_state_dict(state["self"])
+        own, saved = [type(child).__name__ for child in self._children()], [name for name, _ in state["inside"]]
+        if own != saved:
+            raise ValueError(f"the run was saved with the callbacks {', '.join(saved)}, but has {', '.join(own)}")
+        for child, (_, part) in zip(self._children(), state["inside"], strict=True):
+            child.load_state_dict(part)
+
+
+class EventCallback(ParentCallback):
     """Calls another callback on an event. Abstract: subclasses call ``_on_event`` in ``_on_step``.
 
     Args:
@@ -212,16 +234,6 @@ class EventCallback(BaseCallback):
         if self.callback is not None:
             self.callback.parent = self
 
-    def state_dict(self) -> dict[str, Any]:
-        """Returns the state of the callback and of its children."""
-        return {"self": super().state_dict(), "inside": [child.state_dict() for child in self._children()]}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restores what :meth:`state_dict` returned."""
-        super().load_state_dict(state["self"])
-        for child, part in zip(self._children(), state["inside"], strict=True):
-            child.load_state_dict(part)
-
     def _children(self) -> list[BaseCallback]:
         return [] if self.callback is None else [self.callback]
 
@@ -229,7 +241,7 @@ class EventCallback(BaseCallback):
         return True if self.callback is None else self.callback.on_step()
 
 
-class CallbackList(BaseCallback):
+class CallbackList(ParentCallback):
     """Several callbacks as one; training stops when one of them returns False.
 
     Args:
@@ -239,24 +251,6 @@ class CallbackList(BaseCallback):
     def __init__(self, callbacks: Iterable[BaseCallback | Callable[..., Any]]) -> None:
         super().__init__()
         self.callbacks = [to_callback(callback) for callback in callbacks]
-
-    def state_dict(self) -> dict[str, Any]:
-        """Returns the state of each callback, with the name of its class."""
-        parts = [[type(callback).__name__, callback.state_dict()] for callback in self.callbacks]
-        return {"self": super().state_dict(), "inside": parts}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restores what :meth:`state_dict` returned.
-
-        Raises:
-            ValueError: if the callbacks differ.
-        """
-        super().load_state_dict(state["self"])
-        own, saved = [type(callback).__name__ for callback in self.callbacks], [name for name, _ in state["inside"]]
-        if own != saved:
-            raise ValueError(f"the run was saved with the callbacks {', '.join(saved)}, but has {', '.join(own)}")
-        for callback, (_, part) in zip(self.callbacks, state["inside"], strict=True):
-            callback.load_state_dict(part)
 
     def _children(self) -> list[BaseCallback]:
         return self.callbacks

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -60,18 +60,15 @@ def make_vec_env(
     folder = None if monitor_dir is None else Path(monitor_dir)
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
-    makers = [
-        _Maker(
-            env_id,
-            dict(env_kwargs or {}),
-            None if seed is None else seed + rank,
-            None if folder is None else folder / str(rank),
-            dict(monitor_kwargs or {}),
-            wrapper_class,
-            dict(wrapper_kwargs or {}),
-        )
-        for rank in range(start_index, start_index + n_envs)
-    ]
+
+    def make(rank: int) -> gym.Env:
+        env = made(env_id, env_kwargs or {})
+        if seed is not None:
+            env.action_space.seed(seed + rank)
+        env = Monitor(env, None if folder is None else folder / str(rank), **(monitor_kwargs or {}))
+        return env if wrapper_class is None else wrapper_class(env, **(wrapper_kwargs or {}))
+
+    makers = [partial(make, rank) for rank in range(start_index, start_index + n_envs)]
     venv = (DummyVecEnv if vec_env_cls is None else vec_env_cls)(makers, **(vec_env_kwargs or {}))
     venv.seed(seed)
     return venv
@@ -94,33 +91,13 @@ def make_atari_env(
     return make_vec_env(env_id, n_envs, seed, start_index, monitor_dir, AtariWrapper, env_kwargs, *kinds)
 
 
-@dataclass(frozen=True)
-class _Maker:
-    """Makes one environment; can be pickled."""
-
-    env_id: str | Callable[..., gym.Env]
-    env_kwargs: dict[str, Any]
-    action_seed: int | None
-    monitor_path: Path | None
-    monitor_kwargs: dict[str, Any]
-    wrapper: Callable[..., gym.Env] | None
-    wrapper_kwargs: dict[str, Any]
-
-    def __call__(self) -> gym.Env:
-        env = self._make()
-        if self.action_seed is not None:
-            env.action_space.seed(self.action_seed)
-        env = Monitor(env, self.monitor_path, **self.monitor_kwargs)
-        return env if self.wrapper is None else self.wrapper(env, **self.wrapper_kwargs)
-
-    def _make(self) -> gym.Env:
-        if not isinstance(self.env_id, str):
-            return self.env_id(**self.env_kwargs)
-        if "render_mode" in self.env_kwargs:
-            return make_env(self.env_id, **self.env_kwargs)
-        try:
-            return make_env(self.env_id, render_mode="rgb_array", **self.env_kwargs)
-        except TypeError as error:
-            if "render_mode" not in str(error):
-                raise
-            return make_env(self.env_id, **self.env_kwargs)
+def made(env_id: str | Callable[..., gym.Env], kwargs: Mapping[str, Any]) -> gym.Env:
+    """Returns an environment; one of an id with ``render_mode="rgb_array"`` where it accepts that."""
+    if not isinstance(env_id, str):
+        return env_id(**kwargs)
+    try:
+        return make_env(env_id, **{"render_mode": "rgb_array", **kwargs})
+    except TypeError as error:
+        if "render_mode" in kwargs or "render_mode" not in str(error):
+            raise
+        return make_env(env_id, **kwargs)

@@ -56,16 +56,6 @@ def evaluate_policy(
     """
     agent = model if isinstance(model, Agent) else None
     vector = make_masked(env) if agent is not None and agent.takes_masks else make_vector(env)
-    memory: Any = None
-
-    def policy(obs: Any, began: np.ndarray) -> np.ndarray:
-        nonlocal memory
-        masks = {}
-        if isinstance(obs, Masked):
-            obs, masks["action_masks"] = obs
-        action, memory = model.predict(obs, state=memory, episode_start=began, deterministic=deterministic, **masks)
-        return action
-
     if n_eval_episodes < 1:
         raise ValueError(f"n_eval_episodes={n_eval_episodes} must be at least 1")
     if agent is not None and agent.get_vec_normalize_env() is not None and vector.vec_normalize is None:
@@ -77,9 +67,11 @@ def evaluate_policy(
     episode_rewards: list[float] = []
     episode_lengths: list[int] = []
     with nullcontext() if agent is None else lent(agent, vector):
-        observations, dones = vector.reset(), np.ones(vector.n_envs, bool)
+        observations, dones, states = vector.reset(), np.ones(vector.n_envs, bool), None
         while (episode_counts < share).any():
-            actions = policy(observations, dones)
+            obs, masks = observations if isinstance(observations, Masked) else (observations, None)
+            given = {"state": states, "episode_start": dones, "deterministic": deterministic}
+            actions, states = model.predict(obs, **given if masks is None else given | {"action_masks": masks})
             if (signal := interrupt.requested()) is not None:
                 raise interrupt.Stopped(signal)
             step = vector.step(actions)

@@ -16,7 +16,8 @@ import time
 import warnings
 from abc import ABC, abstractmethod
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partialmethod
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -41,7 +42,6 @@ __all__ = [
     "JSONOutputFormat",
     "KVWriter",
     "Logger",
-    "SeqWriter",
     "TensorBoardOutputFormat",
     "Video",
     "configure",
@@ -127,14 +127,6 @@ class KVWriter(ABC):
         """Closes the output."""
 
 
-class SeqWriter(ABC):
-    """Writes words. Abstract."""
-
-    @abstractmethod
-    def write_sequence(self, sequence: Sequence[str]) -> None:
-        """Writes words in one line."""
-
-
 def filter_excluded_keys(
     key_values: Mapping[str, Any], key_excluded: Mapping[str, Any], *formats: str
 ) -> dict[str, Any]:
@@ -143,7 +135,7 @@ def filter_excluded_keys(
     return {key: value for key, value in key_values.items() if not {*formats} & excluded[key]}
 
 
-class HumanOutputFormat(KVWriter, SeqWriter):
+class HumanOutputFormat(KVWriter):
     """Prints rows as tables.
 
     Args:
@@ -187,6 +179,7 @@ class HumanOutputFormat(KVWriter, SeqWriter):
         return text if len(text) <= self.max_length else f"{text[: self.max_length - 3]}..."
 
     def write_sequence(self, sequence: Sequence[str]) -> None:
+        """Writes words in one line."""
         self.file.write(" ".join(sequence) + "\n")
         self.file.flush()
 
@@ -374,21 +367,10 @@ class Logger(logging.Logger):
             if isinstance(output, HumanOutputFormat):
                 output.write_sequence([str(word) for word in args])
 
-    def debug(self, *args: Any) -> None:
-        """Prints at the level DEBUG."""
-        self.log(*args, level=DEBUG)
-
-    def info(self, *args: Any) -> None:
-        """Prints at the level INFO."""
-        self.log(*args, level=INFO)
-
-    def warn(self, *args: Any) -> None:
-        """Prints at the level WARN."""
-        self.log(*args, level=WARN)
-
-    def error(self, *args: Any) -> None:
-        """Prints at the level ERROR."""
-        self.log(*args, level=ERROR)
+    debug = partialmethod(log, level=DEBUG)
+    info = partialmethod(log, level=INFO)
+    warn = partialmethod(log, level=WARN)
+    error = partialmethod(log, level=ERROR)
 
     def set_level(self, level: int) -> None:
         """Sets the lowest level that is printed."""
@@ -408,17 +390,16 @@ def make_output_format(_format: str, log_dir: str | Path, log_suffix: str = "") 
     """
     folder = Path(log_dir)
     folder.mkdir(parents=True, exist_ok=True)
-    if _format == "stdout":
-        return HumanOutputFormat(sys.stdout)
-    if _format == "log":
-        return HumanOutputFormat(folder / f"log{log_suffix}.txt")
-    if _format == "json":
-        return JSONOutputFormat(folder / f"progress{log_suffix}.json")
-    if _format == "csv":
-        return CSVOutputFormat(folder / f"progress{log_suffix}.csv")
-    if _format == "tensorboard":
-        return TensorBoardOutputFormat(folder)
-    raise ValueError(f"Unknown format specified: {_format}")
+    kinds: dict[str, Callable[[], KVWriter]] = {
+        "stdout": lambda: HumanOutputFormat(sys.stdout),
+        "log": lambda: HumanOutputFormat(folder / f"log{log_suffix}.txt"),
+        "json": lambda: JSONOutputFormat(folder / f"progress{log_suffix}.json"),
+        "csv": lambda: CSVOutputFormat(folder / f"progress{log_suffix}.csv"),
+        "tensorboard": lambda: TensorBoardOutputFormat(folder),
+    }
+    if _format not in kinds:
+        raise ValueError(f"Unknown format specified: {_format}")
+    return kinds[_format]()
 
 
 def configure(folder: str | Path | None = None, format_strings: Sequence[str] | None = None) -> Logger:

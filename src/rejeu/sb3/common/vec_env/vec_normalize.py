@@ -242,7 +242,7 @@ class VecNormalize(VecEnvWrapper):
         Raises:
             CheckpointError: if the arrays are damaged or belong to other observations.
         """
-        _check_specs(arrays, self.statistics(), path)
+        checkpoint.match(self.statistics(), arrays, path)
         for name, array in arrays.items():
             if not np.isfinite(array).all() or (not name.endswith(".mean") and (array < 0).any()):
                 raise CheckpointError(f"{path}: {name} has negative values, or values that are not finite")
@@ -291,7 +291,7 @@ class VecNormalize(VecEnvWrapper):
                 new = VecNormalize(venv, **settings, norm_obs_keys=header.keys)
             except (LookupError, TypeError, ValueError) as error:
                 raise CheckpointError(f"{load_path} does not fit {venv.observation_space}: {error}") from None
-            _check_specs(file.specs, new.statistics(), load_path)
+            checkpoint.match(new.statistics(), file.specs, load_path)
             new.put_statistics(file.read(), load_path)
         return new
 
@@ -340,17 +340,6 @@ def sync_envs_normalization(env: VecEnv, eval_env: VecEnv) -> None:
 
 def _arrays(moments: RunningMeanStd) -> dict[str, np.ndarray]:
     return {"mean": moments.mean, "var": moments.var, "count": np.array(moments.count, np.float64)}
-
-
-def _check_specs(found: Mapping[str, Any], own: Mapping[str, Any], path: str | Path) -> None:
-    """Raises ``CheckpointError`` unless both have the same names, shapes and dtypes."""
-    forms = [{name: f"{one.dtype}{list(one.shape)}" for name, one in arrays.items()} for arrays in (found, own)]
-    if differing := sorted(name for name in {*found, *own} if forms[0].get(name) != forms[1].get(name)):
-        name = differing[0]
-        raise CheckpointError(
-            f"{path}: {checkpoint.shown(name)} is {checkpoint.shown(forms[0].get(name, 'missing'))}, expected "
-            f"{forms[1].get(name, 'no such array')}; it was saved with other observations or settings"
-        )
 
 
 def _written(key: str, value: float) -> float | bool | None:
