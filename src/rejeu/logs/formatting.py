@@ -17,9 +17,13 @@ from rejeu.core.records import shown
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.table import Table
 
 FORMULA = ("=", "+", "-", "@")
 """Characters with which a spreadsheet begins a formula."""
+
+WIDE = 10_000
+"""Columns of a table that is not written to a terminal, so that no cell is folded."""
 
 LOGS = ("csv", "json", "tensorboard", "wandb", "mlflow", "trackio")
 """What the argument ``log`` takes."""
@@ -94,6 +98,29 @@ def console(**settings: Any) -> Console:
 
     is_terminal = getattr(sys.stdout, "isatty", bool)()
     return Console(force_terminal=None if is_terminal else False, **settings)
+
+
+def show_table(head: Sequence[str], rows: Iterable[Sequence[str]], n_text: int) -> None:
+    """Prints a table; see :func:`table_of`."""
+    to = console(highlight=False)
+    if not to.is_terminal:
+        to = console(highlight=False, width=WIDE)
+    to.print(table_of(head, rows, n_text))
+
+
+def table_of(head: Sequence[str], rows: Iterable[Sequence[str]], n_text: int) -> Table:
+    """Returns a table. A narrow terminal folds the first ``n_text`` columns, which are text; numbers are never folded."""
+    from rich import box
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(box=box.SIMPLE, collapse_padding=True, pad_edge=False)
+    for i, name in enumerate(head):
+        is_text = i < n_text
+        table.add_column(name, justify="left" if is_text else "right", overflow="fold", no_wrap=not is_text)
+    for row in rows:
+        table.add_row(*map(escape, row))
+    return table
 
 
 class Display:

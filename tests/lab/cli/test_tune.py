@@ -9,7 +9,7 @@ import pytest
 
 from rejeu.lab import cli
 from rejeu.lab.cli import environment, tune as tune_command
-from rejeu.lab.experiments import process, study as studies, study_plan, sweep, tune as tuning
+from rejeu.lab.experiments import display, process, study as studies, study_plan, tune as tuning
 from rejeu.lab.runs.config import RunConfig
 from tests.lab.experiments.fake_training import Pretended
 
@@ -50,14 +50,11 @@ def test_a_terminal_shows_the_trials_that_run(pretend, tmp_path, capsys, monkeyp
     from rich.console import Console
 
     monkeypatch.setattr(Console, "is_terminal", True)
-    draw = sweep.draw
-    monkeypatch.setattr(
-        sweep, "draw", lambda drawn, found: (draw(drawn, found), drawn.refresh())
-    )  # not ten times a second
+    monkeypatch.setattr(display, "REFRESH", 0.0)
     assert tune("--trials", "2", "--final-seeds", "0", out=tmp_path / "study") == 0
     printed = capsys.readouterr().out
     assert "1 of 2 trials have ended, best return" in printed
-    assert "of 40 steps, return" in printed
+    assert "of 40 (" in printed
     assert "trial   1  complete" in printed
 
 

@@ -101,7 +101,7 @@ def work(folder, launcher, watch=lambda: None, retry=False, stop=None):
     one = Scheduler(launcher, stop or Interrupt(), lines.append)
     one.add(folder.works(retry=retry))
     one.run(watch)
-    return {one.job.name: one.state for one in one.outcomes()}, lines
+    return {one.job.name: one.state for one in one.works}, lines
 
 
 def test_every_job_is_trained_once_and_not_more_than_fit_at_once(tmp_path, monkeypatch):
@@ -189,7 +189,7 @@ def test_jobs_that_another_process_holds_are_left_to_it(tmp_path):
     states, _ = work(folder, launcher)
     assert states == {"job-0": "done", "job-1": "running", "job-2": "done", "job-3": "done"}
     claim.release()
-    assert held.state() == "waiting"
+    assert held.state == "waiting"
 
 
 @pytest.mark.parametrize("where", ["start", "claimed"])

@@ -344,7 +344,7 @@ def test_a_journal_that_is_nested_too_deeply_or_a_link_is_refused(journal, tmp_p
 
 def test_the_value_of_a_trial_must_be_finite(tmp_path):
     study = tuning.open_study(make_plan(), tmp_path / "study")
-    trial, index, _ = study.take()
+    trial, index = study.take()
     study.finish(trial, index, "complete", math.nan)
     assert study.trials()[0].state == "failed"
     assert study.trials()[0].reason == "its last evaluation has the return nan"

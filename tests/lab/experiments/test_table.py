@@ -1,11 +1,12 @@
-"""The table of a sweep."""
+"""What is shown while a sweep trains."""
 
-import math
+import json
+import re
 
-from rich.progress import Progress, TextColumn
+from rich.console import Console
 
 from rejeu.core.interrupt import Interrupt
-from rejeu.lab.experiments import sweep
+from rejeu.lab.experiments import display, sweep
 from rejeu.lab.experiments.folder import Plan, open_folder
 from rejeu.lab.experiments.scheduler import Scheduler
 from rejeu.lab.experiments.work import Job
@@ -27,29 +28,36 @@ def make(tmp_path):
     scheduler.turn()
     metrics = "step,time/time_elapsed,rollout/ep_rew_mean\n250,5,20\n500,10,30\n"
     (works[2].path / "metrics.csv").write_text(metrics, encoding="utf-8")
+    config = {"env": "CartPole-v1", "algorithm": "PPO", "steps": 1000}
+    (works[2].path / "config.json").write_text(json.dumps(config), encoding="utf-8")
     return scheduler
 
 
-def test_a_terminal_shows_bars_and_another_output_lines(tmp_path):
+def show(scheduler, monkeypatch, capsys):
+    """Returns what the display prints of a scheduler."""
+    monkeypatch.setattr(display, "LINES", 0.0)
+    with display.shown(scheduler, lambda: sweep.states_text(scheduler.works)) as watch:
+        watch()
+    return capsys.readouterr().out
+
+
+def test_lines_say_how_far_the_runs_are_that_train(tmp_path, monkeypatch, capsys):
     scheduler = make(tmp_path)
-    done, _, running, waiting = (task.progress() for task in scheduler.works)
-    assert (done.step, done.best) == (1000, 101.0)
-    assert running[:2] == (500, 30.0)
-    assert (waiting.step, math.isnan(waiting.mean_return)) == (0, True)
-    with Progress(TextColumn("{task.description} {task.fields[text]}")) as bars:
-        sweep.draw(bars, sweep.rows(scheduler))
-        everything, one = bars.tasks
-    assert (one.description, one.completed, one.total) == ("job-2", 500, 1000)
-    assert (everything.completed, everything.total) == (1500, 3000)  # the failed run is not trained
     states = "1 running, 1 done, 1 failed, 1 waiting"
-    assert everything.fields["text"] == states
-    assert sweep.line(sweep.rows(scheduler)) == f"job-2 500 of 1,000 steps, return 30.00; {states}"
-    assert sweep.states_text(scheduler.outcomes()) == states
+    assert (
+        show(scheduler, monkeypatch, capsys) == f"job-2 500 of 1,000 (50%) steps, return 30.00 in training; {states}\n"
+    )
     (scheduler.works[2].path / "agent.safetensors").touch()
     scheduler.running[0].handle.status = 0
     while scheduler.running:
         scheduler.turn()
-    with Progress() as bars:
-        bars.add_task("job-2", text="")
-        sweep.draw(bars, sweep.rows(scheduler))
-        assert "job-2" not in {task.description for task in bars.tasks}
+    assert show(scheduler, monkeypatch, capsys) == ""
+
+
+def test_a_terminal_shows_a_table_of_them(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(Console, "is_terminal", True)
+    monkeypatch.setenv("COLUMNS", "200")
+    printed = show(make(tmp_path), monkeypatch, capsys)
+    assert re.search(r"job-2 +CartPole-v1 .*500 of 1,000", printed)
+    assert "job-0" not in printed
+    assert "1 running, 1 done, 1 failed, 1 waiting" in printed

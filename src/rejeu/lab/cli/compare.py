@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from rejeu.lab.cli.commands import Compare
-from rejeu.lab.cli.runs import show_table
 from rejeu.lab.reporting.comparison import Comparison, compare
+from rejeu.logs.formatting import show_table
 
 
 def run_compare(arguments: Compare) -> tuple[int, dict[str, Any]]:

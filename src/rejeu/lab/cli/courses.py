@@ -12,8 +12,7 @@ from rejeu.core.validation import whole
 from rejeu.lab.cli import dumps, environment
 from rejeu.lab.cli.commands import Class, Course
 from rejeu.lab.cli.output import echo
-from rejeu.lab.cli.runs import show_table
-from rejeu.logs.formatting import quoted
+from rejeu.logs.formatting import quoted, show_table
 from rejeu.teaching.courses import grading, leaderboard, write
 
 MAX_EPISODES = 1_000

@@ -3,25 +3,18 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rejeu.core.interrupt import leaving
 from rejeu.lab.cli.commands import Runs, Status
 from rejeu.lab.reporting import run_list
-from rejeu.lab.reporting.rows import COLUMNS, Row, Rows, cells, describe
-from rejeu.logs import formatting
-
-if TYPE_CHECKING:
-    from rich.table import Table
+from rejeu.lab.reporting.rows import COLUMNS, N_TEXT, Row, Rows, cells, describe, texts
+from rejeu.logs.formatting import console, show_table, table_of
 
 EXIT = {"running": 0, "finished": 0, "unknown": 0, "paused": 3, "interrupted": 3, "crashed": 4}
 """Exit status of ``rejeu status`` by the state of a run."""
-WIDE = 10_000
-"""Columns of a table that is not written to a terminal, so that no cell is folded."""
-N_TEXT = 3
-"""First columns of the rows that are text, and that a narrow terminal folds."""
 EVERY = 1.0
 """Seconds between two looks at the folder with ``--follow``."""
 
@@ -53,7 +46,7 @@ def show(rows: Sequence[Row], folder: Path) -> None:
     if not rows:
         print(f"there are no runs in {folder}; rejeu train ENV makes one")
         return
-    show_table(COLUMNS, ([*cells(row).values()] for row in rows), N_TEXT)
+    show_table(COLUMNS, map(texts, rows), N_TEXT)
     print("".join(f"note: {cells(row)['run']}: {one}\n" for row in rows for one in row["notes"]), end="")
 
 
@@ -62,36 +55,12 @@ def follow(reader: Rows) -> None:
     from rich.live import Live
 
     seen: list[Row] = []
-    with leaving("no longer followed"), Live(console=formatting.console(highlight=False), auto_refresh=False) as live:
+    with leaving("no longer followed"), Live(console=console(highlight=False), auto_refresh=False) as live:
         while True:
             rows = reader.read()
-            texts = [[*cells(row).values()] for row in rows]
             if rows != seen and live.console.is_terminal:
-                live.update(table_of(COLUMNS, texts, N_TEXT), refresh=True)
+                live.update(table_of(COLUMNS, map(texts, rows), N_TEXT), refresh=True)
             elif rows != seen:
-                show_table(COLUMNS, texts, N_TEXT)
+                show_table(COLUMNS, map(texts, rows), N_TEXT)
             seen = rows
             time.sleep(EVERY)
-
-
-def show_table(head: Sequence[str], rows: Iterable[Sequence[str]], n_text: int) -> None:
-    """Prints a table; see :func:`table_of`."""
-    console = formatting.console(highlight=False)
-    if not console.is_terminal:
-        console = formatting.console(highlight=False, width=WIDE)
-    console.print(table_of(head, rows, n_text))
-
-
-def table_of(head: Sequence[str], rows: Iterable[Sequence[str]], n_text: int) -> Table:
-    """Returns a table. A narrow terminal folds the first ``n_text`` columns, which are text; numbers are never folded."""
-    from rich import box
-    from rich.markup import escape
-    from rich.table import Table
-
-    table = Table(box=box.SIMPLE, collapse_padding=True, pad_edge=False)
-    for i, name in enumerate(head):
-        is_text = i < n_text
-        table.add_column(name, justify="left" if is_text else "right", overflow="fold", no_wrap=not is_text)
-    for row in rows:
-        table.add_row(*map(escape, row))
-    return table

@@ -65,7 +65,7 @@ def complete(
 
 def finish(folder: SweepFolder, works: list[Work], typed: RunConfig, stop: Interrupt) -> tuple[int, dict[str, Any]]:
     """Says what has become of the jobs and compares the runs; returns the exit status and the result."""
-    result = SweepResult(folder.path, tuple(work.outcome() for work in works))
+    result = SweepResult(folder.path, tuple(works))
     states = {one.state for one in result.outcomes}
     resume = f"rejeu resume {quoted(folder.path)}{again(folder.jobs, typed)}"
     echo(f"{counted(len(works), 'run')}: {states_text(result.outcomes)}")

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from typing import Any
 
 from rejeu.agents import AGENTS, find_agent, find_preset
@@ -14,13 +13,9 @@ from rejeu.lab.cli.commands import Resume, Tune
 from rejeu.lab.cli.environment import Environment
 from rejeu.lab.cli.output import echo
 from rejeu.lab.experiments import space, study as studies, study_plan as plans, tune as tuning
-from rejeu.lab.experiments.search import Watch
-from rejeu.lab.experiments.study import Study, StudyFolder, Trial
-from rejeu.lab.experiments.study_plan import StudyPlan
-from rejeu.lab.experiments.sweep import Row, bars
+from rejeu.lab.experiments.study import Study, StudyFolder
 from rejeu.lab.runs.config import apply
-from rejeu.logs import formatting
-from rejeu.logs.formatting import counted, number, quoted
+from rejeu.logs.formatting import counted, quoted
 
 OF_THE_PLAN = (
     *("only", "measure", "seed", "trials", "steps", "trial_seeds", "final_seeds", "pruner", "backend"),
@@ -77,8 +72,8 @@ def read_search(assignments: Iterable[str], algorithm: str | None) -> dict[str, 
 def complete(study: Study, made: Environment, workers: int | None) -> tuple[int, dict[str, Any]]:
     """Runs a study to its end; returns the exit status and the result."""
     echo("\n".join(header(study, made)))
-    with Interrupt() as stop, display(study) as watch:
-        result = tuning.run(study, made.run, workers, stop, watch, echo)
+    with Interrupt() as stop:
+        result = tuning.run(study, made.run, workers, stop, tuning.lines(echo, study), echo)
     echo()
     if stop.signal is not None:
         echo(f"stopped by {NAMES[stop.signal]}; rejeu resume {quoted(study.folder.path)}{made.run.again()} continues")
@@ -90,45 +85,10 @@ def complete(study: Study, made: Environment, workers: int | None) -> tuple[int,
     return (0 if result.complete and result.best is not None else 2), result.to_dict()
 
 
-@contextmanager
-def display(study: Study) -> Iterator[Watch]:
-    """Returns a function that prints a line for each trial that has ended and, on a terminal, shows those that run."""
-    lines, console = tuning.lines(echo, study), formatting.console()
-    if not console.is_terminal:
-        yield lines
-        return
-    with bars(console) as show:
-
-        def watch(trials: list[Trial]) -> None:
-            lines(trials)
-            show(rows(trials, study.plan))
-
-        yield watch
-
-
-def rows(trials: list[Trial], plan: StudyPlan) -> list[Row]:
-    """Returns a row for the whole study, and one for each trial that runs.
-
-    >>> rows([], plans.make("Pendulum-v1"))
-    [Row(name='trials', done=0, total=30, text='0 of 30 trials have ended')]
-    """
-    ended = sum(one.state in ("complete", "pruned", "failed") for one in trials)
-    text = f"{ended} of {plan.trials} trials have ended"
-    if (best := studies.best_of(trials)) is not None:
-        text += f", best {plan.measure} {number(best.value)} (trial {best.index})"
-    found = [Row("trials", ended, plan.trials, text)]
-    for one in trials:
-        if one.state == "running":
-            step, steps = max(one.evaluations, default=0), plan.default.total_steps
-            about = f"{step:,} of {steps:,} steps, {plan.measure} {number(one.value)}  {tuning.settings(one)}"
-            found.append(Row(f"trial {one.index}", step, steps, about))
-    return found
-
-
 def header(study: Study, made: Environment) -> list[str]:
     """Returns the first lines of a study."""
     plan = study.plan
-    done = sum(one.state not in ("waiting", "running") for one in study.trials())
+    done = sum(one.has_ended for one in study.trials())
     seeds = f", {plan.trial_seeds} seeds each" if plan.trial_seeds > 1 else ""
     return [
         f"environment   {made}, {plan.default.n_envs} at once",

@@ -25,7 +25,7 @@ from filelock import FileLock
 from rejeu.checkpoints.run_folder import newest_step
 from rejeu.core.interrupt import TAKEN, Interrupt
 from rejeu.lab.experiments.process import hold, last_line
-from rejeu.lab.experiments.work import Ending, RunOutcome, Work
+from rejeu.lab.experiments.work import Ending, Work
 from rejeu.lab.reporting.runs import is_locked
 from rejeu.lab.runs.config import write_task
 
@@ -110,10 +110,6 @@ class Scheduler:
             self.works.append(work)
             if self._is_open(work):
                 self.waiting.append(work)
-
-    def outcomes(self) -> list[RunOutcome]:
-        """Returns what has become of each run."""
-        return [work.outcome() for work in self.works]
 
     @property
     def left(self) -> list[str]:

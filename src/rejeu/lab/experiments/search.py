@@ -110,14 +110,14 @@ class Search:
         self.watch: Watch = lambda trials: None
         self._next_look = 0.0
 
-    def run(self, watch: Watch) -> None:
+    def run(self, watch: Watch, show: Callable[[], object] = lambda: None) -> None:
         """Trains until the study is searched, a stop is requested or a training cannot be started.
 
-        The next run continues the trials that were interrupted or not started.
+        The next run continues the trials that were interrupted or not started. ``show`` is called several times a second.
         """
         self.watch = watch
         try:
-            self.scheduler.run(policy=self.turn)
+            self.scheduler.run(show, self.turn)
         finally:
             for one in self.running:
                 self.study.release(one.index)
@@ -138,7 +138,7 @@ class Search:
             if taken is None:
                 self._next_look = time.monotonic() + IDLE
                 break
-            trial, index, _ = taken
+            trial, index = taken
             folder = self.study.folder.trial(index)
             trainings = [work_of(self.run_config, folder, seed) for seed in self.study.plan.seeds(index)]
             self.running.append(RunningTrial(trial, index, trainings))

@@ -70,6 +70,11 @@ class Trial:
     reason: str
     """Why it failed."""
 
+    @property
+    def has_ended(self) -> bool:
+        """Whether it is neither waiting nor running."""
+        return self.state in ("complete", "pruned", "failed")
+
 
 @dataclass(frozen=True)
 class StudyFolder:
@@ -107,8 +112,8 @@ class Study:
     held: dict[int, FileLock] = field(default_factory=dict)
     """Locks of the trials that this process trains, by index."""
 
-    def take(self) -> tuple[optuna.Trial, int, Preset] | None:
-        """Returns the next trial with its index and preset, and locks it; None if no trial is left to begin.
+    def take(self) -> tuple[optuna.Trial, int] | None:
+        """Returns the next trial with its index, locks it, and writes its preset; None if no trial is left to begin.
 
         Trials whose process has died come first.
         """
@@ -128,7 +133,7 @@ class Study:
         source = f"rejeu tune, trial {index} of a study with seed {self.plan.seed}"
         preset = self.plan.preset(spaces.applied(self.plan.fixed, values), source)
         presets.write(preset, self.folder.trial(index) / "preset.json")
-        return trial, index, preset
+        return trial, index
 
     def next_index(self) -> int | None:
         """Returns the index of the next trial: of one that waits, else a new one; None if all have begun."""
@@ -203,8 +208,7 @@ class Study:
 
     def is_searched(self) -> bool:
         """Returns whether all trials have ended."""
-        ended = [one for one in self.trials() if one.state in ("complete", "pruned", "failed")]
-        return len(ended) >= self.plan.trials
+        return sum(one.has_ended for one in self.trials()) >= self.plan.trials
 
     def preset_of(self, trial: Trial, source: str) -> Preset:
         """Returns a trial as a preset."""

@@ -1,44 +1,32 @@
 """``rejeu.sweep``: from a plan to trained runs, with a table of their progress.
 
-Each job of the sweep is a task of the scheduler. On a terminal there are bars, and lines where there is none.
+Each job of the sweep is a run of the scheduler.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import math
-import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any
 
 from rejeu.agents import modules_of
 from rejeu.checkpoints.run_folder import dated
 from rejeu.core.interrupt import Interrupt
+from rejeu.lab.experiments import display
 from rejeu.lab.experiments.folder import SweepFolder, open_folder, read_folder
 from rejeu.lab.experiments.plan import read_plan
 from rejeu.lab.experiments.process import LocalLauncher, default_workers, threads_of
 from rejeu.lab.experiments.scheduler import Launcher, Scheduler
-from rejeu.lab.experiments.work import HIDDEN, JobProgress, RunOutcome
+from rejeu.lab.experiments.work import HIDDEN, Work
 from rejeu.lab.runs.config import RunConfig
-from rejeu.logs import formatting
-
-if TYPE_CHECKING:
-    from rich.console import Console
-    from rich.progress import Progress
 
 STATES = ("running", "done", "failed", "stopped", "waiting")
-REFRESH, LINES = 2.0, 30.0
-"""Seconds between two readings of the tables of the runs: for bars on a terminal, and for lines elsewhere."""
-MAX_NAMED = 4
-"""Most runs that are named in a line."""
 
 echo = partial(print, flush=True)
-Watch = Callable[[Scheduler], None]
 
 
 def imports_of(folder: SweepFolder, typed: RunConfig) -> tuple[str, ...]:
@@ -67,8 +55,8 @@ class SweepResult:
 
     path: Path
     """Folder of the sweep."""
-    outcomes: tuple[RunOutcome, ...]
-    """The outcome of each job."""
+    outcomes: tuple[Work, ...]
+    """The jobs, each with its ``state``, its folder ``path`` and its ``log``."""
 
     @property
     def runs(self) -> list[Path]:
@@ -76,7 +64,7 @@ class SweepResult:
         return [one.path for one in self.outcomes if one.state == "done"]
 
     @property
-    def failed(self) -> list[RunOutcome]:
+    def failed(self) -> list[Work]:
         """The jobs that failed; the log of each says why."""
         return [one for one in self.outcomes if one.state == "failed"]
 
@@ -91,12 +79,12 @@ class SweepResult:
 
     def table(self) -> list[dict[str, Any]]:
         """Returns one row for each job, ready for ``pandas.DataFrame``."""
-        of_run, of_outcome = ("env", "algorithm", "seed"), ("state", "exit_status", "path", "log")
         return [
             {
                 **{"name": one.job.name, "setting": one.job.setting},
-                **{key: getattr(one.job.run, key) for key in of_run},
-                **{key: getattr(one, key) for key in of_outcome},
+                **{key: getattr(one.job.run, key) for key in ("env", "algorithm", "seed")},
+                **{"state": one.state, "exit_status": one.exit_status() if one.status is None else one.status},
+                **{"path": one.path, "log": one.log},
             }
             for one in self.outcomes
         ]
@@ -183,7 +171,7 @@ def sweep(
         imports = imports_of(found, typed)
         scheduler = train(found, make_launcher(found, workers, ray), stop, imports, retry, progress)
         stop.check()
-    return SweepResult(found.path, tuple(scheduler.outcomes()))
+    return SweepResult(found.path, tuple(scheduler.works))
 
 
 def train(
@@ -204,103 +192,14 @@ def train(
         retry: whether jobs that have failed are tried again, once.
         progress: as for :func:`sweep`.
     """
-    with shown(progress) as (watch, say):
-        scheduler = Scheduler(launcher, stop, say)
-        scheduler.add(folder.works(imports, retry))
-        scheduler.run(lambda: watch(scheduler))
+    scheduler = Scheduler(launcher, stop, echo if progress else lambda text: None)
+    scheduler.add(folder.works(imports, retry))
+    with display.shown(scheduler, lambda: states_text(scheduler.works), progress) as watch:
+        scheduler.run(watch)
     return scheduler
 
 
-class Row(NamedTuple):
-    """A bar about a run, or about all of them."""
-
-    name: str
-    done: int
-    total: int | None
-    text: str
-
-
-@contextmanager
-def shown(progress: bool = True) -> Iterator[tuple[Watch, Callable[[str], None]]]:
-    """Context in which progress is shown; returns a function to call often, and one to call with each event."""
-    console = formatting.console()
-    if not progress:
-        yield (lambda scheduler: None), (lambda text: None)
-    elif not console.is_terminal:
-        yield seldom(lambda scheduler: echo(line(rows(scheduler))), LINES, time.monotonic() + LINES), echo
-    else:
-        with bars(console) as show:
-            say = partial(console.print, highlight=False, markup=False)
-            yield seldom(lambda scheduler: show(rows(scheduler)), REFRESH), say
-
-
-@contextmanager
-def bars(console: Console) -> Iterator[Callable[[Sequence[Row]], None]]:
-    """Context in which a terminal shows bars; returns a function to call with all of them, the first of which is for all."""
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
-    names, texts = TextColumn("{task.description}", markup=False), TextColumn("{task.fields[text]}", markup=False)
-    with Progress(
-        names, BarColumn(), texts, TimeRemainingColumn(), console=console, speed_estimate_period=600
-    ) as drawn:
-        yield partial(draw, drawn)
-
-
-def draw(drawn: Progress, found: Sequence[Row]) -> None:
-    """Draws a bar for each row, and removes those that have none."""
-    known = {task.description: task.id for task in drawn.tasks}
-    for name in known.keys() - {row.name for row in found}:
-        drawn.remove_task(known[name])
-    for row in found:
-        task = known[row.name] if row.name in known else drawn.add_task(row.name, text="")
-        drawn.update(task, total=row.total, completed=row.done, text=row.text)
-
-
-def seldom(function: Watch, seconds: float, begin: float = 0.0) -> Watch:
-    """Returns a function that calls another if the last call was so many seconds ago, and runs train."""
-    due = begin
-
-    def call(scheduler: Scheduler) -> None:
-        nonlocal due
-        if time.monotonic() >= due and scheduler.running:
-            due = time.monotonic() + seconds
-            function(scheduler)
-
-    return call
-
-
-def rows(scheduler: Scheduler) -> list[Row]:
-    """Returns a row for all steps of the sweep, by which the remaining time is estimated, and one for each run that trains."""
-    found, taken = [], 0
-    for task in (attempt.task for attempt in scheduler.running):
-        at, steps = task.progress(), task.job.run.steps
-        taken += at.step
-        found.append(Row(task.name, at.step, steps, text_of(at, steps)))
-    outcomes = scheduler.outcomes()
-    asked = sum(one.job.run.steps or 0 for one in outcomes if one.state != "failed")
-    taken += sum(one.job.run.steps or 0 for one in outcomes if one.state == "done")
-    return [Row("all steps", taken, asked or None, states_text(outcomes)), *found]
-
-
-def line(table: Sequence[Row]) -> str:
-    """Returns rows as one line: the steps and the return of the runs that train, and how many are in each state."""
-    everything, *runs = table
-    return "; ".join([*(f"{row.name} {row.text}" for row in runs[:MAX_NAMED]), everything.text])
-
-
-def text_of(progress: JobProgress, steps: int | None) -> str:
-    """Returns how far a run is.
-
-    >>> text_of(JobProgress(1500, mean_return=12.5), 20000)
-    '1,500 of 20,000 steps, return 12.50'
-    """
-    asked = f" of {steps:,}" if steps else ""
-    values = {"return": progress.mean_return, "best evaluation": progress.best}
-    known = [f", {name} {value:,.2f}" for name, value in values.items() if math.isfinite(value)]
-    return f"{progress.step:,}{asked} steps{''.join(known)}"
-
-
-def states_text(outcomes: Iterable[RunOutcome]) -> str:
+def states_text(works: Iterable[Work]) -> str:
     """Returns how many runs are in each state, such as ``2 running, 3 done``."""
-    found = count(one.state for one in outcomes)
+    found = count(one.state for one in works)
     return ", ".join(f"{number} {state}" for state, number in found.items() if number)

@@ -19,7 +19,7 @@ from rejeu.algorithms.search import SearchSpace
 from rejeu.checkpoints.run_folder import dated
 from rejeu.core.errors import MissingExtra
 from rejeu.core.interrupt import Interrupt
-from rejeu.lab.experiments import search as searches, study as studies, study_plan as plans
+from rejeu.lab.experiments import display, search as searches, study as studies, study_plan as plans
 from rejeu.lab.experiments.process import default_workers
 from rejeu.lab.experiments.search import Final, Search, Watch
 from rejeu.lab.experiments.study import Study, StudyFolder, Trial
@@ -117,7 +117,7 @@ def tune(
         trials: number of trials.
         folder: study folder; None for a new one under ``runs``.
         workers: trials at once; None for half as many as there are cores. With one the study is reproducible.
-        verbose: 1 prints a line for each trial, 0 nothing.
+        verbose: 1 prints a line for each trial and shows the trainings, 0 nothing.
         env_kwargs: keyword arguments of the environment.
         preset: what trials start from and the winner is compared with; None for rejeu's, else the algorithm's defaults.
         hyperparameters: values that are set instead of searched.
@@ -166,7 +166,7 @@ def tune(
     echo: Echo = print if verbose else lambda text: None
     config = RunConfig(env=plan.default.env_id, env_kwargs=plan.env_kwargs, imports=tuple(imports))
     with Interrupt() as stop:
-        result = run(study, config, workers, stop, lines(echo, study), echo)
+        result = run(study, config, workers, stop, lines(echo, study), echo, bool(verbose))
     echo(str(result))
     return result
 
@@ -188,6 +188,7 @@ def run(
     stop: Interrupt,
     watch: Watch,
     echo: Echo,
+    progress: bool = True,
 ) -> Result:
     """Searches, writes the winner, compares it with the default, and writes the page about that; returns the result.
 
@@ -198,13 +199,15 @@ def run(
         stop: ends the study where it is.
         watch: called with all trials when there is news.
         echo: takes messages.
+        progress: whether the trainings are shown; see :func:`rejeu.lab.experiments.display.shown`.
     """
     plan, folder = study.plan, study.folder
     at_once = workers or default_workers()
     imports = tuple(modules_of(plan.default.algorithm, config.imports))
     config = dataclasses.replace(config, imports=imports, checkpoint_minutes=plan.checkpoint_minutes)
     search = Search(study, config, at_once, stop)
-    search.run(watch)
+    with display.shown(search.scheduler, lambda: how_far(study), progress) as show:
+        search.run(watch, show)
     trials = study.trials()
     best = studies.best_of(trials)
     compared = None
@@ -225,6 +228,14 @@ def run(
         except (MissingExtra, OSError) as error:
             notes.append(f"no {folder.page.name}: {error}")
     return Result(folder.path, plan, tuple(trials), best, compared, complete, stop.signal, tuple(notes))
+
+
+def how_far(study: Study) -> str:
+    """Returns how many trials have ended, and which is the best so far."""
+    trials = study.trials()
+    text = f"{sum(one.has_ended for one in trials)} of {study.plan.trials} trials have ended"
+    best = studies.best_of(trials)
+    return text if best is None else f"{text}, best {study.plan.measure} {number(best.value)} (trial {best.index})"
 
 
 def announcement(plan: StudyPlan, trials: Sequence[Trial] = (), workers: int = 1) -> str:
@@ -252,15 +263,14 @@ def source(study: Study, best: Trial) -> str:
 
 def lines(echo: Echo, study: Study) -> Watch:
     """Returns a function that prints a line for each trial that has ended since the last call."""
-    known = {one.index for one in study.trials() if one.state not in ("waiting", "running")}
+    known = {one.index for one in study.trials() if one.has_ended}
 
     def watch(trials: list[Trial]) -> None:
         best = studies.best_of(trials)
         for one in trials:
-            if one.state in ("waiting", "running") or one.index in known:
-                continue
-            known.add(one.index)
-            echo(line(one, study.plan) + "  (best)" * (one is best))
+            if one.has_ended and one.index not in known:
+                known.add(one.index)
+                echo(line(one, study.plan) + "  (best)" * (one is best))
 
     return watch
 

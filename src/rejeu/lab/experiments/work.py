@@ -17,9 +17,8 @@ import shutil
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Literal
 
-import numpy as np
 from msgspec import Meta
 
 from rejeu.checkpoints.run_folder import newest_step
@@ -27,9 +26,9 @@ from rejeu.core import atomic
 from rejeu.core.errors import CheckpointError
 from rejeu.envs.registry import are_plain
 from rejeu.lab.experiments.process import LOST
-from rejeu.lab.reporting.runs import EVALUATIONS, METRICS, is_locked
+from rejeu.lab.reporting.runs import is_locked
 from rejeu.lab.runs.config import RunConfig, Task, written
-from rejeu.logs.tables import read_bytes, read_table
+from rejeu.logs.tables import read_bytes
 
 HIDDEN = ".sweep"
 MAX_NAME = 150
@@ -116,28 +115,8 @@ def job_name(*parts: object) -> str:
     return f"{re.sub(r'[^A-Za-z0-9_.]+', '-', text).strip('-.')[: MAX_NAME - 20]}-seed{seed}"
 
 
-class JobProgress(NamedTuple):
-    """Progress of a run, from the ends of its tables."""
-
-    step: int = 0
-    mean_return: float = float("nan")
-    best: float = float("nan")
-    """Best mean return of an evaluation."""
-
-
-@dataclass(frozen=True)
-class RunOutcome:
-    """The outcome of one job."""
-
-    job: Job
-    state: State
-    exit_status: int | None
-    path: Path
-    log: Path
-
-
 class Work:
-    """A job in the folder of an experiment, and its files. Mutable."""
+    """A job in the folder of an experiment, its files, and what has become of it. Mutable."""
 
     ending: Ending | None = None
     """How it ended, None before."""
@@ -185,8 +164,9 @@ class Work:
         """Writes that it is done or has failed."""
         atomic.write(self.exit, f"{status}\n")
 
+    @property
     def state(self) -> State:
-        """Returns its state, by its files."""
+        """Its state, by its files."""
         if self.is_training() or (self.claim.is_file() and is_locked(self.claim)):
             return "running"
         status = self.exit_status()
@@ -195,11 +175,6 @@ class Work:
         if status:
             return "failed"
         return "stopped" if self.path.is_dir() else "waiting"
-
-    def outcome(self) -> RunOutcome:
-        """Returns what has become of it."""
-        status = self.exit_status() if self.status is None else self.status
-        return RunOutcome(self.job, self.state(), status, self.path, self.log)
 
     def has_result(self) -> bool:
         """Returns whether its files contain what it was trained for."""
@@ -243,15 +218,3 @@ class Work:
     def drop_checkpoints(self) -> None:
         """Deletes its checkpoints."""
         shutil.rmtree(self.path / "checkpoints", ignore_errors=True)
-
-    def progress(self) -> JobProgress:
-        """Returns how far its run is."""
-        metrics = read_table(self.path / METRICS, ("step", "rollout/ep_rew_mean"))
-        evaluations = read_table(self.path / EVALUATIONS, ("step", "mean_return"))
-        steps = [column[-1] for column in (metrics.column("step"), evaluations.column("step")) if len(column)]
-        returns, values = metrics.column("rollout/ep_rew_mean"), evaluations.column("mean_return")
-        return JobProgress(
-            int(max((one for one in steps if np.isfinite(one)), default=0)),
-            float(returns[-1]) if len(returns) else float("nan"),
-            float(np.nanmax(values)) if np.isfinite(values).any() else float("nan"),
-        )

@@ -35,6 +35,8 @@ POINTS = 40
 """Points of the small curve."""
 COLUMNS = ("run", "environment", "algorithm", "state", "steps", "best", "rate", "curve")
 """Titles of a table, in the order of :func:`cells`."""
+N_TEXT = 3
+"""First columns that are text, and that a narrow terminal folds."""
 BARS = "▁▂▃▄▅▆▇█"
 FILES = (CONFIG, EPISODES, METRICS, EVALUATIONS, WARNINGS, "agent.safetensors", "checkpoints", "paused", "video.mp4")
 PICTURES = ("video.mp4", "curve.png")
@@ -84,6 +86,11 @@ class Rows:
             elif path not in self._known:
                 self._known[path] = Known(None, nothing(path, "unread"), None, 0.0)
         return [{**self._known[path].row, "run": self.name_of(path)} for path in sorted(self._known)]
+
+    def row(self, path: Path) -> Row:
+        """Returns the row of one run."""
+        self._update(path)
+        return self._known[path].row
 
     def name_of(self, path: Path) -> str:
         """Returns the path of a run below the folder, which names it."""
@@ -197,9 +204,14 @@ def curve(run: RunSummary) -> list[float]:
 
 def cells(row: Row) -> dict[str, str]:
     """Returns a row as texts, by the titles of :data:`COLUMNS`."""
-    texts = (row["run"], row["env"], row["algorithm"], row["state"])
+    names = (row["run"], row["env"], row["algorithm"], row["state"])
     own = (steps_text(row), best_text(row), rate_text(row), bars(row["curve"]))
-    return dict(zip(COLUMNS, (shown(text, 300) for text in (*texts, *own)), strict=True))
+    return dict(zip(COLUMNS, (shown(text, 300) for text in (*names, *own)), strict=True))
+
+
+def texts(row: Row) -> list[str]:
+    """Returns a row as texts, in the order of :data:`COLUMNS`."""
+    return [*cells(row).values()]
 
 
 def steps_text(row: Row) -> str:
