@@ -161,8 +161,8 @@ def take_turn(program: OffPolicyProgram, env: FunctionalEnv, loop: Loop, limits:
     """Returns what the ``i``-th turn of a chunk passes on."""
     config, algorithm, replay, before = program.config, program.algorithm, program.replay, loop.carry
     assert before.action is not None
-    loop = step_envs(program, env, loop, before.action, limits, i)
-    result, episodes, learned = loop.result, loop.carry.episodes, loop.learned
+    loop, result = step_envs(program, env, loop, before.action, limits, i)
+    episodes, learned = loop.carry.episodes, loop.learned
     kept = result.kept & ~loop.nonfinite_env & all_finite(before.action)  # a run with NaN goes on until the chunk ends
     ring = replay.add(loop.experience, before.action, result.reward, result.terminated, result.obs, kept)
     ring = replay.begin(ring, episodes.obs, episodes.ended)

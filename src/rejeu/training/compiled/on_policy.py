@@ -114,8 +114,8 @@ def take_turn(program: OnPolicyProgram, env: FunctionalEnv, loop: Loop, limits: 
     actor, key = program.algorithm.actor(loop.learned.state), nth(carry.key, clock.step)
     action, explorer = program.explorer.act(carry.explorer, actor, before.obs, before.ended, key, clock)
     action = action.astype(steps.action.dtype)
-    loop = step_envs(program, env, loop, action, limits, i)
-    result, episodes = loop.result, loop.carry.episodes
+    loop, result = step_envs(program, env, loop, action, limits, i)
+    episodes = loop.carry.episodes
     put = lambda stores, values: jax.tree.map(lambda s, v: s.at[t].set(v.astype(s.dtype)), stores, values)  # noqa: E731
     steps = steps._replace(
         obs=put(steps.obs, before.obs),

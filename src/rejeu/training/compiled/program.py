@@ -103,11 +103,8 @@ class StepResult(NamedTuple):
     reward: Array
     """``float32 (n_envs,)``."""
     terminated: Array
-    truncated: Array
     kept: Array
     """Which of the steps count, ``bool (n_envs,)``; all but in the last turn."""
-    action: Array
-    """What was done, in the range of algorithms."""
 
 
 class Learned(NamedTuple):
@@ -152,7 +149,6 @@ class Loop(NamedTuple):
     experience: Any
     """The replay buffer, or the rollout."""
     learned: Learned
-    result: StepResult
     log: EpisodeLog
     nonfinite_env: Array
     """Whether a reward or an observation was not finite in this chunk after a finite action, ``bool[]``."""
@@ -167,8 +163,6 @@ class ChunkReport(NamedTuple):
     is_finite: Array
     """Whether the state is finite after the chunk, ``bool[]``."""
     nonfinite_env: Array
-    result: StepResult
-    """Of the newest turn."""
     log: EpisodeLog
 
 
@@ -234,12 +228,10 @@ class Program(ABC):
         program = self.with_hyperparameters(carry.hyper)
         first_episode = carry.episodes.n_finished
         state, carry = program.packing.unpack(carry.state), carry._replace(state=None)
-        action = experience.action[0] if carry.action is None else carry.action  # of its shape
         loop = Loop(
             carry,
             experience,
             program.nothing_learned(env, state, carry, experience),
-            no_result(carry.episodes, action),
             empty_log(program.capacity, program.n_envs),
             jnp.bool(False),
         )
@@ -252,7 +244,7 @@ class Program(ABC):
         learned = loop.learned
         is_finite = check(jax.tree.leaves(learned.state), {})
         counted = learned.metrics, learned.n_updates, learned.n_bad
-        report = ChunkReport(*counted, is_finite, loop.nonfinite_env, loop.result, loop.log)
+        report = ChunkReport(*counted, is_finite, loop.nonfinite_env, loop.log)
         carry = loop.carry._replace(state=program.packing.pack(learned.state), in_a_row=learned.in_a_row)
         return carry, loop.experience, report
 
@@ -310,13 +302,6 @@ def changed(config: Any, hyper: dict[str, Array]) -> Any:
     return copied
 
 
-def no_result(episodes: EpisodeState, action: Array) -> StepResult:
-    """Returns the result before the first turn of a chunk; ``action`` has the shape of actions."""
-    n_envs = len(episodes.ended)
-    never = jnp.zeros(n_envs, bool)
-    return StepResult(episodes.obs, jnp.zeros(n_envs, jnp.float32), never, never, never, action)
-
-
 def empty_log(capacity: int, n_envs: int) -> EpisodeLog:
     """Returns a log without episodes."""
     shape = (capacity, n_envs)
@@ -338,8 +323,10 @@ def plain(space: gym.Space, obs: PyTree) -> PyTree:
     return jax.tree.unflatten(spaces.structure(space), parts)
 
 
-def step_envs(program: Program, env: FunctionalEnv, loop: Loop, action: Array, limits: Limits, turn: Array) -> Loop:
-    """Takes one step of all environments, and starts new episodes where some ended.
+def step_envs(
+    program: Program, env: FunctionalEnv, loop: Loop, action: Array, limits: Limits, turn: Array
+) -> tuple[Loop, StepResult]:
+    """Takes one step of all environments, and starts new episodes where some ended; returns what is passed on, and the step.
 
     Args:
         program: what is compiled.
@@ -378,12 +365,9 @@ def step_envs(program: Program, env: FunctionalEnv, loop: Loop, action: Array, l
         jnp.where(before.ended, 0.0, program.config.gamma * before.running_return) + reward,
         before.n_finished + jnp.sum(counts, dtype=jnp.uint32),
     )
-    return loop._replace(
-        carry=loop.carry._replace(episodes=episodes),
-        result=StepResult(obs, reward, terminated, truncated, kept, action),
-        log=log,
-        nonfinite_env=loop.nonfinite_env | (all_finite(action) & ~all_finite(reward, *jax.tree.leaves((obs, fresh)))),
-    )
+    spoiled = all_finite(action) & ~all_finite(reward, *jax.tree.leaves((obs, fresh)))
+    carry, nonfinite_env = loop.carry._replace(episodes=episodes), loop.nonfinite_env | spoiled
+    return loop._replace(carry=carry, log=log, nonfinite_env=nonfinite_env), StepResult(obs, reward, terminated, kept)
 
 
 def all_finite(*arrays: Array) -> Array:
