@@ -25,7 +25,7 @@ from gymnasium.vector.utils import CloudpickleWrapper
 
 from rejeu.core.errors import WorkerError
 from rejeu.envs.workers import process
-from rejeu.envs.workers.process import Copied, Handover, WorkerDescription, WorkerFailure
+from rejeu.envs.workers.process import Handover, WorkerDescription, WorkerFailure
 
 CLOSE_SECONDS = 5.0
 """Seconds that workers have to exit before they are terminated."""
@@ -406,12 +406,12 @@ START_METHOD = "forkserver" if sys.platform == "linux" else "spawn"
 class ProcessWorker(Worker):
     """A handle of a worker process on this machine."""
 
-    def __init__(self, number: int, make: Callable[[], gym.Env], context: Any, encoder: Handover) -> None:
-        """Starts the process. ``encoder`` is passed to :func:`rejeu.envs.workers.process.serve`."""
+    def __init__(self, number: int, make: Callable[[], gym.Env], context: Any, handover: Handover) -> None:
+        """Starts the process. ``handover`` is passed to :func:`rejeu.envs.workers.process.serve`."""
         pipe, theirs = context.Pipe()
         super().__init__(number, pipe)
         self._ended: str | None = None
-        arguments = (theirs, CloudpickleWrapper(make), encoder)
+        arguments = (theirs, CloudpickleWrapper(make), handover)
         self.process = context.Process(target=process.serve, args=arguments, daemon=True)
         self.process.start()
         theirs.close()
@@ -458,14 +458,14 @@ class Processes(Starter):
     def __init__(
         self,
         start_method: str | None = None,
-        encoders: Callable[[Any], Callable[[int], Handover]] | None = None,
+        handovers: Callable[[Any], Callable[[int], Handover]] | None = None,
         preload: str | None = None,
     ) -> None:
         """Prepares the start of processes.
 
         Args:
             start_method: start method of ``multiprocessing``. None uses :data:`START_METHOD`.
-            encoders: takes the ``multiprocessing`` context and returns a function that returns the encoder of each worker by
+            handovers: takes the ``multiprocessing`` context and returns a function that returns the handover of each worker by
                 its number. None: observations are sent with the dtypes of the space.
             preload: name of an additional module that the workers need.
         """
@@ -474,10 +474,10 @@ class Processes(Starter):
         if start_method == "forkserver":
             # Imported once, in the server, so that a worker starts in milliseconds. The import starts no threads.
             self._context.set_forkserver_preload([process.__name__, *([] if preload is None else [preload])])
-        self._encoder_of = (lambda number: Copied()) if encoders is None else encoders(self._context)
+        self._handover_of = (lambda number: process.as_declared) if handovers is None else handovers(self._context)
 
     def start(self, number: int, make: Callable[[], gym.Env]) -> ProcessWorker:
-        return ProcessWorker(number, make, self._context, self._encoder_of(number))
+        return ProcessWorker(number, make, self._context, self._handover_of(number))
 
     def close(self) -> None:
         """Does nothing: the workers own all that was started."""

@@ -7,7 +7,6 @@ import signal
 import socket
 import threading
 import traceback
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
@@ -75,48 +74,42 @@ def rows(space: gym.Space, buffers: Sequence[Any], n_envs: int) -> list[np.ndarr
     ]
 
 
-class Handover(ABC):
-    """How a worker hands over observations. Abstract; sent to the worker, which calls it once."""
+class Encoders(NamedTuple):
+    """What takes an observation, and returns what is sent in its place."""
 
-    @abstractmethod
-    def __call__(self, space: gym.Space) -> Callable[[Any], Any]:
-        """Returns a function that takes an observation, and returns what is sent in its place."""
-
-
-class ToSharedMemory(Handover):
-    """Writes observations into shared memory, and sends None."""
-
-    def __init__(self, buffers: Sequence[Any], n_envs: int, number: int) -> None:
-        """Takes the memory of :func:`rows`, and the index of the environment."""
-        self.buffers, self.n_envs, self.number = buffers, n_envs, number
-
-    def __call__(self, space: gym.Space) -> Callable[[Any], None]:
-        put, number = validation.make_writer(space, rows(space, self.buffers, self.n_envs)), self.number
-        return lambda obs: put(number, obs)
+    encode: Callable[[Any], Any]
+    keep: Callable[[Any], Any]
+    """The same of final observations, which must outlast the next one."""
 
 
-class ToLeaves(Handover):
+Handover = Callable[[gym.Space], Encoders]
+"""How a worker hands over observations of a space; sent to the worker."""
+
+
+def in_shared_memory(buffers: Sequence[Any], n_envs: int, number: int, space: gym.Space) -> Encoders:
+    """Writes observations of environment ``number`` into the memory of :func:`rows`; of final ones the leaves are sent."""
+    put = validation.make_writer(space, rows(space, buffers, n_envs))
+    return Encoders(partial(put, number), as_leaves(space).keep)
+
+
+def as_leaves(space: gym.Space) -> Encoders:
     """Sends observations as the list of their leaves, arrays of the kept dtypes."""
+    stores = [np.zeros((1, *leaf.shape), leaf.dtype) for leaf in leaves(space)]
+    put = validation.make_writer(space, stores)
 
-    def __call__(self, space: gym.Space) -> Callable[[Any], list[np.ndarray]]:
-        stores = [np.zeros((1, *leaf.shape), leaf.dtype) for leaf in leaves(space)]
-        put = validation.make_writer(space, stores)
+    def encode(obs: Any) -> list[np.ndarray]:
+        put(0, obs)
+        return [np.array(store[0]) for store in stores]
 
-        def encode(obs: Any) -> list[np.ndarray]:
-            put(0, obs)
-            return [np.array(store[0]) for store in stores]
-
-        return encode
+    return Encoders(encode, encode)
 
 
-class Copied(Handover):
+def as_declared(space: gym.Space) -> Encoders:
     """Sends observations with their structure and the dtypes of the space."""
-
-    def __call__(self, space: gym.Space) -> Callable[[Any], Any]:
-        return partial(validation.copy_observation, space)
+    return Encoders(*[partial(validation.copy_observation, space)] * 2)
 
 
-def serve(pipe: Connection, make: CloudpickleWrapper, encoder: Handover) -> None:
+def serve(pipe: Connection, make: CloudpickleWrapper, handover: Handover) -> None:
     """Answers requests for one environment, until it is closed or the main process exits.
 
     The global generators of NumPy and Python, of which an environment may draw, are its own: seeded at random here, and from
@@ -125,7 +118,7 @@ def serve(pipe: Connection, make: CloudpickleWrapper, encoder: Handover) -> None
     Args:
         pipe: connection to the main process.
         make: makes the environment.
-        encoder: encodes the observations.
+        handover: how observations are handed over.
     """
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # the main process handles Ctrl-C, and may take another step
@@ -135,11 +128,10 @@ def serve(pipe: Connection, make: CloudpickleWrapper, encoder: Handover) -> None
         env = make.fn()
         if (fault := validation.environment_fault(env)) is not None:
             raise TypeError(fault)
-        encode = encoder(env.observation_space)
-        keep = ToLeaves()(env.observation_space) if isinstance(encoder, ToSharedMemory) else encode
+        encoders = handover(env.observation_space)
         send(pipe, WorkerDescription(env.observation_space, env.action_space, env.metadata, env.render_mode))
         while (request := receive(pipe))[0] != "close":
-            send(pipe, _answered(env, request, encode, keep))
+            send(pipe, _answered(env, request, encoders))
     except (EOFError, ConnectionError):
         pass
     except Exception as error:  # any exception of the constructor: the main process raises it
@@ -160,13 +152,13 @@ class RemoteWorker:
         pipe = as_connection(connected)
         send(pipe, {"node": node_address(), "versions": cluster.versions()})
         try:
-            make, encoder = receive(pipe)
+            make, handover = receive(pipe)
         except EOFError:
             return
         except Exception as error:  # unpickling a function of a module that is missing here can raise anything
             send(pipe, WorkerFailure("raised", str(error), traceback.format_exc()))
             return
-        serve(pipe, make, encoder)
+        serve(pipe, make, handover)
 
 
 def node_address() -> str:
@@ -199,10 +191,10 @@ def receive_exactly(connected: socket.socket, n: int) -> bytes:
     return data
 
 
-def _answered(env: gym.Env, request: Any, encode: Callable[[Any], Any], keep: Callable[[Any], Any]) -> Any:
+def _answered(env: gym.Env, request: Any, encoders: Encoders) -> Any:
     """Returns the answer of the environment, or a :class:`WorkerFailure`."""
     try:
-        return _answer(env, encode, keep, *request)
+        return _answer(env, encoders, *request)
     except BadEnvironmentError as error:
         return WorkerFailure("bad answer", str(error), traceback.format_exc())
     except Exception as error:  # the environment can raise anything
@@ -210,18 +202,18 @@ def _answered(env: gym.Env, request: Any, encode: Callable[[Any], Any], keep: Ca
         return WorkerFailure(kind, str(error), traceback.format_exc())
 
 
-def _answer(env: gym.Env, encode: Callable[[Any], Any], keep: Callable[[Any], Any], name: str, *arguments: Any) -> Any:
+def _answer(env: gym.Env, encoders: Encoders, name: str, *arguments: Any) -> Any:
     """Returns the answer of an environment to one request."""
     if name == "step":
         obs, *rest = validation.step_env(env, *arguments)
-        return encode(obs), *rest
+        return encoders.encode(obs), *rest
     if name == "step_and_reset":
-        return step_and_reset(env, encode, keep, *arguments)
+        return step_and_reset(env, encoders, *arguments)
     if name == "reset":
         if arguments and arguments[0] is not None:
             seed_globals(arguments[0])
         obs, info = validation.reset_env(env, *arguments)
-        return encode(obs), info
+        return encoders.encode(obs), info
     if name == "snapshot":
         return snapshot.state_of(env)
     if name == "restore":
@@ -239,14 +231,13 @@ def seed_globals(seed: int | None) -> None:
 
 
 def step_and_reset(
-    env: gym.Env, encode: Callable[[Any], Any], keep: Callable[[Any], Any], action: Any
+    env: gym.Env, encoders: Encoders, action: Any
 ) -> tuple[Any, float, bool, bool, dict[str, Any], Any, dict[str, Any]]:
     """Steps an environment, and resets it if the episode has ended.
 
     Args:
         env: the environment.
-        encode: encodes the observation to act on.
-        keep: encodes the final observation of an episode, which must outlast the next.
+        encoders: of the observations.
         action: the action.
 
     Returns:
@@ -255,10 +246,10 @@ def step_and_reset(
     """
     obs, reward, terminated, truncated, info = validation.step_env(env, action)
     if not (terminated or truncated):
-        return encode(obs), reward, terminated, truncated, info, None, {}
-    final = keep(obs)
+        return encoders.encode(obs), reward, terminated, truncated, info, None, {}
+    final = encoders.keep(obs)
     obs, reset_info = validation.reset_env(env)
-    return encode(obs), reward, terminated, truncated, info, final, reset_info
+    return encoders.encode(obs), reward, terminated, truncated, info, final, reset_info
 
 
 def call_method(env: gym.Env, name: str, arguments: tuple[Any, ...], keywords: dict[str, Any]) -> Any:

@@ -25,7 +25,7 @@ from rejeu.core import validation
 from rejeu.core.errors import WorkerError
 from rejeu.envs.workers import cluster, process
 from rejeu.envs.workers.pool import LOOK_SECONDS, Starter, Worker, seconds_until
-from rejeu.envs.workers.process import TOKEN_BYTES, RemoteWorker, ToLeaves
+from rejeu.envs.workers.process import TOKEN_BYTES, RemoteWorker
 
 SLOW_START_SECONDS = 30.0
 """Seconds after which a warning says that a worker still waits for its place on the cluster."""
@@ -187,7 +187,7 @@ class ActorWorker(Worker):
             self.end()
             raise
         self.asked, self.asked_at = "make", time.monotonic()
-        process.send(self.pipe, (self._make, ToLeaves()))
+        process.send(self.pipe, (self._make, process.as_leaves))
 
     def _try_again(self) -> None:
         """Starts another actor, because Ray may place one on a node that it does not know yet to be lost.

@@ -21,7 +21,7 @@ from rejeu.envs.base import SUCCESS_KEYS, Seed, Step, VectorEnv, describe_spec, 
 from rejeu.envs.goals import GoalFunctions
 from rejeu.envs.workers import process
 from rejeu.envs.workers.pool import RESTARTED, TIMEOUT, Processes, Restarted, Starter, Workers
-from rejeu.envs.workers.process import ToSharedMemory, WorkerFailure
+from rejeu.envs.workers.process import Handover, WorkerFailure
 
 INDEX = np.uint16
 """Data type of the indices of environments in a record."""
@@ -142,7 +142,7 @@ class InWorkers(VectorEnv):
         self._obs = jax.tree.unflatten(structure(self.observation_space), self._stores)
         self._rows: list[np.ndarray] | None = None
         """Shared memory for the observations of all environments, None if workers send them."""
-        starter = Processes(encoders=self._share) if starter is None else starter
+        starter = Processes(handovers=self._share) if starter is None else starter
         self.workers = Workers([make_one] * n_envs, starter, worker_timeout, restart_workers)
         for i, made in enumerate(self.workers.descriptions):
             if (made.observation_space, made.action_space) != (self.observation_space, self.action_space):
@@ -152,11 +152,13 @@ class InWorkers(VectorEnv):
                     f"those of the first are {self.observation_space} and {self.action_space}; all must be the same"
                 )
 
-    def _share(self, context: Any) -> Callable[[int], ToSharedMemory]:
+    def _share(self, context: Any) -> Callable[[int], Handover]:
         """Allocates shared memory for the observations, and returns a function that returns each worker's use of it."""
         buffers = [context.RawArray(ctypes.c_byte, max(self.n_envs * leaf.nbytes, 1)) for leaf in self._leaves]
         self._rows = process.rows(self.observation_space, buffers, self.n_envs)
-        return partial(ToSharedMemory, buffers, self.n_envs)
+        return partial(
+            partial, process.in_shared_memory, buffers, self.n_envs
+        )  # without the vector, which may be let go
 
     def reset(self, seed: Seed = None) -> Any:
         seed = self._seed if seed is None else seed

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Any
 
 import gymnasium as gym
 
 from rejeu.core.errors import BadEnvironmentError
-from rejeu.envs.validation import copy_observation, environment_fault, id_of, reset_env, with_location
-from rejeu.envs.workers.process import step_and_reset
+from rejeu.envs.validation import environment_fault, id_of, reset_env, with_location
+from rejeu.envs.workers.process import as_declared, step_and_reset
 from rejeu.sb3.common.vec_env.base_vec_env import Indices, SingleEnvs, StepResult, stacked
 
 __all__ = ["DummyVecEnv"]
@@ -55,13 +54,13 @@ class DummyVecEnv(SingleEnvs):
         self.n_steps = 0
         """Number of steps of the vector."""
         self._actions: Any = None
-        self._copies = [partial(copy_observation, env.observation_space) for env in self.envs]
+        self._encoders = [as_declared(env.observation_space) for env in self.envs]
 
     def reset(self) -> Any:
         parts = []
         for i, env in enumerate(self.envs):
             obs, self.reset_infos[i] = self._located(i, reset_env, env, self._seeds[i], self._options[i])
-            parts.append(self._copies[i](obs))
+            parts.append(self._encoders[i].encode(obs))
         self._reset_seeds()
         self._reset_options()
         return stacked(self.observation_space, parts)
@@ -74,8 +73,8 @@ class DummyVecEnv(SingleEnvs):
         self.n_steps += 1
         return self._stepped(
             # Copies: an environment may write its next observation into the same array.
-            self._located(i, step_and_reset, env, copy, copy, action)
-            for i, (env, copy, action) in enumerate(zip(self.envs, self._copies, self._actions, strict=False))
+            self._located(i, step_and_reset, env, encoders, action)
+            for i, (env, encoders, action) in enumerate(zip(self.envs, self._encoders, self._actions, strict=False))
         )
 
     def _located(self, i: int, function: Callable[..., Any], *arguments: Any) -> Any:
