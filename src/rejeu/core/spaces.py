@@ -109,7 +109,7 @@ def structure(space: spaces.Space) -> Any:
     """Returns the tree structure of one observation of ``space``."""
     import jax  # here, so that worker processes start without it
 
-    return jax.tree.structure(_skeleton(space))
+    return jax.tree.structure(plain(space, space))
 
 
 def flat_keys(tree_structure: Any) -> list[str] | None:
@@ -132,7 +132,7 @@ def narrow(dtype: Any) -> str:
 
 
 def parts(space: spaces.Space, observation: Any) -> list[Any]:
-    """Returns the parts of an observation, one for each of :func:`leaves`, in their order.
+    """Returns the parts of an observation, one for each of :func:`leaves`, in their order; of the space itself its leaves.
 
     Raises:
         KeyError: if a key of the space is missing.
@@ -474,34 +474,26 @@ def same(space: spaces.Space, other: spaces.Space, bounds: bool) -> bool:
     ``float32``: MuJoCo's actions have this dtype in Gymnasium, and ``float64`` in EnvPool.
     """
     if bounds:
-        return describe(_single_precision(space)) == describe(_single_precision(other))
+        return describe(space, single=True) == describe(other, single=True)
     return leaves(space) == leaves(other)
 
 
-def _single_precision(space: spaces.Space) -> spaces.Space:
+def describe(space: spaces.Space, single: bool = False) -> Any:
+    """Returns a description of a space in JSON values; infinite bounds are strings. With ``single`` floats are float32."""
     if isinstance(space, spaces.Dict):
-        return spaces.Dict({key: _single_precision(part) for key, part in space.spaces.items()})
+        return {"Dict": {key: describe(part, single) for key, part in sorted(space.spaces.items())}}
     if isinstance(space, spaces.Tuple):
-        return spaces.Tuple([_single_precision(part) for part in space.spaces])
-    if isinstance(space, spaces.Box) and space.dtype.kind == "f":
-        with np.errstate(over="ignore"):
-            return spaces.Box(space.low.astype(np.float32), space.high.astype(np.float32), dtype=np.float32)
-    return space
-
-
-def describe(space: spaces.Space) -> Any:
-    """Returns a description of a space in JSON values; infinite bounds are strings."""
-    if isinstance(space, spaces.Dict):
-        return {"Dict": {key: describe(part) for key, part in sorted(space.spaces.items())}}
-    if isinstance(space, spaces.Tuple):
-        return {"Tuple": [describe(part) for part in space.spaces]}
+        return {"Tuple": [describe(part, single) for part in space.spaces]}
     if isinstance(space, spaces.Box):
+        is_float = space.dtype.kind == "f"
+        dtype = np.dtype(np.float32 if is_float and single else space.dtype)
+        low, high = (_bounds(bound, dtype) for bound in (space.low, space.high))
         return {
             "Box": {
-                "low": _bounds(space.low),
-                "high": _bounds(space.high),
+                "low": low,
+                "high": high,
                 "shape": list(space.shape),
-                "dtype": np.dtype(space.dtype).name if np.dtype(space.dtype).kind == "f" else narrow(space.dtype),
+                "dtype": dtype.name if is_float else narrow(dtype),
             }
         }
     if isinstance(space, spaces.Discrete):
@@ -565,19 +557,12 @@ def _bound(value: Any, dtype: np.dtype) -> np.ndarray:
     return bound.astype(dtype)
 
 
-def _bounds(bounds: np.ndarray) -> Any:
+def _bounds(bounds: np.ndarray, dtype: Any) -> Any:
     """Returns one number if all bounds are equal, else a nested list; infinities as the strings ``inf`` and ``-inf``."""
-    values = bounds.astype(np.float64)
+    with np.errstate(over="ignore"):
+        values = bounds.astype(dtype).astype(np.float64)
     named = np.array([v if np.isfinite(v) else str(v) for v in values.ravel().tolist()], object).reshape(values.shape)
     return named.flat[0] if values.size and (values == values.flat[0]).all() else named.tolist()
-
-
-def _skeleton(space: spaces.Space) -> Any:
-    if isinstance(space, spaces.Dict):
-        return {key: _skeleton(part) for key, part in space.spaces.items()}
-    if isinstance(space, spaces.Tuple):
-        return tuple(_skeleton(part) for part in space.spaces)
-    return 0
 
 
 def as_batch(observation: Any, space: spaces.Space, leaves: Sequence[Leaf]) -> tuple[Any, bool]:

@@ -61,15 +61,6 @@ def to_array(value: Any, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
     return array
 
 
-def leaf_spaces(space: spaces.Space) -> list[spaces.Space]:
-    """Returns the spaces at the leaves of a space, in the order of :func:`rejeu.core.spaces.leaves`."""
-    if isinstance(space, spaces.Dict):
-        return [part for key in sorted(space.spaces) for part in leaf_spaces(space.spaces[key])]
-    if isinstance(space, spaces.Tuple):
-        return [part for one in space.spaces for part in leaf_spaces(one)]
-    return [space]
-
-
 def convert_step(answer: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
     """Returns the five values that ``step`` returned, with reward and flags as Python scalars.
 
@@ -123,7 +114,7 @@ def make_writer(space: spaces.Space, stores: Sequence[np.ndarray]) -> Callable[[
     """
     slots = [
         (store, leaf.shape, math.prod(leaf.shape), part.dtype, np.ndarray)
-        for store, leaf, part in zip(stores, leaves(space), leaf_spaces(space), strict=True)
+        for store, leaf, part in zip(stores, leaves(space), parts(space, space), strict=True)
     ]
     store, shape, size, dtype, array = slots[0]
 
@@ -458,7 +449,7 @@ def bounds_fault(space: spaces.Space, obs: Any) -> tuple[Literal["error", "warni
 
     A warning for a Box, whose bounds networks never see; an error for choices and bits, which would have no place in one.
     """
-    for leaf, part, value in zip(leaves(space), leaf_spaces(space), parts(space, obs), strict=True):
+    for leaf, part, value in zip(leaves(space), parts(space, space), parts(space, obs), strict=True):
         array = np.asarray(value)
         if isinstance(part, spaces.Box):
             low, high = part.low, part.high
@@ -483,7 +474,7 @@ def far_outside(space: spaces.Space, obs: Any) -> str | None:
 
     Far is ``FAR`` times the distance of the two bounds. Images cannot lie outside, and what is unbounded is not looked at.
     """
-    for leaf, part, array in zip(leaves(space), leaf_spaces(space), parts(space, obs), strict=True):
+    for leaf, part, array in zip(leaves(space), parts(space, space), parts(space, obs), strict=True):
         if leaf.kind != "continuous":
             continue
         assert isinstance(part, spaces.Box)
