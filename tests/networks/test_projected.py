@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rejeu.networks.batch_renorm import BatchRenorm
+from rejeu.networks.batch_renorm import BatchRenorm, in_training
 from rejeu.networks.layers import RMSNorm
 from rejeu.networks.projected import InvertedResidual, NormalizedMLP, UnitLinear, head, projected
 
@@ -72,7 +72,7 @@ def test_training_and_use_equal_numpy_and_training_moves_the_statistics_by_a_hun
     torso = jax.tree.unflatten(places, [next(leaves) if isinstance(node, BatchRenorm) else node for node in given])
     for seed in range(3):
         x = batch(seed)
-        y, after = torso.train(x)
+        y, after = in_training(torso, lambda torso: torso(x))  # noqa: B023
         np.testing.assert_allclose(y, numpy_torso(torso, x, train=True), atol=2e-4)
         first = norms_of(torso)[0], norms_of(after)[0]
         np.testing.assert_allclose(first[1].mean, 0.99 * first[0].mean + 0.01 * np.mean(x, axis=0), atol=1e-6)

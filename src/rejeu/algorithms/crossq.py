@@ -31,7 +31,7 @@ from gymnasium import spaces
 from jax import Array
 
 from rejeu.algorithms import optimizers, search
-from rejeu.algorithms.sac.continuous import LOG_STD_RANGE, squared_error
+from rejeu.algorithms.sac.continuous import clipped, squared_error, squashed
 from rejeu.algorithms.search import Integers, SearchSpace
 from rejeu.algorithms.soft import EntropyConfig, SoftCritic, soft_actor_critic
 from rejeu.core.algorithm import Algorithm, Optimizer, PyTree, Transition, ensemble, minimize
@@ -41,7 +41,7 @@ from rejeu.core.spaces import action_dimension, check_box_action, leaves
 from rejeu.core.validation import coerce, whole
 from rejeu.exploration.held_noise import held_explorer
 from rejeu.networks import Linear, PolicyConfig, Widths, action_values
-from rejeu.networks.batch_renorm import RenormalizedMLP, RenormalizedNetwork, with_statistics
+from rejeu.networks.batch_renorm import RenormalizedMLP, RenormalizedNetwork, in_training, with_statistics
 
 ACTOR_LAYERS = (256, 256)
 """Default widths of the actor."""
@@ -94,11 +94,6 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     equations = Equations(lambda critics, batch, action, cost: cost, critics_loss, action_values, has_targets=False)
     optimizer = optimizers.make(config.optimizer, config.max_grad_norm, b1=ADAM_B1)
     return make_with(config, observation_space, action_space, equations, optimizer)
-
-
-def clipped(outputs: Array) -> Array:
-    """Returns the policy's log standard deviations within those of SAC, from outputs of the actor."""
-    return jnp.clip(outputs, *LOG_STD_RANGE)
 
 
 class Equations(NamedTuple):
@@ -206,7 +201,7 @@ def joint_outputs(critics: Any, batch: Transition, next_action: Array) -> tuple[
     The critics are in training; they are returned as they are after having seen the batch.
     """
     obs, action = joined(batch.obs, batch.next_obs), joined(batch.action, next_action)
-    outputs, trained = jax.vmap(lambda critic: critic.train(obs, action))(critics)
+    outputs, trained = jax.vmap(lambda critic: in_training(critic, lambda critic: critic(obs, action)))(critics)
     now, then = jnp.split(outputs, 2, axis=1)
     return now, then, trained
 
@@ -241,12 +236,6 @@ def critics_loss(
     return loss, (errors, trained)
 
 
-def squashed(outputs: Array, log_std: Callable[[Array], Array]) -> TanhNormal:
-    """Returns the distribution of actions in [-1, 1] that the actor's outputs, ``(batch, 2 action_dim)``, mean."""
-    mean, raw = jnp.split(outputs, 2, axis=-1)
-    return TanhNormal(mean, log_std(raw))
-
-
 def actor_loss(
     actor: RenormalizedNetwork,
     critics: Any,
@@ -262,6 +251,6 @@ def actor_loss(
     The actor normalizes by ``seen``, which begins with ``obs``. With the loss come the log-probabilities of the actions drawn,
     ``(batch,)``, and the actor that has seen the batch.
     """
-    outputs, trained = actor.train(seen)
+    outputs, trained = in_training(actor, lambda actor: actor(seen))
     action, log_prob = policy(outputs[: len(jax.tree.leaves(obs)[0])]).sample_and_log_prob(key)
     return jnp.mean(alpha * log_prob - jnp.min(values(critics, obs, action), axis=0)), (log_prob, trained)

@@ -11,8 +11,8 @@ Without clipping the two are equal, but in training the gradient flows through t
 During the warm-up ``r = 1`` and ``d = 0``: plain batch normalization. Running statistics are exponential averages
 with the rate 0.01. The paper averages ``s``, we average its square, as CrossQ's authors do.
 
-The running statistics are arrays of the network like its weights, but they are not learned by gradient: ``train`` returns
-the output and the network with updated statistics. Because an optimizer's step starts from the previous network,
+The running statistics are arrays of the network like its weights, but they are not learned by gradient: :func:`in_training`
+returns the output and the network with updated statistics. Because an optimizer's step starts from the previous network,
 :func:`with_statistics` combines the two::
 
     (loss, trained), gradients = jax.value_and_grad(loss_that_returns_trained, has_aux=True)(network)
@@ -136,15 +136,6 @@ class RenormalizedMLP(eqx.Module):
             x = norm(ACTIVATIONS[self.activation](layer(x)))
         return x
 
-    def train(self, x: Array) -> tuple[Array, RenormalizedMLP]:
-        """Does the same by the batch's statistics; also returns the torso with updated statistics."""
-        x, norm = self.norms[0].train(x)
-        norms = [norm]
-        for layer, norm in zip(self.layers, self.norms[1:], strict=True):
-            x, norm = norm.train(ACTIVATIONS[self.activation](layer(x)))
-            norms.append(norm)
-        return x, eqx.tree_at(lambda torso: torso.norms, self, tuple(norms))
-
 
 class RenormalizedNetwork(eqx.Module):
     """Observation, and for a critic the action, to numbers: encoder, normalized hidden layers, one linear head."""
@@ -169,7 +160,7 @@ class RenormalizedNetwork(eqx.Module):
             leaves: those of the observations.
             action_dim: None for a network that is given no action.
             n_outputs: how many numbers come out.
-            make_torso: ``make_torso(key, n_inputs)`` returns hidden layers with ``n_outputs`` and ``train``.
+            make_torso: ``make_torso(key, n_inputs)`` returns hidden layers with ``n_outputs``.
             make_head: ``make_head(key, n_inputs, n_outputs)`` returns the last layer.
         """
         encoder_key, torso_key, head_key = jax.random.split(key, 3)
@@ -182,16 +173,9 @@ class RenormalizedNetwork(eqx.Module):
 
         A critic is given actions ``(batch, action_dim)`` as well.
         """
-        return self.head(self.torso(self._features(obs, action)))
-
-    def train(self, obs: PyTree, action: Array | None = None) -> tuple[Array, RenormalizedNetwork]:
-        """Does the same by the batch's statistics; also returns the network with updated statistics."""
-        hidden, torso = self.torso.train(self._features(obs, action))
-        return self.head(hidden), eqx.tree_at(lambda network: network.torso, self, torso)
-
-    def _features(self, obs: PyTree, action: Array | None) -> Array:
         features = self.encoder(obs)
-        return features if action is None else jnp.concatenate([features, action], axis=-1)
+        features = features if action is None else jnp.concatenate([features, action], axis=-1)
+        return self.head(self.torso(features))
 
 
 def with_statistics(network: Network, trained: Network) -> Network:

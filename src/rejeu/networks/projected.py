@@ -4,8 +4,8 @@ Batch normalization makes the scale of the weights before it irrelevant, but as 
 less. :func:`projected` scales them back: each unit's weights to the norm 1, and in FlashSAC the ``d`` gains of each
 normalization to ``sqrt(d)``. So the effective learning rate stays the same (Palenicek et al. 2025, arXiv 2502.07523).
 
-The normalization is :class:`rejeu.networks.batch_renorm.BatchRenorm` without renormalization. ``train`` returns what these
-layers compute by the statistics of the batch, and the layers with updated running statistics; a call goes by the running ones.
+The normalization is :class:`rejeu.networks.batch_renorm.BatchRenorm` without renormalization. A call goes by the running
+statistics; :func:`rejeu.networks.batch_renorm.in_training` goes by those of the batch.
 """
 
 from __future__ import annotations
@@ -74,16 +74,6 @@ class NormalizedMLP(RenormalizedMLP):
             x = ACTIVATIONS[self.activation](norm(layer(x)))
         return x
 
-    def train(self, x: Array) -> tuple[Array, NormalizedMLP]:
-        """Does the same by the batch's statistics; also returns the layers with updated statistics."""
-        x, norm = self.norms[0].train(x)
-        norms = [norm]
-        for layer, norm in zip(self.layers, self.norms[1:], strict=True):
-            x, norm = norm.train(layer(x))
-            norms.append(norm)
-            x = ACTIVATIONS[self.activation](x)
-        return x, eqx.tree_at(lambda torso: torso.norms, self, tuple(norms))
-
 
 class InvertedBlock(eqx.Module):
     """``x + f(BN(W2 f(BN(W1 x))))``, wider inside than outside by :data:`EXPANSION`: an inverted residual block."""
@@ -106,13 +96,6 @@ class InvertedBlock(eqx.Module):
         """Maps ``(batch, width)`` to ``(batch, width)`` by the running statistics."""
         f = ACTIVATIONS[self.activation]
         return x + f(self.outer(self.contract(f(self.inner(self.expand(x))))))
-
-    def train(self, x: Array) -> tuple[Array, InvertedBlock]:
-        """Does the same by the batch's statistics; also returns the block with updated statistics."""
-        f = ACTIVATIONS[self.activation]
-        hidden, inner = self.inner.train(self.expand(x))
-        y, outer = self.outer.train(self.contract(f(hidden)))
-        return x + f(y), eqx.tree_at(lambda block: (block.inner, block.outer), self, (inner, outer))
 
 
 class InvertedResidual(eqx.Module):
@@ -145,15 +128,6 @@ class InvertedResidual(eqx.Module):
         for block in self.blocks:
             x = block(x)
         return self.last(x)
-
-    def train(self, x: Array) -> tuple[Array, InvertedResidual]:
-        """Does the same by the batch's statistics; also returns the layers with updated statistics."""
-        x, norm = self.norm.train(x)
-        x, blocks = self.embedding(x), []
-        for block in self.blocks:
-            x, block = block.train(x)
-            blocks.append(block)
-        return self.last(x), eqx.tree_at(lambda torso: (torso.norm, torso.blocks), self, (norm, tuple(blocks)))
 
 
 def projected(network: Network) -> Network:

@@ -251,8 +251,18 @@ def policy(actor: Network | SdeActor, obs: PyTree) -> TanhNormal:
     """Returns the distribution of actions in [-1, 1] at ``obs``."""
     if isinstance(actor, SdeActor):
         return actor.distribution(actor.hidden(obs))
-    mean, log_std = jnp.split(actor(obs), 2, axis=-1)
-    return TanhNormal(mean, jnp.clip(log_std, *LOG_STD_RANGE))
+    return squashed(actor(obs))
+
+
+def clipped(outputs: Array) -> Array:
+    """Returns the log standard deviations of the policy, within :data:`LOG_STD_RANGE`, from outputs of the actor."""
+    return jnp.clip(outputs, *LOG_STD_RANGE)
+
+
+def squashed(outputs: Array, log_std: Callable[[Array], Array] = clipped) -> TanhNormal:
+    """Returns the distribution of actions in [-1, 1] that the actor's outputs, ``(batch, 2 action_dim)``, mean."""
+    mean, raw = jnp.split(outputs, 2, axis=-1)
+    return TanhNormal(mean, log_std(raw))
 
 
 def td_target(

@@ -23,13 +23,7 @@ import jax.numpy as jnp
 from gymnasium import spaces
 from jax import Array
 
-from rejeu.algorithms.sac.continuous import (
-    Config,
-    algorithm_of,
-    check_discrete,
-    networks,
-    squared_error,
-)
+from rejeu.algorithms.sac.continuous import Config, algorithm_of, check_discrete, networks, squared_error
 from rejeu.algorithms.soft import SoftCritic
 from rejeu.core.algorithm import Algorithm, Clock, PyTree, Transition, some_allowed, unmasked
 from rejeu.core.distributions import Categorical, forbid

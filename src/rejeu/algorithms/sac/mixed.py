@@ -26,14 +26,7 @@ import numpy as np
 from gymnasium import spaces
 from jax import Array
 
-from rejeu.algorithms.sac.continuous import (
-    LOG_STD_RANGE,
-    Config,
-    algorithm_of,
-    check_discrete,
-    networks,
-    squared_error,
-)
+from rejeu.algorithms.sac.continuous import Config, algorithm_of, check_discrete, networks, squared_error, squashed
 from rejeu.algorithms.sac.discrete import TARGET_ENTROPY_SHARE, taken
 from rejeu.algorithms.soft import SoftCritic
 from rejeu.core.algorithm import Algorithm, Clock, Metrics, PyTree, Transition
@@ -124,8 +117,7 @@ def column_sizes(space: spaces.Space) -> list[int]:
 def policy(actor: Network, obs: PyTree, n: int) -> tuple[Categorical, TanhNormal]:
     """Returns the distributions of the ``n`` combinations and of the Box components."""
     outputs = actor(obs)
-    mean, log_std = jnp.split(outputs[:, n:], 2, axis=-1)
-    return Categorical(outputs[:, :n]), TanhNormal(mean, jnp.clip(log_std, *LOG_STD_RANGE))
+    return Categorical(outputs[:, :n]), squashed(outputs[:, n:])
 
 
 def all_values(critics: PyTree, obs: PyTree, box: Array) -> Array:
