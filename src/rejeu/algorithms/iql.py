@@ -28,6 +28,7 @@ from jax import Array
 
 from rejeu.algorithms import optimizers, search
 from rejeu.algorithms.config import OffPolicyConfig, network_inputs
+from rejeu.algorithms.td3 import critics_loss
 from rejeu.core.algorithm import (
     AVERAGED,
     TD_ERROR,
@@ -39,7 +40,6 @@ from rejeu.core.algorithm import (
     copy,
     minimize,
     polyak,
-    weighted_mean,
 )
 from rejeu.core.distributions import Normal
 from rejeu.core.schedules import at
@@ -168,9 +168,3 @@ def value_loss(value: Network, obs: PyTree, recorded: Array, expectile: float) -
 def actor_loss(actor: Actor, batch: Transition, weight: Array) -> tuple[Array, None]:
     """Returns minus the log-probabilities of recorded actions, weighted by ``weight`` ``(batch,)``."""
     return -jnp.mean(weight * actor.policy(batch.obs).log_prob(batch.action)), None
-
-
-def critics_loss(critics: QNetwork, batch: Transition, target: Array) -> tuple[Array, Array]:
-    """Returns the mean squared TD errors summed over the critics, and the values, ``(n_critics, batch)``."""
-    values = action_values(critics, batch.obs, batch.action)
-    return jnp.sum(weighted_mean(jnp.square(values - target[None]), batch.weight)), values

@@ -29,6 +29,7 @@ from gymnasium import spaces
 from jax import Array
 
 from rejeu.algorithms import optimizers, search
+from rejeu.algorithms.actor_critic.gae import summed_backwards
 from rejeu.algorithms.actor_critic.steps import RolloutState as State, flat, initial_state, masked_mean, minibatches
 from rejeu.algorithms.config import network_inputs
 from rejeu.algorithms.dqn import check_epsilon, epsilon_greedy_algorithm, epsilon_schedule, metrics_of, taken
@@ -226,16 +227,7 @@ def lambda_returns(reward: Array, next_value: Array, discount: Array, ended: Arr
     Array([4., 6., 8.], dtype=float32)
     """
     mixing = jnp.where(ended, 0.0, q_lambda)
-    bootstrapped = reward + discount * (1.0 - mixing) * next_value
-    factor = discount * mixing
-
-    def back(following: Array, step: tuple[Array, Array]) -> tuple[Array, Array]:
-        bootstrapped, factor = step
-        result = bootstrapped + factor * following
-        return result, result
-
-    _, result = jax.lax.scan(back, jnp.zeros_like(reward[0]), (bootstrapped, factor), reverse=True)
-    return result
+    return summed_backwards(reward + discount * (1.0 - mixing) * next_value, discount * mixing)
 
 
 def td_loss(network: Network, batch: Samples) -> tuple[Array, Array]:

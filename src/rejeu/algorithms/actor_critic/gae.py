@@ -30,12 +30,15 @@ def advantages(
             was truncated, up to there plus the value of the last state) minus the value; with 0 it is the TD error.
     """
     delta = reward + discount * next_value - value
-    factor = jnp.where(ended, 0.0, gae_lambda * discount)
+    return summed_backwards(delta, jnp.where(ended, 0.0, gae_lambda * discount))
+
+
+def summed_backwards(value: Array, factor: Array) -> Array:
+    """Returns ``x_t = value_t + factor_t x_{t+1}``, ``(steps, n_envs)`` as both arguments; it begins with 0 after the last."""
 
     def back(following: Array, step: tuple[Array, Array]) -> tuple[Array, Array]:
-        delta, factor = step
-        advantage = delta + factor * following
-        return advantage, advantage
+        value, factor = step
+        result = value + factor * following
+        return result, result
 
-    _, result = jax.lax.scan(back, jnp.zeros_like(delta[0]), (delta, factor), reverse=True)
-    return result
+    return jax.lax.scan(back, jnp.zeros_like(value[0]), (value, factor), reverse=True)[1]
