@@ -75,7 +75,7 @@ class Judging:
         for path in self._results.keys() - {*paths}:
             del self._results[path], self._stamps[path]
             self.version += 1
-        due = [path for path in paths[: leaderboard.MAX_MODELS] if self._is_due(path)]
+        due = [path for path in paths if self._is_due(path)]
         if not due:
             return
         self._env_id = leaderboard.usual_env_id(paths)

@@ -15,6 +15,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -68,6 +69,7 @@ def grade(path: Path, seconds: float = SECONDS) -> Grade:
     language = chosen(spoken and spoken[1])
     command = [sys.executable, "-c", "from rejeu.teaching.courses.grading import main; main()"]
     quiet = {"MPLBACKEND": "agg", "PYTHONIOENCODING": "utf-8"}
+    say, found, why = partial(said, language=language), {}, ""
     try:
         done = subprocess.run(
             command,
@@ -80,17 +82,10 @@ def grade(path: Path, seconds: float = SECONDS) -> Grade:
         )
         found = json.loads(done.stdout.splitlines()[-1])
     except subprocess.TimeoutExpired:
-        return Grade(
-            path, dict.fromkeys(names), said("it took longer than {:g} seconds", seconds, language=language), language
-        )
+        why = say("it took longer than {:g} seconds", seconds)
     except (IndexError, ValueError):
-        return Grade(
-            path,
-            dict.fromkeys(names),
-            said("its process ended ({})", checks.short(done.stderr[-160:]), language=language),
-            language,
-        )
-    return Grade(path, {name: found.get(name) for name in names}, language=language)
+        why = say("its process ended ({})", checks.short(done.stderr[-160:]))
+    return Grade(path, {name: found.get(name) for name in names}, why, language)
 
 
 def main() -> None:

@@ -31,8 +31,6 @@ from rejeu.envs.make import VectorEnv
 from rejeu.envs.registry import is_plain_id
 from rejeu.logs.evaluation import Evaluation, evaluate
 
-MAX_MODELS = 1_000
-"""Upper limit on the models of a folder; the others are left out, with a line that says so."""
 MAX_BYTES = 2**28
 """Upper limit on the size of a model."""
 NARROW_SPACE = "\N{NARROW NO-BREAK SPACE}"
@@ -159,7 +157,7 @@ def usual_env_id(paths: Sequence[Path]) -> str:
         ValueError: if no file says.
     """
     ids: Counter[str] = Counter()
-    for path in paths[:MAX_MODELS]:
+    for path in paths:
         try:
             env_id = header(path).get("env_id")
         except PROBLEMS:
@@ -215,7 +213,7 @@ def build(
     results: dict[Path, Entrant | Unranked] = {}
     columns = texts()[language]["columns"]
     with closing(make_vector(episodes)) as env:
-        for path in paths[:MAX_MODELS]:
+        for path in paths:
             name = name_of(path, folder, paths)
             found = results[path] = result_of(path, name, env_id, env, episodes, seed, seconds, success_threshold)
             if isinstance(found, Unranked):
@@ -237,10 +235,7 @@ def board_of(
 ) -> Leaderboard:
     """Returns the leaderboard of the models that have a result; the other arguments are those of :func:`build`."""
     problems = [(name_of(path, folder, paths), found) for path, found in results.items() if isinstance(found, Unranked)]
-    if len(paths) > MAX_MODELS:
-        left_out = texts()[language]["more"].format(n=len(paths) - MAX_MODELS)
-        problems.insert(0, (left_out, Unranked("first", n=MAX_MODELS)))
-    equal = tuple(tuple(name_of(path, folder, paths) for path in group) for group in equal_files(paths[:MAX_MODELS]))
+    equal = tuple(tuple(name_of(path, folder, paths) for path in group) for group in equal_files(paths))
     rows = ranked(found for found in results.values() if isinstance(found, Entrant))
     return Leaderboard(env_id, episodes, rows, tuple(problems), language, equal)
 

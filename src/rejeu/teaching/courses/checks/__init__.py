@@ -13,8 +13,8 @@ small case, the right result and those of typical mistakes, each with its messag
 
 The names of ``case`` are the arguments, in their order; text is the name of a function, which the module gives to
 :func:`tabulated`. Comments say how results were computed. With ``compiles = true`` the arguments are arrays of JAX, and JAX
-must be able to compile the student's function. With ``each = "NAME"`` the function is called once for each value of that
-argument. Other checks are functions::
+must be able to compile the student's function. With ``each = ["NAME"]`` the function is called once for each value of these
+arguments. Other checks are functions::
 
     @exercise
     def td_error(student):
@@ -163,17 +163,18 @@ def of_table(
     name: str, module: str, section: Mapping[str, Any], functions: Mapping[str, Any]
 ) -> Callable[..., Verdict]:
     """Returns the check of a section of a table."""
-    each, is_compiled, named = section.get("each"), section.get("compiles", False), section["case"]
+    each, is_compiled, named = section.get("each", ()), section.get("compiles", False), section["case"]
     case = {key: functions[one] if isinstance(one, str) else one for key, one in named.items()}
     case = {key: np.asarray(one) if isinstance(one, list) else one for key, one in case.items()}
-    cases = [{**case, each: one} for one in case[each]] if each else [case]
+    rows = zip(*(case[one] for one in each), strict=True)
+    cases = [{**case, **dict(zip(each, row, strict=True))} for row in rows] if each else [case]
+    wrong = {key: one["result"] for key, one in section.items() if isinstance(one, dict) and "result" in one}
 
     def check(student: Any) -> None:
         convert = lambda one: jnp.asarray(one) if is_compiled and hasattr(one, "dtype") else one  # noqa: E731
         given = [[*map(convert, one.values())] for one in cases]
         right = np.asarray(section["right"])
         results = [call(student, *arguments) for arguments in given]
-        wrong = {key: one["result"] for key, one in section.items() if isinstance(one, dict) and "result" in one}
         mistakes(**{key: np.shape(results[0]) == np.shape(one) != right.shape for key, one in wrong.items()})
         found = [numbers(result, right.shape[1:] if each else right.shape) for result in results]
         diagnose(np.stack(found) if each else found[0], right, **wrong)

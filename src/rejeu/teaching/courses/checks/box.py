@@ -9,9 +9,6 @@ import numpy as np
 
 from rejeu.teaching.courses.checks import call, close, diagnose, exercise, mistakes, numbers, tabulated
 
-SHAPES = {"state": (2, 4), "action": (1, 4), "common": (8, 5)}
-"""Inputs and outputs of the layers of a small critic. Both branches have as many outputs, so that their order shows."""
-
 
 def _value(state: Any, action: Any) -> Any:
     return state[:, :1] + 2.0 * action
@@ -21,7 +18,16 @@ def _action(state: Any) -> Any:
     return 0.5 * state[:, 1:]
 
 
-globals().update(tabulated(__name__, q=_value, mu=_action))
+def _layers() -> dict[str, Any]:
+    """Returns a small critic. Both branches have as many outputs, so that their order shows."""
+    rng, shapes = np.random.default_rng(0), {"state": (2, 4), "action": (1, 4), "common": (8, 5)}
+    layers: dict[str, Any] = {
+        key: [(rng.normal(size=shape), rng.normal(size=shape[1]))] for key, shape in shapes.items()
+    }
+    return layers | {"output": (rng.normal(size=(5, 1)), np.array([-1.0]))}
+
+
+globals().update(tabulated(__name__, q=_value, mu=_action, layers=_layers()))
 
 
 @exercise
@@ -49,33 +55,6 @@ def ball_step(student: Any) -> None:
         reversed=~lost,
     )
     mistakes(reward=not close([numbers(result[1], ()) for result in results], np.where(lost, -10.0, 1.0)))
-
-
-def _relu(layers: list[tuple[np.ndarray, np.ndarray]], x: np.ndarray) -> np.ndarray:
-    for weight, bias in layers:
-        x = np.maximum(x @ weight + bias, 0.0)
-    return x
-
-
-@exercise
-def critic(student: Any) -> None:
-    """Checks ``critic(layers, state, action)``."""
-    rng = np.random.default_rng(0)
-    layers: dict[str, Any] = {
-        name: [(rng.normal(size=shape), rng.normal(size=shape[1]))] for name, shape in SHAPES.items()
-    }
-    layers["output"] = rng.normal(size=(5, 1)), np.array([-1.0])
-    state, action = rng.normal(size=(6, 2)), rng.normal(size=(6, 1))
-    (weight, bias), s, a = layers["output"], _relu(layers["state"], state), _relu(layers["action"], action)
-    joined = _relu(layers["common"], np.concatenate([s, a], axis=1))
-    swapped = _relu(layers["common"], np.concatenate([a, s], axis=1))
-    diagnose(
-        numbers(call(student, layers, state, action), (6, 1)),
-        joined @ weight + bias,
-        relu_at_end=np.maximum(joined @ weight + bias, 0.0),
-        action_first=swapped @ weight + bias,
-        no_bias=joined @ weight,
-    )
 
 
 @exercise

@@ -81,16 +81,13 @@ def _one_relabeling(result: Any, step: GoalStep, goal: np.ndarray, achieved: boo
             raise Wrong("more_changed", name=name)
     reward, right = numbers(result.reward, ()), 0.0 if achieved else -1.0
     of_before = 0.0 if np.array_equal(step.obs["achieved_goal"], goal) else -1.0
-    if close(reward, right) and bool(result.terminated) == achieved:
-        return
-    if not close(reward, right) and close(reward, of_before) and not close(reward, step.reward):
-        raise Wrong("reward_before", reward=reward)
-    if not close(reward, right) and close(reward, step.reward):
-        raise Wrong("reward_kept", reward=reward)
     if not close(reward, right):
-        raise Wrong("reward", reward=reward, right=right)
-    mistakes(still_going=achieved)
-    raise Wrong("terminated_kept")
+        is_kept, is_before = close(reward, step.reward), close(reward, of_before)
+        raise Wrong(
+            "reward_kept" if is_kept else "reward_before" if is_before else "reward", reward=reward, right=right
+        )
+    if bool(result.terminated) != achieved:
+        raise Wrong("still_going" if achieved else "terminated_kept")
 
 
 @exercise

@@ -4,51 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
-from rejeu.teaching.courses.checks import Wrong, call, compiles, diagnose, exercise, mistakes, numbers
+from rejeu.teaching.courses.checks import Wrong, call, exercise, mistakes, numbers, tabulated
 
-
-@exercise
-def toward(student: Any) -> None:
-    """Checks ``toward(position, velocity, target)``."""
-    cases = [
-        ([0.0, 0.5], [0.0, 0.0], [0.1, 0.45]),
-        ([0.0, 0.0], [0.3, -0.2], [0.0, 0.0]),
-        ([0.0, 0.0], [0.0, 1.0], [2.0, 0.9]),
-    ]
-    found = np.stack([numbers(call(student, *map(np.array, case)), (2,)) for case in cases])
-    position, velocity, target = (np.array([case[i] for case in cases]) for i in range(3))
-    push = 4 * (target - position) - 2 * velocity
-    diagnose(
-        found,
-        np.clip(push, -1, 1),
-        reversed=np.clip(4 * (position - target) - 2 * velocity, -1, 1),
-        no_brake=np.clip(4 * (target - position), -1, 1),
-        speeds_up=np.clip(4 * (target - position) + 2 * velocity, -1, 1),
-        not_limited=push,
-    )
-
-
-@exercise
-def cloning_loss(student: Any) -> None:
-    """Checks ``cloning_loss(action, shown)``."""
-    rng = np.random.default_rng(0)
-    action, shown = (rng.normal(size=(5, 2)).astype(np.float32) for _ in range(2))
-    result = call(student, jnp.asarray(action), jnp.asarray(shown))
-    mistakes(each_step=np.shape(result) in {(5,), (5, 1)}, each_component=np.shape(result) == (2,))
-    error = action - shown
-    diagnose(
-        numbers(result, ()),
-        np.square(error).sum(axis=1).mean(),
-        sum_of_steps=np.square(error).sum(),
-        mean_of_components=np.square(error).mean(),
-        not_squared=error.sum(axis=1).mean(),
-        absolute=np.abs(error).sum(axis=1).mean(),
-        reversed=-np.square(error).sum(axis=1).mean(),
-    )
-    compiles(student, jnp.asarray(action), jnp.asarray(shown))
+globals().update(tabulated(__name__))
 
 
 @exercise
