@@ -76,10 +76,10 @@ def test_every_combination_of_keys_gives_an_action_of_the_environment(env_id):
 
 
 def test_unknown_discrete_actions_have_number_keys_and_letters():
-    assert keys.default_actions(Discrete(2)) == {"0": 0, "1": 1, "a": 0, "d": 1}
-    four = keys.bind(Discrete(4, start=5), keys.default_actions(Discrete(4, start=5)))
+    assert keys.default_keys(Discrete(2)) == {"0": (0, ""), "1": (1, ""), "a": (0, ""), "d": (1, "")}
+    four = keys.keys_for("none", Discrete(4, start=5))
     assert [int(four.action([key], 0)) for key in "0123asdw"] == [5, 6, 7, 8, 5, 6, 7, 8]
-    assert len([key for key in keys.default_actions(Discrete(18)) if key.isdigit()]) == 10
+    assert len([key for key in keys.default_keys(Discrete(18)) if key.isdigit()]) == 10
 
 
 def test_unknown_discrete_actions_wait_for_a_key_unless_there_are_three():

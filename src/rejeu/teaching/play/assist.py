@@ -26,12 +26,13 @@ from rejeu.training.run import Progress
 
 
 class Seat:
-    """The window, and the keys that are held in it. Mutable; as a context manager it is closed at the end.
+    """Where a person takes over by holding keys: a window on an environment that somebody else steps. Mutable.
 
-    ``p`` pauses, ``q`` closes the window, after which nobody takes over any more.
+    Called without or with an observation, as the expert of :func:`rejeu.demonstrations.dagger` is, it returns the action of the
+    person. The first call opens the window. ``p`` pauses, ``q`` closes the window, after which nobody takes over any more.
 
     Args:
-        env: made with ``render_mode="rgb_array"``, and reset; somebody else steps it.
+        env: made with ``render_mode="rgb_array"``.
         keys: actions by keys, in addition to the environment's defaults.
         fps: steps a second; None uses the environment's own.
 
@@ -44,16 +45,18 @@ class Seat:
     def __init__(self, env: gym.Env, keys: Mapping[str, Any] | None = None, fps: float | None = None) -> None:
         self.env, self.keys = env, keys_for(id_of(env), env.action_space, keys)
         self.fps = natural_fps(env) if fps is None else number("fps", fps, above=0)
-        self.player = Player("agent", env, lambda obs, held, step: None, frame=rgb_frame(env), over=False)
+        self.player = Player("agent", env, lambda obs, held, step: None, over=False)
         self.game = Game([self.player], 0, self.keys.names, phase="running")
         self.window = Window(said("{}: hold a key to take over", f"rejeu {id_of(env)}"))
-        self.window.open(self.game, self.keys)
 
-    def action(self) -> Any:
+    def __call__(self, obs: Any = None) -> Any:
         """Draws the environment, waits for its next step, and returns the action of the person; None where no key is held.
 
         After Ctrl-C, which ends the training or the clone, nobody is waited for.
         """
+        if self.window.canvas is None:
+            self.player.frame = rgb_frame(self.env)
+            self.window.open(self.game, self.keys)
         while not self.game.closed and interrupt.requested() is None:
             for event in self.window.events():
                 if event.kind != "press" or event.key in self.keys.names or CONTROLS.get(event.key) != "restart":
@@ -83,36 +86,6 @@ class Seat:
         self.game.closed = True
         self.window.close()
 
-    def __enter__(self) -> Seat:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
-
-
-class Expert:
-    """A person who takes over from a clone by holding keys, as the expert of :func:`rejeu.demonstrations.dagger`.
-
-    The arguments are those of :class:`Seat`.
-    """
-
-    def __init__(self, env: gym.Env, keys: Mapping[str, Any] | None = None, fps: float | None = None) -> None:
-        self.env, self.keys, self.fps = env, keys, fps
-        keys_for(id_of(env), env.action_space, keys)
-        Window("").close()  # raises before anything is learned
-        self.seat: Seat | None = None
-
-    def __call__(self, obs: Any) -> Any:
-        """Returns the action of the person, None where no key is held."""
-        if self.seat is None:
-            self.seat = Seat(self.env, self.keys, self.fps)
-        return self.seat.action()
-
-    def close(self) -> None:
-        """Closes the window."""
-        if self.seat is not None:
-            self.seat.close()
-
 
 class Assist(TrainingCallback):
     """Lets a person act in place of an agent while it trains: who holds a key acts, and who releases it gives the agent back.
@@ -136,7 +109,7 @@ class Assist(TrainingCallback):
         self, folder: str | Path | None = None, keys: Mapping[str, Any] | None = None, fps: float | None = None
     ) -> None:
         self.folder, self.keys, self.fps = folder, keys, fps
-        self.seat: Seat | None = None
+        self.seat: Seat
         self.recording: Recording | None = None
         self.steps = 0
         """Number of steps in which the person acted."""
@@ -145,14 +118,13 @@ class Assist(TrainingCallback):
     def before_training(self, agent: Agent) -> None:
         """Checks the agent; the window opens after the first step, when there is something to show."""
         check(agent)
+        self.seat = Seat(agent.run.env.envs[0], self.keys, self.fps)
         if self.folder is not None:
             self.recording = Recording(self.folder, agent.run.env.envs[0], None)
 
     def __call__(self, agent: Agent, progress: Progress) -> None:
         """Records the step that was taken, and replaces the action of the next one if a key is held."""
-        run, env = agent.run, agent.run.env.envs[0]
-        if self.seat is None:
-            self.seat = Seat(env, self.keys, self.fps)
+        run = agent.run
         if self.seat.game.closed and not self._by_hand:
             return
         assert progress.result is not None
@@ -164,7 +136,7 @@ class Assist(TrainingCallback):
                 action, reward = progress.action, float(progress.result.reward[0])
                 self.recording.step(single(obs), single(action), reward, terminated, truncated)
         self.seat.stepped(float(progress.result.reward[0]), terminated or truncated)
-        action = self.seat.action()
+        action = self.seat()
         if action is not None:
             run.action = spaces.unscale_action(agent.action_space, np.asarray(action)[None])
             if self.recording is not None and not (self._by_hand and not (terminated or truncated)):
@@ -173,8 +145,7 @@ class Assist(TrainingCallback):
 
     def after_training(self, agent: Agent, error: BaseException | None) -> None:
         """Closes the window and completes the dataset."""
-        if self.seat is not None:
-            self.seat.close()
+        self.seat.close()
         if self.recording is not None:
             self.recording.close()
 

@@ -127,8 +127,8 @@ def bind(space: gym.Space, actions: Mapping[str, Any], labels: Iterable[tuple[An
     return KeyMap(space, bindings, tuple(_discrete(space, NONE, action) for action in turns))
 
 
-def default_actions(space: gym.Space) -> dict[str, Any]:
-    """Returns the default key map of an action space.
+def default_keys(space: gym.Space) -> dict[str, tuple[Any, str]]:
+    """Returns actions and descriptions by keys for an action space, as in :data:`KNOWN`; an empty description for the default.
 
     Box: a/d for the first component, s/w for the second, j/l and k/i for the third and fourth, to -1 and 1 without bounds.
     Discrete: the number keys; a/d for two actions; a/d and no key for three actions; a, s, d, w for the first four of more.
@@ -136,17 +136,16 @@ def default_actions(space: gym.Space) -> dict[str, Any]:
     Raises:
         ValueError: for a Box space with more than four components.
 
-    >>> default_actions(gym.spaces.Discrete(3))
+    >>> {key: action for key, (action, _) in default_keys(gym.spaces.Discrete(3)).items()}
     {'0': 0, '1': 1, '2': 2, 'a': 0, 'd': 2, 'none': 1}
-    >>> default_actions(gym.spaces.Box(-2.0, 2.0, (1,)))
-    {'a': [-2.0], 'd': [2.0]}
+    >>> default_keys(gym.spaces.Box(-2.0, 2.0, (1,)))
+    {'a': ([-2.0], 'number 1 down'), 'd': ([2.0], 'number 1 up')}
     """
     if isinstance(space, gym.spaces.Discrete):
         first, n = int(space.start), int(space.n)
-        numbers = {str(i): first + i for i in range(min(n, 10))}
-        if n == 3:
-            return {**numbers, "a": first, "d": first + 2, NONE: first + 1}
-        return {**numbers, **{key: first + i for i, key in enumerate("ad" if n < 4 else "asdw") if i < n}}
+        letters = {"a": 0, "d": 2, NONE: 1} if n == 3 else dict(zip("ad" if n < 4 else "asdw", range(n), strict=False))
+        numbers = {str(i): i for i in range(min(n, 10))}
+        return {key: (first + i, "") for key, i in (numbers | letters).items()}
     if not isinstance(space, gym.spaces.Box):
         return {}
     rest = _resting(space)
@@ -156,24 +155,13 @@ def default_actions(space: gym.Space) -> dict[str, Any]:
             f"there are default keys for {len(AXIS_KEYS)} components, but the actions have {len(rest)}; bind keys with --keys "
             f"a=[{example}] ..."
         )
-    actions: dict[str, Any] = {}
+    found: dict[str, tuple[Any, str]] = {}
     for i, keys in enumerate(AXIS_KEYS[: len(rest)]):
-        for key, bounds, step in zip(keys, (space.low, space.high), (-1.0, 1.0), strict=True):
+        for key, bounds, step, side in zip(keys, (space.low, space.high), (-1.0, 1.0), ("down", "up"), strict=True):
             bound = float(bounds.reshape(-1)[i])
-            actions[key] = [*rest[:i], bound if math.isfinite(bound) else rest[i] + step, *rest[i + 1 :]]
-    return actions
-
-
-def default_labels(space: gym.Space) -> list[tuple[Any, str]]:
-    """Returns the descriptions of :func:`default_actions`, for Box spaces.
-
-    >>> default_labels(gym.spaces.Discrete(2)), default_labels(gym.spaces.Box(-2, 2, (1,)))
-    ([], [([-2.0], 'number 1 down'), ([2.0], 'number 1 up')])
-    """
-    if not isinstance(space, gym.spaces.Box):
-        return []
-    sides = {key: (i, side) for i, pair in enumerate(AXIS_KEYS) for key, side in zip(pair, ("down", "up"), strict=True)}
-    return [(action, f"number {sides[key][0] + 1} {sides[key][1]}") for key, action in default_actions(space).items()]
+            action = [*rest[:i], bound if math.isfinite(bound) else rest[i] + step, *rest[i + 1 :]]
+            found[key] = action, f"number {i + 1} {side}"
+    return found
 
 
 def equivalent_keys(binding: Binding, bindings: tuple[Binding, ...]) -> frozenset[str]:
@@ -303,14 +291,9 @@ def keys_for(env_id: str, space: gym.Space, own: Mapping[str, Any] | None = None
     >>> [binding.label for binding in keys_for("MountainCar-v0", gym.spaces.Discrete(3)).bindings]
     ['left', 'right']
     """
-    own = dict(own or {})
-    labels: list[tuple[Any, str]] = []
-    known = known_keys(env_id, space)
-    if known is not None:
-        actions = {key: action for key, (action, _) in known.items()}
-        labels = [(action, label) for key, (action, label) in known.items() if key != NONE]
-    elif own and isinstance(space, gym.spaces.Box) and space.low.size > len(AXIS_KEYS):
-        actions = {}
-    else:
-        actions, labels = default_actions(space), default_labels(space)
-    return bind(space, {**actions, **own}, labels)
+    entries = known_keys(env_id, space)
+    if entries is None:
+        is_wide = isinstance(space, gym.spaces.Box) and space.low.size > len(AXIS_KEYS)
+        entries = {} if own and is_wide else default_keys(space)
+    labels = [(action, label) for key, (action, label) in entries.items() if label and key != NONE]
+    return bind(space, {**{key: action for key, (action, _) in entries.items()}, **(own or {})}, labels)
