@@ -272,14 +272,6 @@ def reshape(printer: Printer, operation: Operation) -> None:
     printer.known[out] = memory(name, out.shape, found.dtype)
 
 
-def split(printer: Printer, operation: Operation) -> None:
-    """Parts along an axis."""
-    found, axis, start = printer.view(operation.inputs[0]), operation.params["axis"], 0
-    for out in operation.outputs:
-        printer.known[out] = moved(found, out.shape, partial(along, axis, start))
-        start += out.shape[axis]
-
-
 def concatenate(printer: Printer, operation: Operation) -> None:
     """Arrays one after the other."""
     out, axis, start = operation.outputs[0], operation.params["dimension"], 0
@@ -323,20 +315,16 @@ def argmax(printer: Printer, operation: Operation) -> None:
 
 def product(printer: Printer, operation: Operation) -> None:
     """A product of matrices, row by row of the right one."""
-    axes, batch = operation.params["dimension_numbers"]
     left, right = (printer.view(one) for one in operation.inputs)
-    pairs = zip((left, right), axes, batch, strict=True)
-    free = [[i for i in range(len(one.shape)) if i not in (*a, *b)] for one, a, b in pairs]
     out = printer.buffer(operation.outputs[0].shape, operation.outputs[0].dtype)
-    n_batch, width = len(batch[0]), [right.shape[i] for i in free[1]]
-    with printer.block(out.shape[: n_batch + len(free[0])]) as rows:
-        with printer.block(width) as columns:
+    *outer, shared, width = right.shape
+    with printer.block([*outer, left.shape[-2]]) as rows:
+        with printer.block([width]) as columns:
             printer.lines.append(f"{out.read([*rows, *columns])} = 0;")
-        with printer.block([left.shape[i] for i in axes[0]]) as inner:
-            shared, own = rows[:n_batch], rows[n_batch:]
-            printer.declare("x", left.dtype, left.read(placed((batch[0], shared), (free[0], own), (axes[0], inner))))
-            with printer.block(width) as columns:
-                weight = right.read(placed((batch[1], shared), (axes[1], inner), (free[1], columns)))
+        with printer.block([shared]) as inner:
+            printer.declare("x", left.dtype, left.read([*rows, *inner]))
+            with printer.block([width]) as columns:
+                weight = right.read([*rows[:-1], *inner, *columns])
                 printer.lines.append(f"{out.read([*rows, *columns])} += x * {weight};")
     printer.known[operation.outputs[0]] = out
 
@@ -346,7 +334,6 @@ STATEMENTS: dict[str, Callable[[Printer, Operation], None]] = {
     "concatenate": concatenate,
     "dot_general": product,
     **dict.fromkeys(("expand_dims", "reshape", "squeeze"), reshape),
-    "split": split,
     **dict.fromkeys(REDUCTIONS, reduce),
 }
 """Operations that are loops of their own."""

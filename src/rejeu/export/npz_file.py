@@ -29,15 +29,20 @@ def described(program: TracedProgram) -> tuple[dict[str, Any], list[np.ndarray]]
     def listed(values: Any) -> list[int]:
         return [numbers[one] for one in values]
 
-    steps = [[one.name, listed(one.inputs), listed(one.outputs), parameters(one)] for one in program.operations]
+    steps = [[name_of(one), listed(one.inputs), listed(one.outputs), parameters(one)] for one in program.operations]
     description = {"inputs": listed(program.arguments), "operations": steps, "outputs": listed(program.outputs)}
     return description, [one.data for one in constants if one.data is not None]
+
+
+def name_of(operation: Operation) -> str:
+    """Returns the name of an operation in a file."""
+    return "matmul" if operation.name == "dot_general" else operation.name
 
 
 def parameters(operation: Operation) -> dict[str, Any]:
     """Returns the parameters of an operation that are JSON values, with -1 for the free size of the batch."""
     rounding = operation.params.get("rounding_method", 1)
-    if operation.name not in FUNCTIONS or int(rounding) != 1:
+    if name_of(operation) not in FUNCTIONS or int(rounding) != 1:
         raise unsupported(operation, "npz")
     return {key: value for key, one in operation.params.items() if (value := plain(one)) is not None}
 

@@ -6,7 +6,6 @@ import io
 import math
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
-from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -35,29 +34,11 @@ def broadcast(n: int, params: Params, x: np.ndarray) -> np.ndarray:
     return x.reshape(sizes) if sizes == shape else np.broadcast_to(x.reshape(sizes), shape)
 
 
-def product(n: int, params: Params, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """A product of matrices, with any axes."""
-    (left, right), (left_batch, right_batch) = params["dimension_numbers"]
-    if not left_batch and y.ndim == 2 and (left, right) == ([x.ndim - 1], [0]):
-        return (x.reshape(-1, len(y)) @ y).reshape(*x.shape[:-1], y.shape[1])
-    axes, other = [*range(x.ndim)], [*range(x.ndim, x.ndim + y.ndim)]
-    for i, k in zip((*left_batch, *left), (*right_batch, *right), strict=True):
-        other[k] = i
-    free = [i for i in axes if i not in (*left_batch, *left)], [k for k in other if k >= x.ndim]
-    return np.einsum(x, axes, y, other, [*left_batch, *free[0], *free[1]])
-
-
 def sliced(n: int, params: Params, x: np.ndarray) -> np.ndarray:
     """A part of an array."""
     ends = (None if end == -1 else end for end in params["limit_indices"])
     strides = params.get("strides") or [1] * x.ndim
     return x[tuple(map(slice, params["start_indices"], ends, strides))]
-
-
-def split(n: int, params: Params, x: np.ndarray) -> list[np.ndarray]:
-    """Parts along an axis."""
-    before, ends = (slice(None),) * params["axis"], accumulate(params["sizes"], initial=0)
-    return [x[*before, begin:end] for begin, end in pairwise(ends)]
 
 
 def selected(n: int, params: Params, which: np.ndarray, *cases: np.ndarray) -> np.ndarray:
@@ -93,11 +74,10 @@ FUNCTIONS: dict[str, Function] = {
     "broadcast_in_dim": broadcast,
     "concatenate": lambda n, params, *parts: np.concatenate(parts, params["dimension"]),
     "convert_element_type": lambda n, params, x: x.astype(params["new_dtype"]),
-    "dot_general": product,
+    "matmul": lambda n, params, x, y: x @ y,
     **{f"reduce_{name}": reduction(getattr(np, name)) for name in ("max", "min", "sum")},
     "reshape": lambda n, params, x: x.reshape(params["new_sizes"]),
     "slice": sliced,
-    "split": split,
     "squeeze": lambda n, params, x: x.squeeze(tuple(params["dimensions"])),
     "transpose": lambda n, params, x: x.transpose(params["permutation"]),
 }
@@ -108,10 +88,8 @@ def count(name: str, params: Params, inputs: Sequence[np.ndarray]) -> int:
     """Returns about how many numbers an operation computes, from the shapes of its inputs."""
     if name == "broadcast_in_dim":
         return math.prod(map(abs, params["shape"]))
-    if name == "dot_general":
-        (left, _), (batch, _) = params["dimension_numbers"]
-        shared = math.prod(inputs[0].shape[axis] for axis in (*left, *batch))
-        return inputs[0].size * inputs[1].size // max(shared, 1) // 256  # multiplications are cheap
+    if name == "matmul":
+        return inputs[0].size * inputs[1].shape[-1] // 256  # multiplications are cheap
     if name in ELEMENTWISE:
         return math.prod(np.broadcast_shapes(*(one.shape for one in inputs)))
     return sum(one.size for one in inputs)
@@ -127,11 +105,7 @@ class ArrayOperation(NamedTuple):
 
     def run(self, n: int, known: dict[int, np.ndarray]) -> None:
         """Adds the outputs for ``n`` observations to the known arrays."""
-        result = FUNCTIONS[self.name](n, self.params, *[known[i] for i in self.inputs])
-        if self.name == "split":
-            known |= zip(self.outputs, result, strict=True)
-        else:
-            known[self.outputs[0]] = result
+        known[self.outputs[0]] = FUNCTIONS[self.name](n, self.params, *[known[i] for i in self.inputs])
 
 
 class NumpyProgram:

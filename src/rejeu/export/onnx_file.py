@@ -96,12 +96,6 @@ def add(graph: Graph, operation: Operation) -> None:
         has_shape = any(one.shape == outputs[0].shape and one not in graph.narrow for one in inputs)
         names = [graph.loose(one) if has_shape else graph.name(one) for one in inputs]
         graph.names[outputs[0]] = elementwise(graph, operation, names)
-    elif name == "split":
-        lengths = graph.constant(np.array(operation.params["sizes"], np.int64))
-        names = [f"/v{len(graph.nodes)}_{i}" for i in range(len(outputs))]
-        node = helper.make_node("Split", [graph.name(inputs[0]), lengths], names, axis=operation.params["axis"])
-        graph.nodes.append(node)
-        graph.names |= zip(outputs, names, strict=True)
     elif name in REDUCTIONS:
         axes = graph.constant(np.array(operation.params["axes"], np.int64))
         graph.names[outputs[0]] = graph.node(REDUCTIONS[name], [graph.name(inputs[0]), axes], keepdims=0)
@@ -129,27 +123,6 @@ def elementwise(graph: Graph, operation: Operation, names: list[str]) -> str:
     return graph.node(kind, names, **({"fmod": 1} if name == "rem" else {}))
 
 
-def product(graph: Graph, operation: Operation, names: list[str]) -> str:
-    """A product of matrices, with any axes."""
-    (left_axes, right_axes), (left_batch, right_batch) = operation.params["dimension_numbers"]
-    left, right = operation.inputs
-    if not left_batch and len(right.shape) == 2 and (*left_axes, *right_axes) == (len(left.shape) - 1, 0):
-        return graph.node("MatMul", names)
-
-    def arranged(name: str, value: Value, batch: Any, contracted: Any, is_left: bool) -> str:
-        free = [axis for axis in range(len(value.shape)) if axis not in (*batch, *contracted)]
-        groups = (batch, free, contracted) if is_left else (batch, contracted, free)
-        name = graph.node("Transpose", [name], perm=[axis for group in groups for axis in group])
-        sizes = [[value.sizes[axis] for axis in group] for group in groups]
-        return graph.reshape(name, [-1 if -1 in group else int(np.prod(group)) for group in sizes])
-
-    made = (
-        arranged(names[0], left, left_batch, left_axes, True),
-        arranged(names[1], right, right_batch, right_axes, False),
-    )
-    return graph.reshape(graph.node("MatMul", made), operation.outputs[0].sizes)
-
-
 def sliced(graph: Graph, operation: Operation, names: list[str]) -> str:
     """A part of an array."""
     params, shape = operation.params, operation.inputs[0].sizes
@@ -173,7 +146,7 @@ def reshaped(graph: Graph, operation: Operation, names: list[str]) -> str:
 STRUCTURAL: dict[str, Make] = {
     "argmax": argmax,
     "concatenate": lambda g, op, n: g.node("Concat", n, axis=op.params["dimension"]),
-    "dot_general": product,
+    "dot_general": lambda g, op, n: g.node("MatMul", n),
     "expand_dims": reshaped,
     "reshape": reshaped,
     "slice": sliced,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
+from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -55,10 +56,36 @@ def convolution(params: Any, x: Any, kernel: Any) -> Any:
     return found.transpose(np.argsort([out[0], *out[2:], out[1]]))
 
 
+def product(params: Any, x: Any, y: Any) -> Any:
+    """A product along any axes, as one of matrices."""
+    (left, right), (left_batch, right_batch) = params["dimension_numbers"]
+    n, n_shared = len(left_batch), len(left)
+    free = [i for i in range(x.ndim) if i not in (*left_batch, *left)]
+    x = x.transpose(*left_batch, *free, *left)
+    y = y.transpose(*right_batch, *right, *(i for i in range(y.ndim) if i not in (*right_batch, *right)))
+    shape, rows, columns = x.shape[:n], x.shape[n : n + len(free)], y.shape[n + n_shared :]
+    shared = math.prod(y.shape[n : n + n_shared])
+    x, y = x.reshape(*shape, math.prod(rows), shared), y.reshape(*shape, shared, math.prod(columns))
+    found = jax.lax.dot_general(x, y, of_matrices(n), params["precision"], params["preferred_element_type"])
+    return found.reshape(*shape, *rows, *columns)
+
+
+def of_matrices(n: int) -> Any:
+    """Returns the axes of a product of matrices ``(..., rows, shared)`` and ``(..., shared, columns)``, after ``n`` others."""
+    return ((n + 1,), (n,)), (tuple(range(n)), tuple(range(n)))
+
+
+def parts(params: Any, x: Any) -> list[Any]:
+    """Parts along an axis, as slices."""
+    ends, axis = [*accumulate(params["sizes"], initial=0)], params["axis"]
+    return [jax.lax.slice_in_dim(x, begin, end, axis=axis) for begin, end in pairwise(ends)]
+
+
 REWRITTEN: dict[str, Callable[..., Any]] = {
     "argmin": lambda params, x: jax.lax.argmax(-x, params["axes"][0], params["index_dtype"]),
     "clamp": lambda _, low, x, high: jnp.minimum(jnp.maximum(x, low), high),
     "conv_general_dilated": convolution,
+    "dot_general": product,
     "exp2": lambda _, x: jnp.power(x.dtype.type(2), x),
     "expm1": lambda _, x: jnp.exp(x) - x.dtype.type(1),
     "integer_pow": power,
@@ -68,6 +95,7 @@ REWRITTEN: dict[str, Callable[..., Any]] = {
     "reduce_and": lambda params, x: jnp.min(x.astype(jnp.int32), params["axes"]) > np.int32(0),
     "reduce_or": lambda params, x: jnp.max(x.astype(jnp.int32), params["axes"]) > np.int32(0),
     "rsqrt": lambda _, x: x.dtype.type(1) / jnp.sqrt(x),
+    "split": parts,
     "square": lambda _, x: x * x,
     "stack": lambda params, *parts: jnp.concatenate(
         [jnp.expand_dims(one, params["axis"]) for one in parts], params["axis"]
@@ -76,8 +104,11 @@ REWRITTEN: dict[str, Callable[..., Any]] = {
 """Primitives that are written with others, so that no format needs them."""
 
 
-def is_rewritten(name: str, params: Any) -> bool:
+def is_rewritten(name: str, params: Any, inputs: Sequence[Value]) -> bool:
     """Returns whether a primitive is written with others; transposed or grouped convolutions and gaps are not."""
+    if name == "dot_general":
+        n = len(params["dimension_numbers"][1][0])
+        return params["dimension_numbers"] != of_matrices(n) or {len(one.shape) for one in inputs} != {n + 2}
     if name == "conv_general_dilated":
         return params["feature_group_count"] * params["batch_group_count"] * max(params["lhs_dilation"]) == 1
     if name == "pad":
@@ -211,7 +242,7 @@ class _Tracing:
         if params.get("name") in DRAWS and "jaxpr" in params:
             return self.draw(DRAWS[params["name"]], equation.outvars[0].aval, inputs[1:])
         inner = next((params[key] for key in INLINED if key in params), None)
-        if is_rewritten(name, params):
+        if is_rewritten(name, params, inputs):
             examples = [jax.ShapeDtypeStruct(one.shape, one.dtype) for one in inputs]
             inner = jax.make_jaxpr(partial(REWRITTEN[name], params))(*examples)
         before, where = self.where, _line(equation.source_info) or self.where

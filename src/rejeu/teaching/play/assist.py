@@ -28,8 +28,7 @@ from rejeu.training.run import Progress
 class Seat:
     """Where a person takes over by holding keys: a window on an environment that somebody else steps. Mutable.
 
-    Called without or with an observation, as the expert of :func:`rejeu.demonstrations.dagger` is, it returns the action of the
-    person. The first call opens the window. ``p`` pauses, ``q`` closes the window, after which nobody takes over any more.
+    Called, as the expert of :func:`rejeu.demonstrations.dagger` with an observation, it returns the action of the person. The first call opens the window. ``p`` pauses, ``q`` closes the window, after which nobody takes over any more.
 
     Args:
         env: made with ``render_mode="rgb_array"``.
