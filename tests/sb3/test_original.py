@@ -359,9 +359,7 @@ def test_logger_formats(tmp_path, capsys):
     assert model.logger.name_to_value["time/fps"] > 0
 
 
-@pytest.mark.parametrize(
-    "kind", [envs.IdentityEnv, envs.IdentityEnvBox, envs.FakeImageEnv, envs.BitFlippingEnv, envs.SimpleMultiObsEnv]
-)
+@pytest.mark.parametrize("kind", [envs.IdentityEnv, envs.IdentityEnvBox, envs.FakeImageEnv, envs.BitFlippingEnv])
 def test_environments_pass_the_checker_without_warnings(kind):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -371,7 +369,7 @@ def test_environments_pass_the_checker_without_warnings(kind):
 def test_the_checker_states_the_difference():
     env = envs.IdentityEnvBox()
     env.step = lambda action: (np.full(1, 3.0, np.float32), 0.0, False, False, {})
-    with pytest.raises(AssertionError, match=r"Expected: -1\.0 <= obs\[0\] <= 1\.0, actual value: 3\.0"):
+    with pytest.raises(AssertionError, match=r"3\.0 at index 0, outside of the declared bounds \[-1\.0, 1\.0\]"):
         env_checker.check_env(env)
 
 
