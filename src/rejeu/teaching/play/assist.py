@@ -28,8 +28,8 @@ from rejeu.training.run import Progress
 class Seat:
     """Where a person takes over by holding keys: a window on an environment that somebody else steps. Mutable.
 
-    Called, it returns the action of the person, and does not use the observation that :func:`rejeu.demonstrations.dagger` gives.
-    The first call opens the window. ``p`` pauses, ``q`` closes the window; nobody takes over any more then.
+    Called, it returns the action of the person, whatever the observation. The first call opens the window. ``p`` pauses, ``q``
+    closes the window; nobody takes over any more then.
 
     Args:
         env: made with ``render_mode="rgb_array"``.
