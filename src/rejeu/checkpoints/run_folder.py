@@ -48,6 +48,8 @@ class RunFolder:
     """The model that evaluated best."""
     checkpoints = File("checkpoints")
     """Folder of the checkpoints from which the run can be resumed."""
+    lock = File("checkpoints/lock")
+    """Held by the process that trains."""
     curve = File("curve.png")
     """The learning curve."""
     replays = File("replays.csv")
@@ -71,6 +73,11 @@ class RunFolder:
     """The current model, while it is watched."""
     videos = File("videos")
     """Folder of videos of the policy during training."""
+
+    @property
+    def marks(self) -> tuple[Path, ...]:
+        """The files any of which makes a folder that of a run: its configuration and its tables."""
+        return self.config, self.episodes, self.metrics
 
 
 def newest_inside(folder: Path) -> str:

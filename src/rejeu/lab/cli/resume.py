@@ -50,7 +50,7 @@ def run_resume(arguments: Resume) -> tuple[int, dict[str, Any]]:
     if arguments.workers is not None:
         raise ValueError(f"{arguments.run} is a single run; --workers is for the folder of a sweep or a study")
     folder = RunFolder(arguments.run)
-    if is_locked(folder.checkpoints / "lock"):  # before the tables are opened, which the other process writes
+    if is_locked(folder.lock):  # before the tables are opened, which the other process writes
         raise RunInUseError(f"another process is training in {folder.path}; wait for it, or stop it")
     return resume(arguments, folder.checkpoints, lambda agent, config: (folder, config), arguments.finish)
 

@@ -189,7 +189,7 @@ class Scheduler:
     def _start(self, task: Work, claim: FileLock) -> None:
         """Starts a run, from its newest checkpoint if there is one."""
         try:
-            first = newest_step(task.path / "checkpoints")
+            first = newest_step(task.files.checkpoints)
             file = task.lock.with_suffix(".task")
             write_task(file, task.task())
             handle = self.launcher.start(file, task.log, task.lock)
@@ -225,7 +225,7 @@ class Scheduler:
 
     def _go_on_later(self, attempt: Attempt, status: int) -> None:
         """Puts a lost run back, unless it was lost too often."""
-        task, step = attempt.task, newest_step(attempt.task.path / "checkpoints")
+        task, step = attempt.task, newest_step(attempt.task.files.checkpoints)
         self._lost[task] = 0 if step > attempt.first_step else self._lost.get(task, 0) + 1
         if self._lost[task] >= MAX_LOST:
             text = f"was lost {MAX_LOST} times in a row without a new checkpoint (exit status {status})"

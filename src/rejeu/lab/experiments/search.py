@@ -18,15 +18,16 @@ import numpy as np
 
 from rejeu.agents import AGENTS, presets
 from rejeu.agents.presets import Preset
+from rejeu.checkpoints.run_folder import RunFolder
 from rejeu.core import validation
 from rejeu.core.interrupt import Interrupt
 from rejeu.lab.experiments.process import LocalLauncher
 from rejeu.lab.experiments.scheduler import Scheduler
-from rejeu.lab.experiments.study import State, Study, Trial
+from rejeu.lab.experiments.study import State, Study, StudyFolder, Trial
 from rejeu.lab.experiments.study_plan import MIN_FINAL_SEEDS, Measure
 from rejeu.lab.experiments.work import Job, Work
 from rejeu.lab.reporting.comparison import Comparison, compare
-from rejeu.lab.reporting.runs import EVALUATIONS, RunSummary, read_run
+from rejeu.lab.reporting.runs import RunSummary, read_run
 from rejeu.lab.runs.config import RunConfig
 from rejeu.logs import statistics
 from rejeu.logs.tables import read_table
@@ -47,7 +48,7 @@ Verdict = Literal["better", "worse", "no difference found", "the default itself"
 
 def work_of(run: RunConfig, folder: Path, seed: int) -> Work:
     """Returns the training of a preset in a folder, on a seed, where ``run`` is what all trainings of the study share."""
-    of_preset = dataclasses.replace(run, preset=str(folder / "preset.json"), seed=seed, imports=())
+    of_preset = dataclasses.replace(run, preset=str(StudyFolder(folder).preset), seed=seed, imports=())
     job = Job(name=f"seed_{seed}", run=of_preset, no_report=True, no_video=True)
     name = f"{folder.name}, {job.label}"
     return Work(folder, job, run.imports, is_retried=True, name=name, keeps_checkpoints=False)
@@ -56,7 +57,7 @@ def work_of(run: RunConfig, folder: Path, seed: int) -> Work:
 def evaluations(work: Work, column: str) -> list[tuple[int, float]]:
     """Returns step and value of each evaluation so far."""
     try:
-        table = read_table(work.path / EVALUATIONS)
+        table = read_table(work.files.evaluations)
     except OSError:
         return []
     return list(zip(table.column("step").astype(int).tolist(), table.column(column).tolist(), strict=True))
@@ -210,7 +211,7 @@ def final_trainings(study: Study, best: Trial, run: RunConfig) -> list[Work]:
         DEFAULT: study.plan.preset(study.plan.default.hyperparameters, "the default"),
     }
     for name, preset in named.items():
-        presets.write(preset, study.folder.final / name / "preset.json")
+        presets.write(preset, StudyFolder(study.folder.final / name).preset)
     folders = [study.folder.final / name for name in named]
     return [work_of(run, folder, seed) for seed in study.plan.fresh_seeds() for folder in folders]
 
@@ -249,7 +250,7 @@ def compared(study: Study, best: Trial, failed: list[str]) -> Final:
 
 def finished(folder: Path) -> list[RunSummary]:
     """Returns the finished runs in a folder."""
-    found = [read_run(path) for path in sorted(folder.glob("seed_*")) if (path / "config.json").is_file()]
+    found = [read_run(path) for path in sorted(folder.glob("seed_*")) if RunFolder(path).config.is_file()]
     return [run for run in found if run.state == "finished"]
 
 

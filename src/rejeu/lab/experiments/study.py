@@ -87,7 +87,7 @@ class StudyFolder:
     journal = File("journal.log")
     """Optuna's journal."""
     preset = File("preset.json")
-    """The winner."""
+    """The winner; in the folder of a trial, what is trained."""
     page = File("compare.html")
     """The page that compares the winner with the default."""
     final = File("final")
@@ -132,7 +132,7 @@ class Study:
         values = spaces.decoded(space, trial.params)
         source = f"rejeu tune, trial {index} of a study with seed {self.plan.seed}"
         preset = self.plan.preset(spaces.applied(self.plan.fixed, values), source)
-        presets.write(preset, self.folder.trial(index) / "preset.json")
+        presets.write(preset, StudyFolder(self.folder.trial(index)).preset)
         return trial, index
 
     def next_index(self) -> int | None:

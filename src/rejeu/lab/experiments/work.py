@@ -21,7 +21,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from rejeu.checkpoints.run_folder import newest_step
+from rejeu.checkpoints.run_folder import RunFolder, newest_step
 from rejeu.core import atomic
 from rejeu.core.errors import CheckpointError
 from rejeu.envs.registry import are_plain
@@ -146,6 +146,7 @@ class Work:
         """
         self.folder, self.job, self.imports, self.keeps_checkpoints = folder, job, imports, keeps_checkpoints
         self.name, self.path, self.log = name or job.label, folder / job.name, folder / f"{job.name}.log"
+        self.files = RunFolder(self.path)
         self.lock, self.claim, self.exit = (folder / HIDDEN / f"{job.name}.{end}" for end in ("run", "claim", "exit"))
         self.is_retried = is_retried and bool(self.exit_status())
 
@@ -178,7 +179,7 @@ class Work:
 
     def has_result(self) -> bool:
         """Returns whether its files contain what it was trained for."""
-        return (self.path / "agent.safetensors").is_file()
+        return self.files.agent.is_file()
 
     def is_open(self) -> bool:
         """Returns whether there is something left to train; also asked after the claim was obtained."""
@@ -192,7 +193,7 @@ class Work:
         """
         self.is_retried = False
         self.exit.unlink(missing_ok=True)
-        has_begun = newest_step(self.path / "checkpoints") >= 0
+        has_begun = newest_step(self.files.checkpoints) >= 0
         if not has_begun and self.path.is_dir() and any(self.path.iterdir()):
             self.move_aside()
         return self.job.task(self.path, has_begun, self.imports)
@@ -217,4 +218,4 @@ class Work:
 
     def drop_checkpoints(self) -> None:
         """Deletes its checkpoints."""
-        shutil.rmtree(self.path / "checkpoints", ignore_errors=True)
+        shutil.rmtree(self.files.checkpoints, ignore_errors=True)

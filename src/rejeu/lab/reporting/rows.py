@@ -12,20 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from rejeu.checkpoints.run_folder import RunFolder
 from rejeu.core.records import shown
 from rejeu.lab.reporting import run_list
-from rejeu.lab.reporting.runs import (
-    CONFIG,
-    EPISODES,
-    EVALUATIONS,
-    METRICS,
-    WARNINGS,
-    RunSummary,
-    best_row,
-    has_process,
-    is_file,
-    is_recent,
-)
+from rejeu.lab.reporting.runs import RunSummary, best_row, has_process, is_file, is_recent
 from rejeu.logs import charts
 from rejeu.logs.tables import EMPTY, NO_EPISODES
 
@@ -38,8 +28,6 @@ COLUMNS = ("run", "environment", "algorithm", "state", "steps", "best", "rate", 
 N_TEXT = 3
 """First columns that are text, and that a narrow terminal folds."""
 BARS = "▁▂▃▄▅▆▇█"
-FILES = (CONFIG, EPISODES, METRICS, EVALUATIONS, WARNINGS, "agent.safetensors", "checkpoints", "paused", "video.mp4")
-PICTURES = ("video.mp4", "curve.png")
 SHARE = 20.0
 """A run whose reading takes a second is read at most once in so many seconds, ..."""
 LONGEST = 10.0
@@ -119,8 +107,14 @@ class Rows:
 def stamp(path: Path) -> Any:
     """Returns what changes when a run does: times and sizes of its files, and whether a process trains it."""
     process = has_process(path)
-    files = [path / name for name in FILES] if run_list.is_ours(path) else [*others(path)]
-    return process, is_recent(path) if process is None else None, *map(time_of, files)
+    watched = files(path) if run_list.is_ours(path) else others(path)
+    return process, is_recent(path) if process is None else None, *map(time_of, watched)
+
+
+def files(path: Path) -> tuple[Path, ...]:
+    """Returns the files of a run that say that it has changed."""
+    run = RunFolder(path)
+    return *run.marks, run.evaluations, run.warnings, run.agent, run.checkpoints, run.paused, run.video
 
 
 def others(path: Path) -> Iterator[Path]:
@@ -157,6 +151,7 @@ def describe(run: RunSummary) -> Row:
         left = max(60 * run.minutes_asked - seconds, 0.0)
     returns = run.episodes.returns[-WINDOW:]
     means = run.metrics.column("rollout/ep_rew_mean")
+    folder = RunFolder(run.path)
     known = returns if len(returns) else means[np.isfinite(means)][-1:]
     return {
         "path": run.path,
@@ -176,8 +171,8 @@ def describe(run: RunSummary) -> Row:
         "best": best_evaluation(run),
         "evaluations": len(run.evaluations),
         "curve": curve(run),
-        "changed": max((time_of(run.path / name) or (0, 0))[0] for name in FILES) / 1e9,
-        "pictures": tuple(name for name in PICTURES if is_file(run.path / name)),
+        "changed": max((time_of(path) or (0, 0))[0] for path in files(run.path)) / 1e9,
+        "pictures": tuple(path.name for path in (folder.video, folder.curve) if is_file(path)),
         "warnings": run.warnings,
         "notes": run.notes,
     }

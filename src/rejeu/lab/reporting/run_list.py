@@ -9,10 +9,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from rejeu.checkpoints.run_folder import RunFolder
 from rejeu.core.errors import MissingExtra
 from rejeu.core.records import shown
 from rejeu.lab.reporting.other_programs import EVENTS, FILES, MONITOR, files, read_monitor, read_tensorboard
-from rejeu.lab.reporting.runs import CONFIG, EPISODES, MAX_NAME, METRICS, RunSummary, is_file, read_run
+from rejeu.lab.reporting.runs import MAX_NAME, RunSummary, is_file, read_run
 
 MAX_DEPTH = 4
 """Levels of folders that are searched for runs."""
@@ -126,7 +127,7 @@ def subfolders(folder: Path) -> list[Path]:
 
 def is_ours(folder: Path) -> bool:
     """Returns whether a folder is one of ``rejeu train``."""
-    return any(is_file(folder / name) for name in (CONFIG, EPISODES, METRICS))
+    return any(map(is_file, RunFolder(folder).marks))
 
 
 def is_run(folder: Path) -> bool:

@@ -30,8 +30,6 @@ from rejeu.lab.runs.config import MAX_BYTES, RunConfig
 from rejeu.logs.formatting import quoted
 from rejeu.logs.tables import EMPTY, NO_EPISODES, Episodes, Table, flat, read_bytes, read_table
 
-CONFIG, EPISODES, METRICS, EVALUATIONS = "config.json", "episodes.csv", "metrics.csv", "evaluations.csv"
-WARNINGS = "warnings.txt"
 MAX_DEPTH = 20
 """Upper limit on the levels of a ``config.json``."""
 MAX_WARNINGS = 100
@@ -88,8 +86,8 @@ class RunSummary:
     warnings: tuple[str, ...] = ()
     videos: tuple[Path, ...] = ()
     """Paths of mp4 files inside the folder, oldest first; the video of the best model is last."""
-    models: tuple[str, ...] = ()
-    """Names of the model files, ``best.safetensors`` first."""
+    models: tuple[Path, ...] = ()
+    """Paths of the model files, the best first."""
     notes: tuple[str, ...] = ()
     """One line for each thing that was missing or damaged."""
 
@@ -146,12 +144,14 @@ def read_run(path: str | Path, columns: Collection[str] | None = None) -> RunSum
         raise FileNotFoundError(said)
     folder = folder.resolve()
     files = RunFolder(folder)
-    if not any((folder / name).is_file() for name in (CONFIG, EPISODES, METRICS, EVALUATIONS)):
-        raise FileNotFoundError(f"{shown(folder, 300)} is no run folder: it holds no {CONFIG}{newest_inside(folder)}")
+    if not any(path.is_file() for path in files.marks):
+        raise FileNotFoundError(
+            f"{shown(folder, 300)} is no run folder: it holds no {files.config.name}{newest_inside(folder)}"
+        )
     config, versions, notes = read_config(files.config)
-    metrics, evaluations = (ordered(read_table(folder / name)) for name in (METRICS, EVALUATIONS))
+    metrics, evaluations = (ordered(read_table(path)) for path in (files.metrics, files.evaluations))
     metrics = statistics_rows(metrics)
-    table = ordered(read_table(folder / EPISODES, columns))
+    table = ordered(read_table(files.episodes, columns))
     replays = read_table(files.replays) if is_file(files.replays) else EMPTY
     tables = (table, metrics, evaluations)
     times = (table.column("seconds"), metrics.column("time/time_elapsed"), evaluations.column("seconds"))
@@ -167,7 +167,7 @@ def read_run(path: str | Path, columns: Collection[str] | None = None) -> RunSum
         replays=replays,
         warnings=read_warnings(files.warnings),
         videos=tuple(find_videos(files)),
-        models=tuple(name for name in ("best.safetensors", "agent.safetensors") if is_file(folder / name)),
+        models=tuple(path for path in (files.best, files.agent) if is_file(path)),
         notes=(*notes, *(note for part in (*tables, replays) for note in part.notes)),
     )
     if config is not None:
@@ -218,9 +218,9 @@ def read_config(path: Path) -> tuple[RunConfig | None, dict[str, str | None], li
             raise Malformed("it is nested too deeply")
         return convert(content, RunConfig), convert(content.get("versions", {}), dict[str, str | None]), []
     except FileNotFoundError:
-        return None, {}, [f"there is no {CONFIG}, so the configuration is not known"]
+        return None, {}, [f"there is no {path.name}, so the configuration is not known"]
     except (OSError, Malformed, CheckpointError) as error:
-        return None, {}, [f"{CONFIG} is damaged: {shown(error)}"]
+        return None, {}, [f"{path.name} is damaged: {shown(error)}"]
 
 
 def ordered(table: Table) -> Table:
@@ -244,7 +244,8 @@ def ordered(table: Table) -> Table:
 
 def state_of(run: RunSummary) -> State:
     """Returns the state of a run, from its lock and from what was written; a file says only that a pause was meant."""
-    has_model = "agent.safetensors" in run.models
+    files = RunFolder(run.path)
+    has_model = files.agent in run.models
     process = has_process(run.path)
     if process or (process is None and not has_model and is_recent(run.path)):
         return "running"
@@ -254,12 +255,12 @@ def state_of(run: RunSummary) -> State:
         return "finished"
     if not has_model:
         return "crashed"
-    return "paused" if is_file(RunFolder(run.path).paused) else "interrupted"
+    return "paused" if is_file(files.paused) else "interrupted"
 
 
 def has_process(folder: Path) -> bool | None:
     """Returns whether a process holds a lock of a run; None if there is no lock."""
-    locks = [is_locked(path) for path in (folder / "lock", folder / "checkpoints" / "lock") if is_file(path)]
+    locks = [is_locked(path) for path in (folder / "lock", RunFolder(folder).lock) if is_file(path)]
     return any(locks) if locks else None
 
 
@@ -292,8 +293,9 @@ def is_locked(path: Path) -> bool:
 
 def is_recent(folder: Path) -> bool:
     """Returns whether a table of a run was written in the last minute."""
-    files = [folder / name for name in (CONFIG, METRICS, EVALUATIONS, EPISODES)]
-    return any(0 <= time.time() - path.lstat().st_mtime < RECENT for path in files if is_file(path))
+    run = RunFolder(folder)
+    known = filter(is_file, (*run.marks, run.evaluations))
+    return any(0 <= time.time() - path.lstat().st_mtime < RECENT for path in known)
 
 
 def read_warnings(path: Path) -> tuple[str, ...]:

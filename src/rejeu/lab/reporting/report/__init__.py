@@ -13,6 +13,7 @@ from typing import Any
 
 from rejeu.agents.agent import Agent
 from rejeu.algorithms import config as configs
+from rejeu.checkpoints.run_folder import RunFolder
 from rejeu.core import atomic
 from rejeu.lab.reporting.report import page, sections
 from rejeu.lab.reporting.runs import RunSummary, read_run
@@ -48,7 +49,7 @@ def write_report(
         raise ValueError(f"a report shows 1 to {MAX_RUNS} runs, got {len(paths)}")
     read = [read_run(path) for path in paths]
     if out is None:
-        out = read[0].path / "report.html" if len(read) == 1 else Path("report.html")
+        out = RunFolder(read[0].path).report if len(read) == 1 else Path("report.html")
     return write_page(read, Path(out))
 
 

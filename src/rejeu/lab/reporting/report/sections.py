@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from rejeu.checkpoints.run_folder import RunFolder
 from rejeu.core.records import shown
 from rejeu.lab.reporting.report.videos import BUDGET, Video, collect
 from rejeu.lab.reporting.runs import MAX_WORD, RunSummary, best_row
@@ -310,7 +311,7 @@ def replay_command(run: RunSummary) -> str:
     """Returns the command that shows episodes of the trained agent; empty if there is no model."""
     if run.format != "rejeu" or not run.models:
         return ""
-    which = "" if "best.safetensors" in run.models else " --which last"
+    which = "" if RunFolder(run.path).best in run.models else " --which last"
     return f"rejeu watch {path_word(run.path)}{which} --seed N --episodes 1{env_options(run)}"
 
 

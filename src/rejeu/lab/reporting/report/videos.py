@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import quote
 
+from rejeu.checkpoints.run_folder import RunFolder
 from rejeu.core.records import shown
 from rejeu.lab.reporting.runs import RunSummary
 from rejeu.logs.tables import read_bytes
 
 BUDGET = 5 * 2**19
 """Bytes of videos in a page; in base64 they take a third more."""
-BEST = "video.mp4"
 
 
 class Video(NamedTuple):
@@ -38,8 +38,9 @@ def collect(run: RunSummary, folder: Path | None, budget: int) -> tuple[list[Vid
         folder: where the page will be, for relative links; None for no links.
         budget: most bytes to embed.
     """
-    during = [path for path in run.videos if path.name != BEST]
-    chosen = {path: "Best model" for path in run.videos if path.name == BEST}  # first, as the budget may not be enough
+    best = RunFolder(run.path).video
+    during = [path for path in run.videos if path != best]
+    chosen = {path: "Best model" for path in run.videos if path == best}  # first, as the budget may not be enough
     chosen |= dict.fromkeys(during[-1:], "Last") | dict.fromkeys(during[:-1][:1], "First")
     videos, notes, spent = [], [], 0
     for path, title in chosen.items():
