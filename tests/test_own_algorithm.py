@@ -206,11 +206,7 @@ def test_a_report_shows_what_differs_and_the_command_that_repeats_the_run(awac):
     run = RunSummary(
         path=Path("run"),
         name="run",
-        algorithm="AWAC",
-        env_id="Pendulum-v1",
-        seed=1,
-        config=RunConfig(env="Pendulum-v1", algorithm="AWAC", seed=1, imports=("my awac.py",)),
-        hyperparameters=saved,
+        config=RunConfig(env="Pendulum-v1", algorithm="AWAC", seed=1, imports=("my awac.py",), hyperparameters=saved),
     )
     assert run.changed == {"gamma": (0.9, 0.99), "beta": (3.0, 1.0)}
     words = "--import 'my awac.py' --algo AWAC --seed 1 --set gamma=0.9 beta=3.0"

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rejeu.logs import statistics
-from rejeu.logs.tables import HUGE, Episodes, Table
+from rejeu.logs.tables import HUGE, Table
 
 MAX_DOTS = 1500
 """Most episodes that are drawn one by one; of more their quantiles are drawn."""
@@ -79,10 +79,10 @@ def window_of(n: int) -> int:
     return max(min(max(n // 5, 3), MAX_WINDOW), round(n / MAX_POINTS))
 
 
-def smooth(episodes: Episodes, values: np.ndarray, is_rate: bool = False, window: int | None = None) -> Smoothed:
+def smooth(episodes: Table, values: np.ndarray, is_rate: bool = False, window: int | None = None) -> Smoothed:
     """Returns the moving means of one column with 95 % confidence intervals, those of rates after Wilson; NaN is ignored."""
     known = usable(values)
-    step, seconds, values = episodes.step[known], episodes.seconds[known], values[known]
+    step, seconds, values = episodes.column("step")[known], episodes.column("seconds")[known], values[known]
     n = len(values)
     window = window_of(n) if window is None else window
     at = thinned(n) if n <= MAX_DOTS else np.unique(np.linspace(window - 1, n - 1, MAX_POINTS).astype(int))
@@ -138,7 +138,7 @@ def widened(shown: list[float | None] | None, value: float) -> list[float | None
     return [low, max(high, value + margin)]
 
 
-def episode_chart(episodes: Episodes, evaluations: Table, column: str, window: int | None = None) -> Chart | None:
+def episode_chart(episodes: Table, evaluations: Table, column: str, window: int | None = None) -> Chart | None:
     """Returns the chart of returns, successes or lengths over training; None without any number.
 
     Args:
@@ -147,7 +147,7 @@ def episode_chart(episodes: Episodes, evaluations: Table, column: str, window: i
         column: "return", "success" or "length".
         window: episodes in the moving mean; None for :func:`window_of` their number.
     """
-    values = getattr(episodes, {"return": "returns"}.get(column, column))
+    values = episodes.column(column)
     known, is_rate = usable(values), column == "success"
     evaluated = evaluation_points(evaluations, column)
     if not known.any() and evaluated is None:
@@ -163,7 +163,7 @@ def episode_chart(episodes: Episodes, evaluations: Table, column: str, window: i
             low, high = curve.spread
             found.append(series("band", "5 % to 95 % of episodes", "dots", *at, low=low, high=high))
         elif not is_rate:
-            where = episodes.step[known], episodes.seconds[known] / 60
+            where = episodes.column("step")[known], episodes.column("seconds")[known] / 60
             found.append(series("dots", "episodes", "dots", *where, values[known]))
         found.append(series("band", "95 % interval", "line", *at, low=curve.low, high=curve.high))
         found.append(series("line", f"mean of {window or window_of(n):,} episodes", "line", *at, curve.mean))

@@ -44,34 +44,7 @@ class Table:
 EMPTY = Table({})
 
 
-@dataclass(frozen=True, eq=False)
-class Episodes:
-    """Episodes of training, in the order in which they ended; arrays ``float64 (n_episodes,)``."""
-
-    step: np.ndarray
-    """Environment steps, over all environments, at the end of the episode; never decreases."""
-    env: np.ndarray
-    returns: np.ndarray
-    """NaN where the file had no finite number."""
-    length: np.ndarray
-    success: np.ndarray
-    """1 for a success, 0 for none, NaN where unknown."""
-    seconds: np.ndarray
-    """Training time at the end of the episode."""
-
-    def __len__(self) -> int:
-        return len(self.step)
-
-    @classmethod
-    def of(cls, table: Table) -> Episodes:
-        """Returns the episodes of a table with the columns of ``episodes.csv``."""
-        return cls(*(table.column(name) for name in ("step", "env", "return", "length", "success", "seconds")))
-
-
-NO_EPISODES = Episodes(*[np.zeros(0)] * 6)
-
-
-def evaluation_table(evaluations: Iterable[tuple[int, Any]], episodes: Episodes = NO_EPISODES) -> Table:
+def evaluation_table(evaluations: Iterable[tuple[int, Any]], episodes: Table = EMPTY) -> Table:
     """Returns evaluations as the table of a run, at the times that training episodes ended at.
 
     Args:
@@ -85,7 +58,7 @@ def evaluation_table(evaluations: Iterable[tuple[int, Any]], episodes: Episodes 
     columns = {name: np.array([getattr(one, name) for one in results], np.float64) for name in names}
     columns["episodes"] = np.array([len(one.returns) for one in results], np.float64)
     if len(episodes):
-        columns["seconds"] = np.interp(steps, episodes.step, episodes.seconds)
+        columns["seconds"] = np.interp(steps, episodes.column("step"), episodes.column("seconds"))
     return Table({"step": steps, **columns})
 
 

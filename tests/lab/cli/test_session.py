@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -70,11 +71,11 @@ def test_status_is_the_mean_of_the_last_hundred_episodes_and_the_time_that_is_le
     for asked, left in (({"steps": 40 * n}, 3 * (seconds - 2)), ({"steps": None, "minutes": 2}, 120 - seconds + 2)):
         (run / "config.json").write_text(json.dumps({**config, **asked}))
         (run / "checkpoints").mkdir(exist_ok=True)
-        facts = rows.describe(SimpleNamespace(**{**vars(run_list.read(run)), "state": "running"}))
+        facts = rows.describe(replace(run_list.read(run), state="running"))
         assert facts["steps_per_second"] == pytest.approx(10 * n / (seconds - 2))
         assert facts["seconds_left"] == pytest.approx(left)
         assert rows.rate_text(facts) == f"{10 * n / (seconds - 2):,.0f}/s, {left:,.0f} s left"
-    facts = rows.describe(SimpleNamespace(**{**vars(run_list.read(run)), "state": "interrupted"}))
+    facts = rows.describe(replace(run_list.read(run), state="interrupted"))
     assert (facts["episodes"], facts["seconds_left"], facts["seconds"]) == (n, None, seconds)
     best = facts["best"]
     assert (best["step"], best["mean_return"], best["success_rate"]) == (

@@ -24,19 +24,25 @@ def rows(path):
 def test_recorded_monitor_files_are_one_run_of_two_environments():
     run = run_list.read(ZOO)
     both = [rows(ZOO / f"{i}.monitor.csv") for i in range(2)]
-    assert (run.format, run.algorithm, run.env_id, run.seed, run.n_envs) == ("monitor", "PPO", "CartPole-v1", 1, 2)
+    assert (run.format, run.config.algorithm, run.config.env, run.config.seed, run.config.n_envs) == (
+        "monitor",
+        "PPO",
+        "CartPole-v1",
+        1,
+        2,
+    )
     assert run.steps == sum(row["l"] for part in both for row in part)
     assert len(run.episodes) == sum(map(len, both))
-    assert sorted(run.episodes.returns) == sorted(row["r"] for part in both for row in part)
-    assert (np.diff(run.episodes.seconds) >= 0).all()
-    assert (np.diff(run.episodes.step) > 0).all()
+    assert sorted(run.episodes.column("return")) == sorted(row["r"] for part in both for row in part)
+    assert (np.diff(run.episodes.column("seconds")) >= 0).all()
+    assert (np.diff(run.episodes.column("step")) > 0).all()
 
 
 def test_single_monitor_file():
     run = run_list.read(ZOO / "0.monitor.csv")
     expected = rows(ZOO / "0.monitor.csv")
-    np.testing.assert_array_equal(run.episodes.step, np.cumsum([row["l"] for row in expected]))
-    np.testing.assert_array_equal(run.episodes.seconds, [row["t"] for row in expected])
+    np.testing.assert_array_equal(run.episodes.column("step"), np.cumsum([row["l"] for row in expected]))
+    np.testing.assert_array_equal(run.episodes.column("seconds"), [row["t"] for row in expected])
 
 
 def test_the_clocks_of_several_files_begin_with_the_first(tmp_path):
@@ -44,16 +50,16 @@ def test_the_clocks_of_several_files_begin_with_the_first(tmp_path):
         head = f'#{{"t_start": {start}, "env_id": "CartPole-v1"}}'
         (tmp_path / f"{i}.monitor.csv").write_text(f"{head}\nr,l,t\n{row}\n", encoding="utf-8")
     episodes = read_monitor(tmp_path).episodes
-    assert (episodes.seconds.tolist(), episodes.returns.tolist()) == ([30, 35], [1, 2])
+    assert (episodes.column("seconds").tolist(), episodes.column("return").tolist()) == ([30, 35], [1, 2])
 
 
 def test_hostile_monitor_file(tmp_path):
     path = tmp_path / "monitor.csv"
     path.write_bytes(b'#{"t_start": "now", "env_id": ["<b>"]}\nr,l,t\n1e999,5,1\nx,-3,nan\n2,1e300,3\n3,4,4\n5,')
     run = read_monitor(path)
-    assert run.env_id == ""
+    assert run.config.env == ""
     assert "the last row of monitor.csv is incomplete and was left out" in run.notes
-    assert np.isfinite(run.episodes.step).all()
+    assert np.isfinite(run.episodes.column("step")).all()
     assert run.steps == 9
     assert "2 damaged rows without a valid length were left out" in run.notes
     path.write_bytes(b"#\nreward,length\n1,2\n")
@@ -64,7 +70,7 @@ def test_hostile_monitor_file(tmp_path):
 def test_tensorboard_files():
     pytest.importorskip("tensorboard")
     run = run_list.read(RECORDED / "tb" / "PPO_1")
-    assert (run.format, run.algorithm, run.seed, run.steps) == ("tensorboard", "PPO", 1, 768)
+    assert (run.format, run.config.algorithm, run.config.seed, run.steps) == ("tensorboard", "PPO", 1, 768)
     assert np.isfinite(run.metrics.column("rollout/ep_rew_mean")).all()
     (group,) = compare(run, x="time", samples=10).groups
     assert group.x[-1] == run.seconds > 0
@@ -96,5 +102,5 @@ def test_yaml_beside_a_run_is_never_read(tmp_path):
     (folder / "monitor.csv").write_bytes((ZOO / "0.monitor.csv").read_bytes())
     (folder / "config.yml").write_text("!!python/object/apply:os.system ['touch hacked']", encoding="utf-8")
     found, _ = run_list.read_all(tmp_path)
-    assert [(run.algorithm, run.seed) for run in found] == [("PPO", 3)]
+    assert [(run.config.algorithm, run.config.seed) for run in found] == [("PPO", 3)]
     assert not Path("hacked").exists()

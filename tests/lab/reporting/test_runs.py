@@ -55,10 +55,11 @@ def aged(folder):
 
 def test_complete_run(folder):
     run = read_run(folder)
-    assert (run.name, run.algorithm, run.env_id, run.seed, run.n_envs) == ("run", "DQN", "CartPole-v1", 3, 2)
-    assert (run.state, run.steps, run.steps_asked, run.seconds) == ("finished", 100, 100, 1.25)
-    np.testing.assert_array_equal(run.episodes.step, [40, 100])
-    np.testing.assert_array_equal(run.episodes.returns, [20.0, 30.5])
+    config = run.config
+    assert (run.name, config.algorithm, config.env, config.seed, config.n_envs) == ("run", "DQN", "CartPole-v1", 3, 2)
+    assert (run.state, run.steps, config.steps, run.seconds) == ("finished", 100, 100, 1.25)
+    np.testing.assert_array_equal(run.episodes.column("step"), [40, 100])
+    np.testing.assert_array_equal(run.episodes.column("return"), [20.0, 30.5])
     np.testing.assert_array_equal(run.metrics.column("train/loss"), [np.nan, 0.5])
     np.testing.assert_array_equal(run.evaluations.column("mean_return"), [25.0])
     assert run.versions == {"python": "3.11.7"}
@@ -153,8 +154,8 @@ def test_truncated_and_damaged_rows_are_left_out(folder):
     content = EPISODES + "x,0,1,1,nan,1\r\n120,0\r\n-5,0,1,1,nan,1\r\n110,0,inf,5,1.0,2.0\r\n130,0,12"
     (folder / "episodes.csv").write_bytes(content.encode())
     run = read_run(folder)
-    np.testing.assert_array_equal(run.episodes.step, [40, 100, 110])
-    np.testing.assert_array_equal(run.episodes.returns, [20.0, 30.5, np.nan])
+    np.testing.assert_array_equal(run.episodes.column("step"), [40, 100, 110])
+    np.testing.assert_array_equal(run.episodes.column("return"), [20.0, 30.5, np.nan])
     assert run.notes == (
         "the last row of episodes.csv is incomplete and was left out",
         "left out of episodes.csv: 1 damaged row",
@@ -179,8 +180,8 @@ def test_config_with_values_of_wrong_types(folder):
     bad = {"env": {"a": 1}, "algorithm": ["<script>"], "seed": "x", "steps": -1, "minutes": True, "hyperparameters": 3}
     (folder / "config.json").write_text(json.dumps(bad), encoding="utf-8")
     run = read_run(folder)
-    assert (run.seed, run.steps_asked, run.minutes_asked, run.hyperparameters) == (None, None, None, {})
-    assert run.algorithm == ""
+    assert (run.config.seed, run.config.steps, run.config.minutes, run.config.hyperparameters) == (None, None, None, {})
+    assert run.config.algorithm == ""
     assert "config.json is damaged" in run.notes[0]
 
 

@@ -240,12 +240,17 @@ def compared(study: Study, best: Trial, failed: list[str]) -> Final:
     labels = {winner_name(best): f"winner (trial {best.index})", DEFAULT: DEFAULT}
     if min(map(len, runs.values())) < MIN_FINAL_SEEDS:
         return Final("not compared", None, None, tuple(failed))
-    labeled = [dataclasses.replace(run, algorithm=labels[name]) for name, found in runs.items() for run in found]
+    labeled = [named(run, labels[name]) for name, found in runs.items() for run in found]
     comparison = compare(labeled, "algorithm", score="evaluation", seed=study.plan.seed)
     winner, default = ([last_values(found, study.plan.column)] for found in runs.values())
     value, low, high = difference(winner, default, study.plan.seed)
     verdict: Verdict = "better" if low > 0 else "worse" if high < 0 else "no difference found"
     return Final(verdict, (value, low, high), comparison, tuple(failed), study.plan.measure)
+
+
+def named(run: RunSummary, label: str) -> RunSummary:
+    """Returns a run whose algorithm has another name, which makes its group."""
+    return dataclasses.replace(run, config=dataclasses.replace(run.config, algorithm=label))
 
 
 def finished(folder: Path) -> list[RunSummary]:

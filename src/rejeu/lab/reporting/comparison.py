@@ -189,7 +189,7 @@ class Comparison:
                 {
                     **row,
                     "paths": [str(run.path) for run in group.runs],
-                    "seeds": [run.seed for run in group.runs],
+                    "seeds": [run.config.seed for run in group.runs],
                     "scores": [one.tolist() for one in group.scores],
                     "curve": dict(zip(("x", *BOUNDS), [group.x.tolist(), *group.curve.tolist()], strict=True)),
                     "profile": dict(
@@ -356,7 +356,9 @@ def warnings_of(curves: Sequence[Curve]) -> list[str]:
         runs = [one.run for one in members]
         named = settings(runs)
         mixed += [label] if len({*named}) > 1 else []
-        seeds = Counter((run.seed, setting) for run, setting in zip(runs, named, strict=True) if run.seed is not None)
+        seeds = Counter(
+            (run.config.seed, setting) for run, setting in zip(runs, named, strict=True) if run.config.seed is not None
+        )
         repeated += [label] if seeds and max(seeds.values()) > 1 else []
     notes = [
         f"{shown(label, 100)}: the runs of this group differ in their settings; --by setting separates them"
@@ -366,7 +368,7 @@ def warnings_of(curves: Sequence[Curve]) -> list[str]:
         f"{shown(label, 100)}: runs of this group have the same seed; they count as several, but are not independent"
         for label in dict.fromkeys(repeated)
     ]
-    means = sum(not (len(one.run.episodes) or one.run.hyperparameters.get("offline")) for one in curves)
+    means = sum(not (len(one.run.episodes) or one.run.config.hyperparameters.get("offline")) for one in curves)
     if means:
         notes.append(
             f"{means} of {len(curves)} runs have no episodes on disk; the logged means of their latest episodes are used"
@@ -508,8 +510,8 @@ def run_rows(comparison: Comparison) -> list[list[str]]:
     rows = []
     for group in comparison.groups:
         for run, score in zip(group.runs, group.run_scores, strict=True):
-            seed = "" if run.seed is None else str(run.seed)
-            rows.append([run.name, group.label, run.env_id, seed, run.state, f"{run.steps:,}", number(score)])
+            seed = "" if run.config.seed is None else str(run.config.seed)
+            rows.append([run.name, group.label, run.config.env, seed, run.state, f"{run.steps:,}", number(score)])
     return rows
 
 

@@ -43,7 +43,7 @@ def group_labels(runs: Sequence[RunSummary], by: By | None) -> tuple[By, list[st
 
 def settings(runs: Sequence[RunSummary]) -> list[str]:
     """Returns for each run the algorithm, and the settings in which the runs of this algorithm differ."""
-    values = [dict(flat(run.hyperparameters)) | {"n_envs": run.n_envs} for run in runs]
+    values = [dict(flat(run.config.hyperparameters)) | {"n_envs": run.config.n_envs} for run in runs]
     written = [{name: whole_text(value) for name, value in one.items()} for one in values]
     members: dict[str, list[dict[str, str]]] = {}
     for run, one in zip(runs, written, strict=True):
@@ -65,13 +65,13 @@ def differing_names(settings: Sequence[Mapping[str, str]]) -> list[str]:
 
 def algorithm_label(run: RunSummary) -> str:
     """Returns the algorithm of a run; of one that does not say, the name of the folder above."""
-    return run.algorithm or run.path.parent.name
+    return run.config.algorithm or run.path.parent.name
 
 
 def env_label(run: RunSummary) -> str:
     """Returns the environment of a run with its keyword arguments."""
-    kwargs = ", ".join(f"{name}={whole_text(value)}" for name, value in sorted(run.env_kwargs.items()))
-    return shortened(f"{run.env_id}({kwargs})" if kwargs else run.env_id)
+    kwargs = ", ".join(f"{name}={whole_text(value)}" for name, value in sorted(run.config.env_kwargs.items()))
+    return shortened(f"{run.config.env}({kwargs})" if kwargs else run.config.env)
 
 
 def whole_text(value: Any) -> str:
@@ -117,8 +117,8 @@ class Curve:
         when, value = table.column("step" if axis == "steps" else "seconds"), table.column("mean_return")
         good = np.isfinite(when) & (np.abs(value) < HUGE)
         if len(run.episodes):
-            x, y = (run.episodes.step if axis == "steps" else run.episodes.seconds), run.episodes.returns
-        elif run.hyperparameters.get("offline"):
+            x, y = (run.episodes.column(name) for name in ("step" if axis == "steps" else "seconds", "return"))
+        elif run.config.hyperparameters.get("offline"):
             x, y = when[good], value[good]
         else:  # of a run that is in progress or crashed only the means are known
             x = run.metrics.column("step" if axis == "steps" else "time/time_elapsed")

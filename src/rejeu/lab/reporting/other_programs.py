@@ -17,8 +17,9 @@ from rejeu.algorithms.catalog import CATALOG
 from rejeu.core.errors import MissingExtra
 from rejeu.core.records import Malformed, parse_json, shown
 from rejeu.lab.reporting.runs import MAX_NAME, MAX_STEP, RunSummary, is_file, ordered
+from rejeu.lab.runs.config import RunConfig
 from rejeu.logs.formatting import counted
-from rejeu.logs.tables import EMPTY, MAX_COLUMNS, Episodes, Table, read_bytes, read_table
+from rejeu.logs.tables import EMPTY, MAX_COLUMNS, Table, read_bytes, read_table
 
 MONITOR = re.compile(r"(.*\.)?monitor\.csv")
 EVENTS = re.compile(r"events\.out\.tfevents\..+")
@@ -74,20 +75,16 @@ def read_monitor(path: Path) -> RunSummary:
     steps = np.cumsum(length[order])
     columns = {"env": env, "return": returns, "length": length, "success": success, "seconds": seconds}
     table = ordered(Table({"step": steps, **{name: one[order] for name, one in columns.items()}}, tuple(notes)))
-    episodes = Episodes.of(table)
     folder = path if path.is_dir() else path.parent
     said = named(folder)
     return RunSummary(
         path=path.resolve(),
         name=shown(folder.name, MAX_NAME),
         format="monitor",
-        algorithm=said[0],
-        env_id=env_id or said[1],
-        seed=said[2],
-        n_envs=len(parts),
+        config=RunConfig(env=env_id or said[1], algorithm=said[0], seed=said[2], n_envs=len(parts)),
         steps=int(steps[-1]) if len(steps) else 0,
-        seconds=float(episodes.seconds[-1]) if len(episodes) else float("nan"),
-        episodes=episodes,
+        seconds=float(table.columns["seconds"][-1]) if len(table) else float("nan"),
+        episodes=table,
         notes=table.notes,
     )
 
@@ -152,9 +149,7 @@ def read_tensorboard(folder: Path) -> RunSummary:
         path=folder.resolve(),
         name=shown(folder.name, MAX_NAME),
         format="tensorboard",
-        algorithm=algorithm,
-        env_id=env_id,
-        seed=number,
+        config=RunConfig(env=env_id, algorithm=algorithm, seed=number),
         steps=int(metrics.columns["step"][-1]) if len(metrics) else 0,
         seconds=float(seconds[-1]) if len(seconds) else float("nan"),
         metrics=metrics,

@@ -17,7 +17,7 @@ from rejeu.core.records import shown
 from rejeu.lab.reporting import run_list
 from rejeu.lab.reporting.runs import RunSummary, best_row, has_process, is_file, is_recent
 from rejeu.logs import charts
-from rejeu.logs.tables import EMPTY, NO_EPISODES
+from rejeu.logs.tables import EMPTY
 
 WINDOW = 100
 """Training episodes in the mean that is shown."""
@@ -97,7 +97,7 @@ class Rows:
         try:
             run = run_list.read(path, table_only=True)
             row = describe(run)
-            run = replace(run, episodes=NO_EPISODES, evaluations=EMPTY, metrics=EMPTY, replays=EMPTY)
+            run = replace(run, episodes=EMPTY, evaluations=EMPTY, metrics=EMPTY, replays=EMPTY)
         except (OSError, ValueError, ImportError) as error:
             row = {**nothing(path, "damaged"), "notes": (shown(error, 300),)}
         now = time.monotonic()
@@ -146,10 +146,11 @@ def describe(run: RunSummary) -> Row:
     rates = run.metrics.column("time/fps")
     rates = rates[np.isfinite(rates)]  # without compilation, as training measures it
     rate = float(rates[-1]) if len(rates) else run.steps / seconds if seconds > 0 else math.nan
-    left = max(run.steps_asked - run.steps, 0) / rate if run.steps_asked and rate else math.nan
-    if run.minutes_asked is not None:
-        left = max(60 * run.minutes_asked - seconds, 0.0)
-    returns = run.episodes.returns[-WINDOW:]
+    config = run.config
+    left = max(config.steps - run.steps, 0) / rate if config.steps and rate else math.nan
+    if config.minutes is not None:
+        left = max(60 * config.minutes - seconds, 0.0)
+    returns = run.episodes.column("return")[-WINDOW:]
     means = run.metrics.column("rollout/ep_rew_mean")
     folder = RunFolder(run.path)
     known = returns if len(returns) else means[np.isfinite(means)][-1:]
@@ -157,12 +158,12 @@ def describe(run: RunSummary) -> Row:
         "path": run.path,
         "name": run.name,
         "format": run.format,
-        "env": run.env_id,
-        "algorithm": run.algorithm,
-        "seed": run.seed,
+        "env": config.env,
+        "algorithm": config.algorithm,
+        "seed": config.seed,
         "state": run.state,
         "steps": run.steps,
-        "steps_asked": run.steps_asked,
+        "steps_asked": config.steps,
         "seconds": run.seconds,
         "steps_per_second": rate,
         "seconds_left": left if run.state == "running" else None,
@@ -190,7 +191,7 @@ def best_evaluation(run: RunSummary) -> dict[str, float] | None:
 
 def curve(run: RunSummary) -> list[float]:
     """Returns the mean returns of up to :data:`POINTS` parts of the training; of a run without episodes, its evaluations."""
-    values = run.episodes.returns if len(run.episodes) else run.evaluations.column("mean_return")
+    values = run.episodes.column("return") if len(run.episodes) else run.evaluations.column("mean_return")
     known = values[charts.usable(values)]
     return (
         [float(f"{part.mean():.4g}") for part in np.array_split(known, min(POINTS, len(known)))] if len(known) else []

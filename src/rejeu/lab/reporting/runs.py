@@ -28,7 +28,7 @@ from rejeu.core.errors import CheckpointError
 from rejeu.core.records import Malformed, convert, is_deep, parse_json, shown
 from rejeu.lab.runs.config import MAX_BYTES, RunConfig
 from rejeu.logs.formatting import quoted
-from rejeu.logs.tables import EMPTY, NO_EPISODES, Episodes, Table, flat, read_bytes, read_table
+from rejeu.logs.tables import EMPTY, Table, flat, read_bytes, read_table
 
 MAX_DEPTH = 20
 """Upper limit on the levels of a ``config.json``."""
@@ -44,6 +44,8 @@ MAX_STEP = 2**53
 RECENT = 60.0
 """Seconds since the last write up to which a run without a lock counts as running."""
 
+UNKNOWN = RunConfig(env="", algorithm="")
+"""The description of a run of which nothing is known."""
 State = Literal["running", "finished", "paused", "interrupted", "crashed", "unknown"]
 
 
@@ -53,29 +55,18 @@ class RunSummary:
 
     path: Path
     name: str
-    format: Literal["rejeu", "monitor", "tensorboard"] = "rejeu"
-    """Which program's files they are: ``"monitor"`` are Stable-Baselines3's ``monitor.csv``."""
-    algorithm: str = ""
-    """Empty if unknown."""
-    env_id: str = ""
-    """Empty if unknown."""
-    env_kwargs: Mapping[str, Any] = field(default_factory=dict)
-    seed: int | None = None
-    n_envs: int | None = None
-    config: RunConfig | None = None
-    """The description of the run in ``config.json``; None if that is missing or damaged."""
-    hyperparameters: Mapping[str, Any] = field(default_factory=dict)
-    """All hyperparameters, as JSON values."""
+    format: Literal["rejeu", "agent", "monitor", "tensorboard"] = "rejeu"
+    """Whose files they are: ``"monitor"`` are Stable-Baselines3's ``monitor.csv``; an ``"agent"`` in memory has none."""
+    config: RunConfig = UNKNOWN
+    """The description of the run, as far as it is known; environment and algorithm are empty if they are not."""
     versions: Mapping[str, str] = field(default_factory=dict)
     state: State = "unknown"
     steps: int = 0
     """Environment steps done, by the tables and the newest checkpoint."""
-    steps_asked: int | None = None
-    """Environment steps to do; None if unknown, or if the run is limited by ``minutes_asked``."""
-    minutes_asked: float | None = None
     seconds: float = math.nan
     """Training time so far."""
-    episodes: Episodes = NO_EPISODES
+    episodes: Table = EMPTY
+    """Columns ``step``, ``env``, ``return``, ``length``, ``success``, ``seconds``, in the order in which episodes ended."""
     evaluations: Table = EMPTY
     """Columns ``step``, ``seconds``, ``success_rate``, ``mean_return``, ``std_return``, ``mean_length``, ``episodes``,
     ``best``."""
@@ -97,25 +88,25 @@ class RunSummary:
 
         Empty if the algorithm is neither rejeu's nor registered.
         """
-        defaults = default_hyperparameters(self.algorithm)
+        defaults = default_hyperparameters(self.config.algorithm)
         if not defaults:
             return {}
-        default, value = dict(flat(defaults)), dict(flat(self.hyperparameters))
+        default, value = dict(flat(defaults)), dict(flat(self.config.hyperparameters))
         return {name: (value[name], default.get(name)) for name in value if value[name] != default.get(name)}
 
     def environment_words(self) -> list[str]:
         """Returns the options with which commands about the run make its environment again; empty if its id is enough."""
-        return [] if self.config is None else self.config.environment_words(option=True)
+        return self.config.environment_words(option=True) if self.config.env else []
 
     @cached_property
     def command(self) -> str:
         """The command that repeats the run, made from its configuration; empty if that is not known."""
-        if self.config is None or not self.algorithm:
+        if self.format != "rejeu" or not self.config.algorithm:
             return ""
-        preset = presets.find(self.env_id, self.algorithm)
-        usual = default_hyperparameters(self.algorithm, preset.hyperparameters if preset else {})
+        preset = presets.find(self.config.env, self.config.algorithm)
+        usual = default_hyperparameters(self.config.algorithm, preset.hyperparameters if preset else {})
         taken = dict(flat(usual))  # by rejeu train if nothing is set
-        values = dict(flat(self.hyperparameters))
+        values = dict(flat(self.config.hyperparameters))
         same = {
             name
             for name in values
@@ -158,10 +149,11 @@ def read_run(path: str | Path, columns: Collection[str] | None = None) -> RunSum
     run = RunSummary(
         path=folder,
         name=shown(folder.name, MAX_NAME),
+        config=config,
         versions={shown(name): shown(version) for name, version in versions.items() if version is not None},
         steps=max(0, newest_step(files.checkpoints), *(int(part.column("step")[-1]) for part in tables if len(part))),
         seconds=max((one[-1] for one in times if len(one) and math.isfinite(one[-1])), default=math.nan),
-        episodes=Episodes.of(table),
+        episodes=table,
         evaluations=evaluations,
         metrics=metrics,
         replays=replays,
@@ -170,19 +162,6 @@ def read_run(path: str | Path, columns: Collection[str] | None = None) -> RunSum
         models=tuple(path for path in (files.best, files.agent) if is_file(path)),
         notes=(*notes, *(note for part in (*tables, replays) for note in part.notes)),
     )
-    if config is not None:
-        run = replace(
-            run,
-            algorithm=shown(config.algorithm or "", MAX_NAME),
-            env_id=shown(config.env, MAX_NAME),
-            env_kwargs=config.env_kwargs,
-            seed=config.seed,
-            n_envs=config.n_envs,
-            config=config,
-            hyperparameters=config.hyperparameters,
-            steps_asked=config.steps,
-            minutes_asked=config.minutes,
-        )
     state = state_of(run)
     if state == "running":  # in its first seconds nothing was written
         run = replace(
@@ -210,17 +189,19 @@ def statistics_rows(table: Table) -> Table:
     return Table({name: values[known] for name, values in columns.items() if not name.startswith("eval/")}, table.notes)
 
 
-def read_config(path: Path) -> tuple[RunConfig | None, dict[str, str | None], list[str]]:
-    """Returns the description of a run, the versions of what ran, and notes; None and none if they are missing or damaged."""
+def read_config(path: Path) -> tuple[RunConfig, dict[str, str | None], list[str]]:
+    """Returns the description of a run, the versions of what ran, and notes about what is missing or damaged."""
     try:
         content = parse_json(read_bytes(path, MAX_BYTES))
         if is_deep(content, MAX_DEPTH):
             raise Malformed("it is nested too deeply")
-        return convert(content, RunConfig), convert(content.get("versions", {}), dict[str, str | None]), []
+        config, versions = convert(content, RunConfig), convert(content.get("versions", {}), dict[str, str | None])
+        env, algorithm = shown(config.env, MAX_NAME), shown(config.algorithm or "", MAX_NAME)
+        return replace(config, env=env, algorithm=algorithm), versions, []
     except FileNotFoundError:
-        return None, {}, [f"there is no {path.name}, so the configuration is not known"]
+        return UNKNOWN, {}, [f"there is no {path.name}, so the configuration is not known"]
     except (OSError, Malformed, CheckpointError) as error:
-        return None, {}, [f"{path.name} is damaged: {shown(error)}"]
+        return UNKNOWN, {}, [f"{path.name} is damaged: {shown(error)}"]
 
 
 def ordered(table: Table) -> Table:
@@ -249,8 +230,8 @@ def state_of(run: RunSummary) -> State:
     process = has_process(run.path)
     if process or (process is None and not has_model and is_recent(run.path)):
         return "running"
-    reached_steps = run.steps_asked is not None and run.steps >= run.steps_asked
-    reached_minutes = run.minutes_asked is not None and run.seconds >= 0.98 * 60 * run.minutes_asked
+    reached_steps = run.config.steps is not None and run.steps >= run.config.steps
+    reached_minutes = run.config.minutes is not None and run.seconds >= 0.98 * 60 * run.config.minutes
     if has_model and run.steps in run.evaluations.column("step") and (reached_steps or reached_minutes):
         return "finished"
     if not has_model:
@@ -324,7 +305,7 @@ def is_file(path: Path) -> bool:
         return False
 
 
-def default_hyperparameters(algorithm: str, given: Mapping[str, Any] = MappingProxyType({})) -> dict[str, Any]:
+def default_hyperparameters(algorithm: str | None, given: Mapping[str, Any] = MappingProxyType({})) -> dict[str, Any]:
     """Returns ``given`` and the defaults of an algorithm as JSON values; empty if it is neither rejeu's nor registered."""
     from rejeu.algorithms import config
 

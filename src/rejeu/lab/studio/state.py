@@ -50,7 +50,7 @@ class Studio:
     def given(self, run: str) -> RunOptions:
         """Returns what people have typed about the environment of a run, which no file may let import code."""
         known = self.summaries.get(run)
-        return self.typed("" if known is None or known.config is None else known.config.typed)
+        return self.typed("" if known is None else known.config.typed)
 
     def typed(self, env: str) -> RunOptions:
         """Returns what people have typed about an environment that they named like this."""

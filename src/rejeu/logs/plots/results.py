@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from rejeu.core.validation import whole
 from rejeu.logs import charts
 from rejeu.logs.plots import drawing
-from rejeu.logs.tables import Episodes, Table, evaluation_table
+from rejeu.logs.tables import Table, evaluation_table
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -60,15 +60,15 @@ def learning_curve(
         raise ValueError(f"against={against!r} must be one of {', '.join(AXES)}")
     window = None if window is None else whole("window", window, least=1)
     along, unit, x_title = AXES[against]
-    episodes = Episodes.of(Table(history.to_dict()))
+    episodes = Table(history.to_dict())
     table = evaluation_table(evaluations, episodes)
     empty: charts.Chart = {"y": "return", "series": []}
     found = [charts.episode_chart(episodes, table, "return", window) or empty]
-    if np.isfinite(episodes.success).any():
+    if np.isfinite(history["success"]).any():
         found.append(charts.episode_chart(episodes, table, "success", window) or empty)
     rows = history.record_rows
     if len(rows):
-        records = episodes.step[rows], episodes.seconds[rows] / 60, episodes.returns[rows]
+        records = history["step"][rows], history["seconds"][rows] / 60, history["return"][rows]
         found[0]["series"].insert(1, charts.series("marks", "records", "good", *records))
         found[0]["range"] = charts.widened(found[0]["range"], history.best_return)
 

@@ -15,7 +15,7 @@ from rejeu.lab.reporting import runs
 from rejeu.lab.reporting.report import page, record, sections, write_report
 from rejeu.logs import charts
 from rejeu.logs.evaluation import Evaluation
-from rejeu.logs.tables import EMPTY, Episodes, Table
+from rejeu.logs.tables import EMPTY, Table
 from rejeu.training.run import Episode
 from tests.lab.reporting.report.folders import CONFIG, EVIL, MP4, write, write_hostile
 
@@ -134,9 +134,7 @@ def test_policy_of_the_page_allows_its_own_scripts_and_no_network(tmp_path):
 def test_million_episodes_are_binned(tmp_path):
     n = 1_000_000
     returns = np.sin(np.arange(n) / n)
-    episodes = Episodes(
-        np.arange(n) * 10.0, np.zeros(n), returns, np.full(n, 10.0), np.full(n, np.nan), np.arange(n) / 1e4
-    )
+    episodes = Table({"step": np.arange(n) * 10.0, "return": returns, "seconds": np.arange(n) / 1e4})
     curve = charts.smooth(episodes, returns)
     assert len(curve.step) == charts.MAX_POINTS
     np.testing.assert_allclose(curve.mean[0], returns[:2500].mean())
@@ -157,7 +155,7 @@ def test_commands_of_a_page_make_the_environment_again(tmp_path):
 
 def test_moving_average_and_its_interval():
     values = np.array([1.0, 3.0, 2.0, 6.0, np.nan, 4.0])
-    episodes = Episodes(np.arange(6.0), *[np.zeros(6)] * 4, 60.0 * np.arange(6))
+    episodes = Table({"step": np.arange(6.0), "seconds": 60.0 * np.arange(6)})
     curve = charts.smooth(episodes, values)  # a window of 3
     np.testing.assert_allclose(curve.mean, [1, 2, 2, 11 / 3, 4])
     deviation = np.std([2.0, 6.0, 4.0], ddof=1) / np.sqrt(3)
@@ -190,7 +188,7 @@ def test_charts_have_minutes_and_the_range_of_each_bin(tmp_path):
 
 def test_interval_of_a_single_episode_is_unknown_and_large_returns_keep_their_deviation():
     values = 1e9 + np.array([0.0, 1.0, 0.0, 1.0])
-    curve = charts.smooth(Episodes(np.arange(4.0), *[np.zeros(4)] * 5), values)
+    curve = charts.smooth(Table({"step": np.arange(4.0)}), values)
     assert np.isnan(curve.low[0])
     np.testing.assert_allclose(
         (curve.high - curve.mean)[2], 1.959964 * np.std([0, 1, 0], ddof=1) / np.sqrt(3), rtol=1e-5
@@ -276,7 +274,7 @@ def test_widths_that_follow_from_the_observations_are_no_change(given, changed):
 
 def test_the_interval_of_mean_lengths_stays_between_them():
     length = np.array([50.0, 50, 4, 50, 50, 50, 3, 50])
-    episodes = Episodes(np.arange(8.0), *[np.zeros(8)] * 2, length, *[np.zeros(8)] * 2)
+    episodes = Table({"step": np.arange(8.0), "length": length})
     band = next(
         one for one in charts.episode_chart(episodes, EMPTY, "length")["series"] if one["name"] == "95 % interval"
     )

@@ -17,8 +17,9 @@ from rejeu.checkpoints.run_folder import RunFolder
 from rejeu.core import atomic
 from rejeu.lab.reporting.report import page, sections
 from rejeu.lab.reporting.runs import RunSummary, read_run
+from rejeu.lab.runs.config import RunConfig
 from rejeu.logs.evaluation import Evaluation
-from rejeu.logs.tables import Episodes, Table, evaluation_table
+from rejeu.logs.tables import Table, evaluation_table
 
 MAX_RUNS = 50
 """Most runs of a page."""
@@ -60,15 +61,18 @@ def record(agent: Agent, path: Path, evaluations: Sequence[tuple[int, Evaluation
     return RunSummary(
         path=path.absolute(),
         name=path.stem,
-        algorithm=agent.name,
-        env_id="" if env is None else env.env_id,
-        seed=agent.seed,
-        n_envs=None if env is None else env.n_envs,
-        hyperparameters=configs.to_json(given_config(agent)),
+        format="agent",
+        config=RunConfig(
+            env="" if env is None else env.env_id,
+            algorithm=agent.name,
+            seed=agent.seed,
+            n_envs=None if env is None else env.n_envs,
+            hyperparameters=configs.to_json(given_config(agent)),
+        ),
         state="running" if agent.is_learning else "finished",
         steps=agent.run.step,
         seconds=agent.seconds["total"],
-        episodes=Episodes.of(Table(history.to_dict())),
+        episodes=Table(history.to_dict()),
         evaluations=evaluation_table(evaluations),
     )
 

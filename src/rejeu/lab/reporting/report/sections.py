@@ -54,7 +54,7 @@ def title_of(runs: Sequence[RunSummary]) -> str:
     """Returns the title of a page."""
     if len(runs) > 1:
         return f"{len(runs)} runs"
-    return f"{runs[0].env_id or runs[0].name}, {runs[0].algorithm or 'unknown algorithm'}"
+    return f"{runs[0].config.env or runs[0].name}, {runs[0].config.algorithm or 'unknown algorithm'}"
 
 
 @np.errstate(all="ignore")  # files may hold any number
@@ -95,16 +95,9 @@ def charts_of(run: RunSummary, prefix: str) -> tuple[dict[str, Any], list[dict[s
 
 def histogram_of(run: RunSummary) -> dict[str, Any] | None:
     """Returns the histogram of the training episodes."""
-    episodes = run.episodes
-    columns = {
-        "episode": np.arange(1, len(episodes) + 1),
-        "step": episodes.step,
-        "environment": episodes.env,
-        "return": episodes.returns,
-        "length": episodes.length,
-        "success": episodes.success,
-    }
-    return chart_data.histogram(episodes.returns, columns)
+    own = {name: run.episodes.column(name) for name in ("step", "env", "return", "length", "success")}
+    columns = {"episode": np.arange(1, len(run.episodes) + 1), **own}
+    return chart_data.histogram(own["return"], columns)
 
 
 def replays_of(run: RunSummary) -> dict[str, Any] | None:
@@ -121,8 +114,8 @@ def describe(
     return {
         "id": key,
         "name": run.name,
-        "env": run.env_id or "unknown environment",
-        "algorithm": run.algorithm or "unknown algorithm",
+        "env": run.config.env or "unknown environment",
+        "algorithm": run.config.algorithm or "unknown algorithm",
         "state": run.state,
         "state_text": "state unknown" if run.state == "unknown" else run.state,
         "tiles": tiles(run),
@@ -194,8 +187,8 @@ def tiles(run: RunSummary) -> list[Tile]:
         headline += evaluation_tiles(run, last, int(np.flatnonzero(np.isfinite(mean))[-1]))
     else:
         headline += training_tiles(run)
-    done = f"of {run.steps_asked:,}" if run.steps_asked else ""
-    time = f"of {duration(60 * run.minutes_asked)}" if run.minutes_asked else ""
+    done = f"of {run.config.steps:,}" if run.config.steps else ""
+    time = f"of {duration(60 * run.config.minutes)}" if run.config.minutes else ""
     return [
         *headline,
         Tile("Environment steps", f"{run.steps:,}", done),
@@ -221,7 +214,7 @@ def evaluation_tiles(run: RunSummary, title: str, row: int) -> list[Tile]:
 
 def training_tiles(run: RunSummary) -> list[Tile]:
     """Returns the figures of the last training episodes of a run without evaluations."""
-    returns = run.episodes.returns[-LAST:]
+    returns = run.episodes.column("return")[-LAST:]
     returns = returns[np.isfinite(returns)]
     if not len(returns):
         return [Tile("Evaluation", "\N{EN DASH}", "none yet")]
@@ -231,11 +224,11 @@ def training_tiles(run: RunSummary) -> list[Tile]:
 
 def facts(run: RunSummary) -> list[str]:
     """Returns the line below the headline."""
-    backend = None if run.config is None else run.config.backend
+    config = run.config
     texts = [counted(len(run.episodes), "episode")]
-    texts += [f"seed {run.seed}"] if run.seed is not None else []
-    texts += [f"{counted(run.n_envs, 'environment')} at once"] if run.n_envs else []
-    texts += [f"{shown(backend)} backend"] if backend else []
+    texts += [f"seed {config.seed}"] if config.seed is not None else []
+    texts += [f"{counted(config.n_envs, 'environment')} at once"] if config.n_envs else []
+    texts += [f"{shown(config.backend)} backend"] if config.backend else []
     texts += [f"{run.steps / run.seconds:,.0f} steps/s"] if run.seconds > 0 else []
     return texts
 
@@ -293,13 +286,13 @@ def hyperparameters(run: RunSummary) -> list[dict[str, Any]]:
             "changed": name in run.changed,
             "default": value_text(run.changed[name][1]) if name in run.changed else "",
         }
-        for name, value in list(flat(run.hyperparameters))[:MAX_SETTINGS]
+        for name, value in list(flat(run.config.hyperparameters))[:MAX_SETTINGS]
     ]
 
 
 def settings(run: RunSummary) -> list[tuple[str, str]]:
     """Returns the configuration of the run without the hyperparameters, where it differs from what is usual."""
-    if run.config is None:
+    if run.format != "rejeu":
         return []
     usual = asdict(RunConfig(env=""))
     hidden = ("hyperparameters", "env", "algorithm")
