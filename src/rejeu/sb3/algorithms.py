@@ -49,7 +49,7 @@ from rejeu.sb3.common import base_callback, buffers, logger as loggers, utils
 from rejeu.sb3.common.env_util import is_wrapped, make_vec_env
 from rejeu.sb3.common.monitor import Monitor
 from rejeu.sb3.common.noise import VectorizedActionNoise
-from rejeu.sb3.common.preprocessing import is_image_space, is_image_space_channels_first
+from rejeu.sb3.common.preprocessing import is_image_space, is_image_space_channels_first, maybe_transpose
 from rejeu.sb3.common.torch_layers import encoder_of, register_again
 from rejeu.sb3.common.vec_env.vec_normalize import VecNormalize
 from rejeu.sb3.common.vec_env.vec_transpose import VecTransposeImage
@@ -377,7 +377,7 @@ class Original(Agent):
         """Returns a new buffer; one for ``VecNormalize`` stores what was not normalized, and scales what is drawn."""
         scales = self._asks_for_originals(env)
         buffer: Any = super().make_buffer(env)  # type: ignore[safe-super]
-        return Scaled.by(buffer, self) if scales else buffer
+        return scaled(buffer, self) if scales else buffer
 
     def keep_buffer(self, env: Any) -> None:
         """Keeps the buffer for other environments."""
@@ -442,7 +442,7 @@ class Original(Agent):
                 "obs, info = env.reset()"
             )
         if isinstance(self.observation_space, gym.spaces.Box):
-            observation = _like(self.observation_space, observation)
+            observation = maybe_transpose(np.asarray(observation), self.observation_space)
         explores = hasattr(self.config, "exploration_final_eps") and not deterministic
         action, memory = super().predict(observation, state, episode_start, deterministic or explores, action_masks)
         if explores and self.run.rng.random() < self.exploration_rate:
@@ -658,35 +658,26 @@ class Original(Agent):
         return agent
 
 
-class Scaled:
-    """The methods of a replay buffer that stores original observations and rewards, and draws them normalized."""
+def scaled(buffer: Any, agent: Original) -> Any:
+    """Returns a replay buffer that now stores original observations and rewards, and draws them normalized."""
+    kind = type(buffer)
 
-    def __init__(self, buffer: Any, agent: Original) -> None:
-        self.buffer, self.kind, self.agent = buffer, type(buffer), agent
+    def begin(obs: Any, which: Any = None) -> None:
+        kind.begin(buffer, agent.run.env.original_obs(final=False), which)
 
-    @classmethod
-    def by(cls, buffer: Any, agent: Original) -> Any:
-        """Returns a buffer with these methods."""
-        scaled = cls(buffer, agent)
-        buffer.begin, buffer.add, buffer.draw = scaled.begin, scaled.add, scaled.draw
-        return buffer
-
-    def begin(self, obs: Any, which: Any = None) -> None:
-        """Begins episodes with the first observations of the environments."""
-        self.kind.begin(self.buffer, self.agent.run.env.original_obs(final=False), which)
-
-    def add(self, action: Any, reward: Any, terminated: Any, obs: Any, which: Any = None) -> None:
-        """Adds the last step of the environments."""
-        env: Any = self.agent.run.env
+    def add(action: Any, reward: Any, terminated: Any, obs: Any, which: Any = None) -> None:
+        env: Any = agent.run.env
         original = env.vec_normalize.get_original_reward()
-        self.kind.add(self.buffer, action, original, terminated, env.original_obs(final=True), which)
+        kind.add(buffer, action, original, terminated, env.original_obs(final=True), which)
 
-    def draw(self, *args: Any) -> Any:
-        """Returns a batch, normalized by the current statistics, and what was drawn."""
-        batch, drawn = self.kind.draw(self.buffer, *args)
-        scale: Any = self.agent.run.env.vec_normalize
+    def draw(*args: Any) -> Any:
+        batch, drawn = kind.draw(buffer, *args)
+        scale: Any = agent.run.env.vec_normalize
         obs, following = scale.normalize_obs(batch.obs), scale.normalize_obs(batch.next_obs)
         return batch._replace(obs=obs, next_obs=following, reward=scale.normalize_reward(batch.reward)), drawn
+
+    buffer.begin, buffer.add, buffer.draw = begin, add, draw
+    return buffer
 
 
 def load_agent(kind: type[Original], path: Path, env: Any, changes: Mapping[str, Any]) -> Any:
@@ -730,17 +721,6 @@ def has_channels_last(space: gym.Space) -> bool:
     """Returns whether observations are, or contain, images with the channels last."""
     parts: Any = space.spaces.values() if isinstance(space, gym.spaces.Dict) else [space]
     return any(is_image_space(part) and not is_image_space_channels_first(part) for part in parts)
-
-
-def _like(space: gym.spaces.Box, observation: Any) -> np.ndarray:
-    """Returns an image whose channels are at the other end than the space has them in its order."""
-    array = np.asarray(observation)
-    if len(space.shape) != 3 or array.shape[-3:] == space.shape:
-        return array
-    for source, target in ((-3, -1), (-1, -3)):
-        if (moved := np.moveaxis(array, source, target)).shape[-3:] == space.shape:
-            return moved
-    return array
 
 
 class A2C(Original, agents.A2C):

@@ -40,6 +40,12 @@ class StickyActionEnv(gym.Wrapper):
         return self.env.step(self._sticky_action)
 
 
+def after(env: gym.Env, action: int, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
+    """Returns observation and info of a step before an episode begins, or of another reset if the step has ended it."""
+    obs, _, terminated, truncated, info = env.step(action)
+    return env.reset(**kwargs) if terminated or truncated else (obs, info)
+
+
 class NoopResetEnv(gym.Wrapper):
     """Begins episodes with 1 to ``noop_max`` steps of the action 0, which must do nothing."""
 
@@ -49,13 +55,11 @@ class NoopResetEnv(gym.Wrapper):
         self.override_num_noops: int | None = None
 
     def reset(self, **kwargs: Any) -> Any:
-        obs, info = self.env.reset(**kwargs)
+        begun = self.env.reset(**kwargs)
         n = self.override_num_noops or int(self.unwrapped.np_random.integers(1, self.noop_max + 1))
         for _ in range(n):
-            obs, _, terminated, truncated, info = self.env.step(0)
-            if terminated or truncated:
-                obs, info = self.env.reset(**kwargs)
-        return obs, info
+            begun = after(self.env, 0, **kwargs)
+        return begun
 
 
 class FireResetEnv(gym.Wrapper):
@@ -63,11 +67,8 @@ class FireResetEnv(gym.Wrapper):
 
     def reset(self, **kwargs: Any) -> Any:
         self.env.reset(**kwargs)
-        for action in (1, 2):
-            obs, _, terminated, truncated, info = self.env.step(action)
-            if terminated or truncated:
-                obs, info = self.env.reset(**kwargs)
-        return obs, info
+        after(self.env, 1, **kwargs)
+        return after(self.env, 2, **kwargs)
 
 
 class EpisodicLifeEnv(gym.Wrapper):
@@ -86,14 +87,9 @@ class EpisodicLifeEnv(gym.Wrapper):
         return obs, reward, terminated, truncated, info
 
     def reset(self, **kwargs: Any) -> Any:
-        if self.was_real_done:
-            obs, info = self.env.reset(**kwargs)
-        else:  # the life after
-            obs, _, terminated, truncated, info = self.env.step(0)
-            if terminated or truncated:
-                obs, info = self.env.reset(**kwargs)
+        begun = self.env.reset(**kwargs) if self.was_real_done else after(self.env, 0, **kwargs)  # or the life after
         self.lives = self._lives()
-        return obs, info
+        return begun
 
     def _lives(self) -> int:
         game: Any = self.env.unwrapped

@@ -171,7 +171,10 @@ class ReplayBuffer(BaseBuffer):
         """
         timeouts = np.array([bool(info.get(TIME_LIMIT_TRUNCATED, False)) for info in infos])
         terminated, reward = np.asarray(done, bool) & ~timeouts, np.asarray(reward, np.float32)
-        ring, kind = self.core.ring, type(self.core)  # whose methods take what is given, also behind Scaled
+        ring, kind = (
+            self.core.ring,
+            type(self.core),
+        )  # whose methods take what is given, also behind those of VecNormalize
         kind.begin(self.core, obs)
         actions = np.asarray(action, ring.action.dtype).reshape(ring.n_envs, *ring.action.shape[1:])
         kind.add(self.core, actions, reward, terminated, next_obs)

@@ -52,14 +52,12 @@ def is_image_space(
 
 
 def maybe_transpose(observation: np.ndarray, observation_space: spaces.Space) -> np.ndarray:
-    """Returns an image, or a batch of them, with the channels first if the space has them first and the image last."""
-    if not is_image_space(observation_space):
-        return observation
+    """Returns an image, or a batch of them, with the channels where the space has them, if they are at the other end."""
     shape = observation_space.shape
-    if observation.shape in (shape, (observation.shape[0], *(shape or ()))):
+    if observation.shape[-3:] == shape or observation.ndim < 3 or not is_image_space(observation_space):
         return observation
-    transposed = np.moveaxis(observation, -1, -3)
-    return transposed if transposed.shape[-3:] == shape else observation
+    moved = (np.moveaxis(observation, source, target) for source, target in ((-1, -3), (-3, -1)))
+    return next((one for one in moved if one.shape[-3:] == shape), observation)
 
 
 def preprocess_obs(obs: Any, observation_space: spaces.Space, normalize_images: bool = True) -> Any:

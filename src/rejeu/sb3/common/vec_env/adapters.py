@@ -199,18 +199,15 @@ class VecEnvAdapter(VectorEnv):
                 "hindsight replay computes rewards from goals, which VecNormalize normalizes; remove it and use the "
                 "agent's option normalize=True"
             )
-        if not self.venv.has_attr("compute_reward"):
-            return None
-        return GoalFunctions(goals_module.over_batches(self._remote("compute_reward"), np.float32), self._terminated())
+        reward = self._over_batches("compute_reward", np.float32)
+        return None if reward is None else GoalFunctions(reward, self._over_batches("compute_terminated", np.bool_))
 
-    def _terminated(self) -> Any:
-        if not self.venv.has_attr("compute_terminated"):
+    def _over_batches(self, name: str, dtype: Any) -> Any:
+        """Returns a method of the first environment as a function of batches, None if there is none."""
+        if not self.venv.has_attr(name):
             return None
-        return goals_module.over_batches(self._remote("compute_terminated"), np.bool_)
-
-    def _remote(self, name: str) -> Any:
-        """Returns a method of the first environment as a function."""
-        return lambda achieved, desired, info: self.venv.env_method(name, achieved, desired, info, indices=[0])[0]
+        one = lambda achieved, desired, info: self.venv.env_method(name, achieved, desired, info, indices=[0])[0]  # noqa: E731
+        return goals_module.over_batches(one, dtype)
 
     def original_obs(self, final: bool) -> Any:
         """Returns the observations of the last step as they were before ``VecNormalize``, the outermost wrapper.
