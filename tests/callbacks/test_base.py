@@ -1,10 +1,8 @@
 """Callbacks are called in order, told about start and end, and restored with the run."""
 
-import numpy as np
 import pytest
 
 from rejeu.callbacks import Checkpoint, TrainingCallback
-from rejeu.core.errors import CheckpointError
 from tests.helpers import small_sac
 
 pytestmark = pytest.mark.usefixtures("learners_are_shared")
@@ -107,19 +105,3 @@ def test_the_checkpoint_at_the_start_of_a_resumed_run_contains_the_restored_stat
     agent.learn(callback=[Counting(), Checkpoint(tmp_path / "two", every=1000), stop])
     again = type(agent).resume(tmp_path / "two")
     assert again.saved_callbacks == [("Counting", {"n": 21})]
-
-
-def test_callbacks_of_older_checkpoints_are_restored_under_their_present_names(tmp_path):
-    agent = type(stopped_run(tmp_path)).resume(tmp_path)
-    first, second = Counting(), Counting()
-    agent.saved_callbacks = [("CallbackList", {"self": {}, "inside": [["Counting", {"n": 7}], ["Counting", {"n": 8}]]})]
-    agent.learn(callback=[first, second, lambda agent, progress: False])
-    assert (first.n, second.n) == (8, 9)
-
-
-@pytest.mark.parametrize("state", [{"n": 7}, None, {"inside": 3}, {"inside": [["Counting"]]}, np.zeros(2)])
-def test_a_damaged_list_of_callbacks_is_refused(state, tmp_path):
-    agent = type(stopped_run(tmp_path)).resume(tmp_path)
-    agent.saved_callbacks = [("CallbackList", state)]
-    with pytest.raises(CheckpointError, match="the saved state of CallbackList is damaged"):
-        agent.learn(callback=Counting())

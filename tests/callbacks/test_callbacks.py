@@ -19,7 +19,7 @@ from rejeu.callbacks import (
     stop_on_success,
 )
 from rejeu.callbacks.base import crossed
-from rejeu.callbacks.evaluate import better
+from rejeu.callbacks.evaluate import merit
 from rejeu.core.failed_writes import FailedWrites
 from rejeu.logs.evaluation import Evaluation
 from rejeu.logs.history import History
@@ -62,10 +62,10 @@ def finished(returns, successes=None):
 
 
 def test_return_decides_where_success_is_equal_or_unknown():
-    assert better(evaluation([-50, -50], [1, 1]), evaluation([-1, -1], [1, 0]))
-    assert better(evaluation([2, 2], [1, 0]), evaluation([1, 1], [0, 1]))
-    assert better(evaluation([2, 2]), evaluation([1, 1]))
-    assert not better(evaluation([1, 1]), evaluation([1, 1]))
+    assert merit(evaluation([-50, -50], [1, 1])) > merit(evaluation([-1, -1], [1, 0]))
+    assert merit(evaluation([2, 2], [1, 0])) > merit(evaluation([1, 1], [0, 1]))
+    assert merit(evaluation([2, 2])) > merit(evaluation([1, 1]))
+    assert merit(evaluation([1, 1])) == merit(evaluation([1, 1]))
 
 
 def test_evaluate_saves_only_when_the_best_so_far_is_beaten(tmp_path):

@@ -114,7 +114,7 @@ def listening(agent: Any, callbacks: Sequence[Callback]) -> Iterator[None]:
     """Tells callbacks that training starts and, on exit, that it has ended; restores their state in a resumed run."""
     started: list[TrainingCallback] = []
     error: BaseException | None = None
-    saved = None if agent.saved_callbacks is None else unpacked(agent.saved_callbacks, callbacks)
+    saved = None if agent.saved_callbacks is None else [*agent.saved_callbacks]
     try:
         for callback in callbacks:
             if isinstance(callback, TrainingCallback):
@@ -145,29 +145,10 @@ def restore(agent: Any, callbacks: Sequence[Callback]) -> None:
     Raises:
         CheckpointError: if a saved state is damaged.
     """
-    saved = unpacked(agent.saved_callbacks or (), callbacks)
+    saved = [*(agent.saved_callbacks or ())]
     for callback in callbacks:
         if isinstance(callback, Stateful):
             restore_one(callback, saved)
-
-
-def unpacked(saved: Sequence[tuple[str, Any]], callbacks: Sequence[Callback]) -> list[tuple[str, Any]]:
-    """Returns the saved states of callbacks under the present names of their classes.
-
-    Older checkpoints hold several callbacks with hooks as one ``CallbackList``.
-
-    Raises:
-        CheckpointError: if such a list is damaged.
-    """
-    given = {type(callback).__name__ for callback in callbacks}
-    states: list[tuple[str, Any]] = []
-    for name, state in saved:
-        try:
-            inside = state["inside"] if name == "CallbackList" and name not in given else [(name, state)]
-            states += [(inner, part) for inner, part in inside]
-        except WRONG as error:
-            raise CheckpointError(f"the saved state of {name} is damaged: {brief(error)}") from error
-    return states
 
 
 def restore_one(callback: Stateful, saved: list[tuple[str, Any]]) -> None:

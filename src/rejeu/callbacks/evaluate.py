@@ -105,7 +105,7 @@ class Evaluate(TrainingCallback):
         result = Evaluated(step, agent.evaluate(self.episodes, env=self.env, seed=seed))
         self.results.append(result)
         self._is_due = False
-        is_best = self.best is None or better(result.evaluation, self.best.evaluation)
+        is_best = self.best is None or merit(result.evaluation) > merit(self.best.evaluation)
         if is_best:
             self.best = result
             agent.remember_best(merit(result.evaluation), "evaluation")
@@ -152,14 +152,6 @@ def logged(evaluation: Evaluation) -> dict[str, float]:
     if not math.isnan(evaluation.success_rate):
         metrics["eval/success_rate"] = evaluation.success_rate
     return metrics
-
-
-def better(evaluation: Evaluation, other: Evaluation) -> bool:
-    """Returns whether an evaluation is better than another: by success rate, then by mean return.
-
-    Without a success rate the return decides.
-    """
-    return merit(evaluation) > merit(other)
 
 
 def merit(evaluation: Evaluation) -> tuple[float, float]:
