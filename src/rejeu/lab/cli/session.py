@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -72,14 +72,12 @@ class Learning(NamedTuple):
     evaluate: Evaluate
     callbacks: list[Any]
     """All of them, with ``evaluate``."""
-    outputs: list[RetryingSink]
-    """Of the rows of statistics, and of the video."""
-    sinks: list[Sink]
-    """The same, and the table of episodes."""
+    sinks: list[RetryingSink]
+    """The outputs of the rows of statistics, of episodes and of the video."""
 
     def close(self) -> None:
         """Closes the outputs."""
-        for output in self.outputs:
+        for output in self.sinks:
             output.close()
 
 
@@ -147,7 +145,7 @@ class Session(NamedTuple):
                     evaluate_now(evaluate, agent)
                     self.plot_curve(evaluate)
                     if self.has_video:
-                        record_video(agent, folder, environment, self.config.seed, learning.outputs)
+                        self.record_video(learning)
             else:
                 if stop.signal is None:
                     ask(folder.paused)
@@ -169,12 +167,13 @@ class Session(NamedTuple):
         return (0 if agent.failed_writes.complete else 2), result
 
     def outputs(self) -> list[RetryingSink]:
-        """Returns the outputs of the rows of statistics."""
+        """Returns the outputs of the rows of statistics, and the table of episodes."""
         agent, up_to = self.agent, None if self.is_new else self.agent.num_timesteps
-        sinks = [
+        sinks: list[Sink] = [
             open_log(kind, self.folder.path, run_name(agent), tracker_id(agent), self.folder.metrics.stem, up_to)
             for kind in dict.fromkeys(("csv", *self.config.log))
         ]
+        sinks.append(EpisodeTable(lambda: agent.history, self.folder.episodes))
         return [guarded(sink, agent.failed_writes, closes=True) for sink in sinks]
 
     @contextmanager
@@ -184,8 +183,7 @@ class Session(NamedTuple):
         outputs = self.outputs()
         agent.report_folder = folder.path
         evaluate, callbacks = self.callbacks(stop)
-        episodes = EpisodeTable(lambda: agent.history, folder.episodes)
-        learning = Learning(evaluate, callbacks, outputs, [*outputs, RetryingSink(episodes, agent.failed_writes)])
+        learning = Learning(evaluate, callbacks, outputs)
         try:
             with noted_in(folder.warnings), saved_at_exit(agent, folder, evaluate):
                 yield learning
@@ -226,16 +224,33 @@ class Session(NamedTuple):
     def plot_curve(self, evaluate: Evaluate) -> None:
         """Plots the learning curve or prints why not, unless the run is to have no report."""
         title = f"{self.environment.env_id}, {self.agent.name}"
-        try:
-            if self.has_report:
+        if self.has_report:
+            with optional("curve"):
                 plots.learning_curve(self.agent.history, self.folder.curve, evaluations=evaluate.results, title=title)
-        except (ImportError, OSError) as error:
-            echo(f"no curve: {' '.join(str(error).split())}")
+
+    def record_video(self, learning: Learning) -> None:
+        """Records a video of the best model and adds it to the outputs, or prints why not."""
+        agent, folder, make = self.agent, self.folder, self.environment.rendering
+        with optional("video", ValueError, gymnasium.error.Error):
+            video.record_video(load(folder.best), folder.video, make, VIDEO_EPISODES, VIDEO_STEPS, self.config.seed)
+            for output in learning.sinks:
+                output.write_video(agent.num_timesteps, folder.video)
 
     def write_report(self) -> None:
-        """Writes the page about the run, unless the run is to have none."""
+        """Writes the page about the run or prints why not, unless the run is to have none."""
         if self.has_report:
-            write_report(self.folder)
+            with optional("report"):
+                report.write_report(self.folder.path, self.folder.report)
+
+
+@contextmanager
+def optional(what: str, *kinds: type[Exception]) -> Iterator[None]:
+    """Context whose failure to write something is one line; ``kinds`` are further errors that are expected."""
+    expected: tuple[type[Exception], ...] = (ImportError, OSError, *kinds)
+    try:
+        yield
+    except expected as error:
+        echo(f"no {what}: {' '.join(str(error).split())}")
 
 
 def make_evaluation_env(config: DecidedRun, environment: Environment) -> VectorEnv:
@@ -282,24 +297,3 @@ def saved_at_exit(agent: Agent, folder: RunFolder, evaluate: Evaluate) -> Iterat
 def save_model(agent: Agent, path: Path) -> None:
     """Saves a model, or warns and tries again at the end of the command."""
     agent.failed_writes.attempt(f"model {path}", agent.snapshot(path))
-
-
-def record_video(
-    agent: Agent, folder: RunFolder, environment: Environment, seed: int, outputs: Iterable[RetryingSink]
-) -> None:
-    """Records a video of the best model and adds it to the outputs, or prints why not."""
-    try:
-        video.record_video(load(folder.best), folder.video, environment.rendering, VIDEO_EPISODES, VIDEO_STEPS, seed)
-    except (ImportError, ValueError, OSError, gymnasium.error.Error) as error:
-        echo(f"no video: {' '.join(str(error).split())}")
-        return
-    for output in outputs:
-        output.write_video(agent.num_timesteps, folder.video)
-
-
-def write_report(folder: RunFolder) -> None:
-    """Writes the page about the run, or prints why not."""
-    try:
-        report.write_report(folder.path, folder.report)
-    except (ImportError, OSError) as error:
-        echo(f"no report: {' '.join(str(error).split())}")
