@@ -339,13 +339,14 @@ def test_resume(spy, sessions, monkeypatch, tmp_path):
 
 def test_clone(spy, tmp_path):
     session = mock.MagicMock()
-    session._replace.return_value = session
+    session.in_new_folder.return_value = session
+    session.config.seed = 5
     session.finish.return_value = (0, {})
     session.training.return_value.__enter__.return_value.evaluate.best = None
     shown = mock.MagicMock()
     read, begun = spy(demonstrations, "read", shown), spy(clone, "begin", session)
     cloned, offline, taught = (spy(demonstrations, name) for name in ("clone", "learn_offline", "dagger"))
-    spy(demonstrations, "check"), spy(demonstrations, "keeping_policy"), spy(clone.runs, "write")
+    spy(demonstrations, "check"), spy(demonstrations, "keeping_policy")
     found = spy(clone, "find_model", "model")
     spy(clone, "load", agent := mock.Mock(**{"learner.algorithm.recall": None}))
     spy(clone.environment, "recorded_id", TYPED)
@@ -355,9 +356,8 @@ def test_clone(spy, tmp_path):
         assert main([*argv, "--critic-updates", "3", "--out", str(tmp_path / "a")]) == 0
         assert includes(read, path=Path("shown"))
         task = begun[-1]["arguments"]
-        named = ("env", "algorithm", "hyperparameters", "evaluate_episodes", "device", "no_report", "no_video")
-        assert [getattr(task, name) for name in named] == [TYPED, "SAC", {"gamma": 0.5}, 6, "cpu", True, True]
-        assert includes(begun, seed=5)
+        named = ("env", "algorithm", "hyperparameters", "evaluate_episodes", "device", "no_report", "no_video", "seed")
+        assert [getattr(task, name) for name in named] == [TYPED, "SAC", {"gamma": 0.5}, 6, "cpu", True, True, 5]
         assert includes(cloned, updates=7, learning_rate=0.1, seed=5)
         assert includes(offline, updates=3, keep_policy=True)
         assert not taught

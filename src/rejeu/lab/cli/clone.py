@@ -7,14 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-import numpy as np
 
 from rejeu import demonstrations
 from rejeu.agents import Agent, load
 from rejeu.callbacks import Checkpoint
 from rejeu.callbacks.base import stateful
-from rejeu.checkpoints.run_folder import check_free, create, find_model
-from rejeu.core import devices
+from rejeu.checkpoints.run_folder import find_model
 from rejeu.core.interrupt import Interrupt
 from rejeu.demonstrations import Demonstrations
 from rejeu.envs.registry import register
@@ -24,7 +22,6 @@ from rejeu.lab.cli.environment import Environment
 from rejeu.lab.cli.output import Stopwatch, echo
 from rejeu.lab.cli.session import Session
 from rejeu.lab.cli.train import begin
-from rejeu.lab.runs import config as runs
 from rejeu.lab.runs.config import RunConfig
 from rejeu.logs.formatting import counted
 
@@ -32,32 +29,30 @@ from rejeu.logs.formatting import counted
 def run_clone(arguments: Clone) -> tuple[int, dict[str, Any]]:
     """Clones and evaluates; the exit status is that of ``rejeu train``."""
     stopwatch = Stopwatch()
-    devices.start_with("--device", arguments.device)
-    check_free(arguments.out)
     shown = demonstrations.read(arguments.dataset)
     made = environment_of(shown, arguments)
-    seed = int(np.random.default_rng().integers(10_000)) if arguments.seed is None else arguments.seed
     task = Train(
         env=made.run.typed,
-        env_kwargs=made.kwargs,
+        env_kwargs=made.run.env_kwargs,
         wrappers=made.run.wrappers,
         imports=made.run.imports,
         algorithm=arguments.algo,
         hyperparameters=arguments.hyperparameters,
         evaluate_episodes=arguments.evaluate_episodes,
         device=arguments.device,
+        seed=arguments.seed,
+        out=arguments.out,
         no_report=arguments.no_report,
         no_video=arguments.no_video,
     )
     with ExitStack() as stack:
-        session, stop = begin(task, seed, stack), stack.enter_context(Interrupt())
+        session, stop = begin(task, stack), stack.enter_context(Interrupt())
         expert = None if arguments.expert is None else expert_of(arguments.expert, arguments, made)
         demonstrations.check(session.agent, shown)
         if arguments.critic_updates:
             demonstrations.keeping_policy(session.agent)  # which raises before anything is trained
-        folder = create(arguments.out, session.config.env, session.config.algorithm, seed)
-        session = session._replace(folder=folder)
-        runs.write(folder.config, session.config)
+        session = session.in_new_folder(arguments.out)
+        folder, seed = session.folder, session.config.seed
         echo(f"environment   {made}")
         echo(f"algorithm     {session.config.algorithm}, seed {seed}")
         echo(f"shown         {shown}")

@@ -24,7 +24,7 @@ from rejeu.core import checkpoint
 from rejeu.core.errors import CheckpointError
 from rejeu.envs.functional import REGISTRY
 from rejeu.envs.make import VectorEnv, WorkerOptions, make_vector
-from rejeu.envs.registry import are_plain, is_plain_id, maker, register
+from rejeu.envs.registry import are_plain, is_plain_id, maker
 from rejeu.envs.rendering import make_rendering_env
 from rejeu.lab.cli.commands import RunOptions
 from rejeu.lab.runs.config import EnvironmentOptions, RunConfig, merged, read_folder
@@ -164,14 +164,9 @@ class Environment:
     wrappers: tuple[Callable[[Any], Any], ...] = ()
     """The wrappers, imported, innermost first."""
 
-    @property
-    def kwargs(self) -> dict[str, Any]:
-        """Keyword arguments of the environment."""
-        return self.run.env_kwargs
-
     def make(self, **more: Any) -> gym.Env:
         """Returns a new one; ``more`` are further keyword arguments, such as ``render_mode``."""
-        return Wrapped(maker(self.env_id, **{**self.kwargs, **more}), self.wrappers)()
+        return Wrapped(maker(self.env_id, **{**self.run.env_kwargs, **more}), self.wrappers)()
 
     def vector(
         self, n_envs: int, backend: str, seed: int | None, workers: WorkerOptions = DEFAULT_WORKERS
@@ -183,11 +178,11 @@ class Environment:
         """
         if not self.wrappers:
             return make_vector(
-                self.env_id, n_envs, backend, seed, **workers._asdict(), **self.kwargs  # type: ignore[arg-type]
+                self.env_id, n_envs, backend, seed, **workers._asdict(), **self.run.env_kwargs  # type: ignore[arg-type]
             )  # fmt: skip
         if backend == "envpool":
             raise ValueError("the envpool backend takes no wrappers; use --backend gymnasium")
-        make = Wrapped(maker(self.env_id, **self.kwargs), self.wrappers)
+        make = Wrapped(maker(self.env_id, **self.run.env_kwargs), self.wrappers)
         return make_vector(make, n_envs, backend, seed, **workers._asdict())  # type: ignore[arg-type]
 
     def rendering(self) -> gym.Env:
@@ -201,14 +196,10 @@ class Environment:
     @property
     def is_plain(self) -> bool:
         """Whether it is an id and nothing else, so that EnvPool may step it."""
-        return not self.kwargs and not self.wrappers
-
-    def is_registered(self) -> bool:
-        """Returns whether Gymnasium has it, and not EnvPool alone."""
-        return register(self.env_id)
+        return not self.run.env_kwargs and not self.wrappers
 
     def __str__(self) -> str:
-        parts = [f"{key}={value!r}" for key, value in self.kwargs.items()]
+        parts = [f"{key}={value!r}" for key, value in self.run.env_kwargs.items()]
         text = self.env_id + (f" ({', '.join(parts)})" if parts else "")
         return text + "".join(f", {name}" for name in self.run.wrappers)
 

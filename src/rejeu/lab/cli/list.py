@@ -53,17 +53,7 @@ def described(is_extended: bool) -> dict[str, str]:
 
 def as_dict(preset: Preset) -> dict[str, Any]:
     """Returns a preset with its measured result, which is None if there is none."""
-    names = (
-        "env_id",
-        "algorithm",
-        "name",
-        "n_envs",
-        "total_steps",
-        "evaluate_every",
-        "evaluate_episodes",
-        "hyperparameters",
-    )
-    known = {name: getattr(preset, name) for name in (*names, "source")}
+    known = {name: value for name, value in vars(preset).items() if name not in ("backend", "success_threshold")}
     return {**known, "result": presets.find_result(preset.env_id, preset.algorithm, preset.name)}
 
 

@@ -72,7 +72,7 @@ def run_export(arguments: Export) -> tuple[int, dict[str, Any]]:
         echo(f"the observations are sampled from the observation space, because there is no environment: {error}")
     agent, make_env = load(model), None if made is None else made.make
     if arguments.env is not None and made is not None and not made.wrappers:
-        agent.trained_on = made.env_id, made.kwargs
+        agent.trained_on = made.env_id, made.run.env_kwargs
     found = export(
         agent, out, to, arguments.noise, arguments.batch, make_env, str(arguments.run), arguments.frame_stack
     )

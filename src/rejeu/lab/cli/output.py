@@ -11,14 +11,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from rejeu.agents import Agent
 from rejeu.callbacks import Evaluate, Evaluated
 from rejeu.checkpoints.run_folder import RunFolder
 from rejeu.core import atomic, xla
 from rejeu.core.errors import RunInUseError
 from rejeu.core.interrupt import NAMES
+from rejeu.envs.registry import register
 from rejeu.lab.cli.environment import Environment
 from rejeu.lab.runs.config import DecidedRun
 from rejeu.lab.runs.requests import keep_model
@@ -121,12 +120,13 @@ def summary(
         what = "paused" if facts["signal"] is None else f"stopped by {NAMES[facts['signal']]}"
         saved = "; everything is saved" if agent.failed_writes.complete else ""
         lines.append(f"{what}{saved}{how}")
-    if agent.ep_info_buffer:
-        last = counted(len(agent.ep_info_buffer), "episode")
-        lines.append(f"training      last {last}: {training_statistics(agent)}")
+    if (last := facts["training"])["episodes"]:
+        success = "" if math.isnan(last["success_rate"]) else f"success {last['success_rate']:.1%}, "
+        text = f"return {last['mean_return']:.2f} ± {last['std_return']:.2f}, length {last['mean_length']:.1f}"
+        lines.append(f"training      last {counted(last['episodes'], 'episode')}: {success}{text}")
     if evaluate.best is not None:
         lines.append(f"best model    step {evaluate.best.step:,}: {evaluate.best.evaluation}")
-    backend = " --backend gymnasium" if environment.is_registered() else ""
+    backend = " --backend gymnasium" if register(environment.env_id) else ""
     steps = f"; {agent.num_timesteps:,} steps at {agent.steps_per_second:,.0f} steps/s" if agent.num_timesteps else ""
     return "\n".join(
         [
@@ -136,13 +136,6 @@ def summary(
             f"try it        rejeu evaluate {quoted(folder.path)}{options}{backend}",
         ]
     )
-
-
-def training_statistics(agent: Agent) -> str:
-    """Returns return, length and, where it is known, success of the last training episodes."""
-    returns, lengths = ([episode[key] for episode in agent.ep_info_buffer] for key in ("r", "l"))
-    text = f"return {np.mean(returns):.2f} ± {np.std(returns):.2f}, length {np.mean(lengths):.1f}"
-    return f"success {np.mean(agent.ep_success_buffer):.1%}, {text}" if agent.ep_success_buffer else text
 
 
 @contextmanager

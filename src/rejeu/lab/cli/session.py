@@ -17,7 +17,7 @@ from rejeu.agents import Agent, load
 from rejeu.agents.training import run_name, tracker_id
 from rejeu.callbacks import Checkpoint, Evaluate, RecordVideo
 from rejeu.callbacks.base import restore
-from rejeu.checkpoints.run_folder import RunFolder
+from rejeu.checkpoints.run_folder import RunFolder, create
 from rejeu.core import errors, xla
 from rejeu.core.interrupt import Interrupt, leaving
 from rejeu.envs.make import VectorEnv
@@ -25,6 +25,7 @@ from rejeu.lab.cli.commands import Train
 from rejeu.lab.cli.environment import Environment
 from rejeu.lab.cli.output import Stopwatch, as_dict, echo, noted_in, reporter, summary
 from rejeu.lab.reporting import report
+from rejeu.lab.runs import config as runs
 from rejeu.lab.runs.config import DecidedRun
 from rejeu.lab.runs.requests import Requests, ask
 from rejeu.logs import plots, video
@@ -102,6 +103,15 @@ class Session(NamedTuple):
     """Further callbacks."""
     label: str = ""
     """What the lines about its evaluations begin with, where several runs are trained together."""
+
+    def in_new_folder(self, out: Path | None) -> Session:
+        """Returns the session in a folder that is made: ``out``, or one under ``runs``."""
+        return self.in_folder(create(out, self.config.env, self.config.algorithm, self.config.seed))
+
+    def in_folder(self, folder: RunFolder, label: str = "") -> Session:
+        """Returns the session in an empty folder, to which its configuration is written."""
+        runs.write(folder.config, self.config)
+        return self._replace(folder=folder, label=label)
 
     @property
     def is_over(self) -> bool:

@@ -28,11 +28,10 @@ from rejeu.lab.experiments.process import default_workers, hold, threads_of
 from rejeu.lab.experiments.sweep import SweepResult, imports_of, make_launcher, prepare, states_text, train
 from rejeu.lab.experiments.work import Job, Work, again
 from rejeu.lab.reporting.comparison import By, Comparison, compare
-from rejeu.lab.runs import config as configs
 from rejeu.lab.runs.config import RunConfig
 from rejeu.logs.formatting import counted, quoted
 
-Begin = Callable[[Train, int, ExitStack], Session]
+Begin = Callable[[Train, ExitStack], Session]
 """Makes the session of a seed; see :func:`rejeu.lab.cli.train.begin`."""
 
 
@@ -87,11 +86,7 @@ def summarize(folder: Path, by: By | None = None) -> Comparison | None:
     except (ValueError, FileNotFoundError) as error:
         echo(f"no comparison: {error}")
         return None
-    for group in comparison.groups:
-        echo(f"{group.label} on {group.env_id}: {group.interval}")
-    echo(comparison.definition)
-    for note in comparison.notes:
-        echo(f"note: {note}")
+    echo(comparison)
     try:
         echo(f"comparison    {comparison.save(folder / 'compare.html')[0]}")
     except (MissingExtra, OSError) as error:
@@ -156,10 +151,9 @@ def train_together(arguments: Train, begin: Begin) -> tuple[int, dict[str, Any]]
     Settings that cannot be trained on the device are trained in processes.
     """
     stopwatch, jobs = Stopwatch(), make_jobs(arguments)
-    devices.start_with("--device", arguments.device)
     path = choose_folder(arguments)
     with ExitStack() as stack:
-        first = begin(arguments, jobs[0].seed, stack)
+        first = begin(dataclasses.replace(arguments, seed=jobs[0].seed), stack)
         if reason := reason_against(first.agent, ()):
             echo(f"the seeds are trained in processes of their own, not in one program: {reason}")
             return train_all(arguments)
@@ -167,7 +161,10 @@ def train_together(arguments: Train, begin: Begin) -> tuple[int, dict[str, Any]]
         folder = open_folder(path, Plan(jobs=jobs, threads=threads_of(1)), None, arguments)
         sessions = [first, *(with_seed(first, job.seed, stack) for job in jobs[1:])]
         works = folder.works()
-        sessions = [with_folder(session, work) for session, work in zip(sessions, works, strict=True)]
+        sessions = [
+            session.in_folder(work.files, f"seed {work.job.seed}: ")
+            for session, work in zip(sessions, works, strict=True)
+        ]
         echo(
             header(
                 first.config, first.environment, f"{first.backend}, {len(jobs)} seeds in one program", RunFolder(path)
@@ -191,14 +188,6 @@ def with_seed(first: Session, seed: int, stack: ExitStack) -> Session:
     env = stack.enter_context(closing(first.environment.vector(config.n_envs, config.backend, seed)))
     evaluation_env = stack.enter_context(closing(make_evaluation_env(config, first.environment)))
     return first._replace(agent=sibling(first.agent, env, seed), config=config, evaluation_env=evaluation_env)
-
-
-def with_folder(session: Session, work: Work) -> Session:
-    """Returns a session with its new run folder."""
-    work.path.mkdir(parents=True, exist_ok=True)
-    session = session._replace(folder=RunFolder(work.path), label=f"seed {work.job.seed}: ")
-    configs.write(session.folder.config, session.config)
-    return session
 
 
 def train_sessions(sessions: list[Session], stop: Interrupt, stopwatch: Stopwatch) -> list[int]:

@@ -18,18 +18,17 @@ from rejeu.agents import AGENTS, OffPolicyAgent, choose_algorithm, find_agent, f
 from rejeu.agents.presets import Preset
 from rejeu.algorithms import config as configs
 from rejeu.algorithms.catalog import OFFLINE
-from rejeu.checkpoints.run_folder import RunFolder, check_free, create
+from rejeu.checkpoints.run_folder import RunFolder, check_free
 from rejeu.core import devices, validation
 from rejeu.core.interrupt import Interrupt
 from rejeu.core.spaces import leaves
 from rejeu.envs.make import VectorEnv, WorkerOptions, make_vector
-from rejeu.envs.registry import ENVPOOL_SIZE, is_envpool_installed, provider
+from rejeu.envs.registry import ENVPOOL_SIZE, is_envpool_installed, provider, register
 from rejeu.lab.cli import check, environment, sweep
 from rejeu.lab.cli.commands import Train
 from rejeu.lab.cli.environment import Environment
 from rejeu.lab.cli.output import Stopwatch, echo, header
 from rejeu.lab.cli.session import Session, TrainingLimits, installed_logs, make_evaluation_env
-from rejeu.lab.runs import config as runs
 from rejeu.lab.runs.config import DecidedRun, merged
 
 MANY = 64
@@ -38,25 +37,21 @@ MANY = 64
 
 def run_train(arguments: Train) -> tuple[int, dict[str, Any]]:
     """Trains; the exit status is 0, 2 if something could not be written, 130 after Ctrl-C, 143 after SIGTERM."""
-    arguments = with_dataset(arguments)
+    if arguments.offline is not None:
+        arguments = with_dataset(arguments)
     if arguments.seeds is not None:
         return sweep.train_together(arguments, begin) if sweep.fit_together(arguments) else sweep.train_all(arguments)
     stopwatch = Stopwatch()
-    devices.start_with("--device", arguments.device)
-    check_free(arguments.out)
-    seed = int(np.random.default_rng().integers(10_000)) if arguments.seed is None else arguments.seed
     with ExitStack() as stack:
-        session, stop = begin(arguments, seed, stack), stack.enter_context(Interrupt())
+        session, stop = begin(arguments, stack), stack.enter_context(Interrupt())
         if arguments.assist:
             from rejeu.teaching.play import assist
 
             assist.check(session.agent)
-        folder = create(arguments.out, session.config.env, session.config.algorithm, seed)
-        session = session._replace(folder=folder)
+        session = session.in_new_folder(arguments.out)
         if arguments.assist:
-            session = session._replace(more=(assist.Assist(folder.path / "assisted", fps=arguments.fps),))
-        runs.write(folder.config, session.config)
-        echo(header(session.config, session.environment, session.backend, folder))
+            session = session._replace(more=(assist.Assist(session.folder.path / "assisted", fps=arguments.fps),))
+        echo(header(session.config, session.environment, session.backend, session.folder))
         return session.run(stop, stopwatch)
 
 
@@ -66,8 +61,6 @@ def with_dataset(arguments: Train) -> Train:
     Raises:
         ValueError: if the algorithm does not learn from a replay buffer.
     """
-    if arguments.offline is None:
-        return arguments
     name = arguments.algorithm or (OFFLINE if arguments.preset is None else None)
     if name is not None and not issubclass(find_agent(name), OffPolicyAgent):
         raise ValueError(f"--offline needs an algorithm with a replay buffer, such as {OFFLINE}; {name} has none")
@@ -75,8 +68,11 @@ def with_dataset(arguments: Train) -> Train:
     return replace(arguments, algorithm=name, hyperparameters={**arguments.hyperparameters, **given}, offline=None)
 
 
-def begin(arguments: Train, seed: int, stack: ExitStack) -> Session:
+def begin(arguments: Train, stack: ExitStack) -> Session:
     """Returns the session of a new run, for which there is no folder yet; ``stack`` closes its environments."""
+    devices.start_with("--device", arguments.device)
+    check_free(arguments.out)
+    seed = int(np.random.default_rng().integers(10_000)) if arguments.seed is None else arguments.seed
     logs = installed_logs(arguments)
     algorithm = None if arguments.algorithm is None else find_agent(arguments.algorithm).algorithm.Config.name
     made = environment.from_arguments(arguments.env, arguments)
@@ -108,7 +104,7 @@ def make_env(arguments: Train, made: Environment, preset: Preset | None, seed: i
         return make_vector(made.rendering, 1, "gymnasium", seed)
     n_envs = arguments.n_envs or (preset.n_envs if preset else 1)
     backend = preset.backend if preset and made.is_plain else "auto"
-    if backend == "envpool" and not is_envpool_installed() and (made.is_registered() or provider(made.env_id)):
+    if backend == "envpool" and not is_envpool_installed() and (register(made.env_id) or provider(made.env_id)):
         backend = "gymnasium"
     backend = arguments.backend or backend
     workers = WorkerOptions(restart_workers=arguments.restart_workers, wait_for=arguments.wait_for)
@@ -155,7 +151,7 @@ def make_config(
     return DecidedRun(
         env=made.env_id,
         env_argument=made.run.env,
-        env_kwargs=dict(made.kwargs),
+        env_kwargs=dict(made.run.env_kwargs),
         wrappers=made.run.wrappers,
         imports=made.run.imports,
         algorithm=algorithm,

@@ -38,7 +38,7 @@ def run_tune(arguments: Tune) -> tuple[int, dict[str, Any]]:
         made.env_id,
         algorithm,
         env_argument=made.run.env,
-        env_kwargs=made.kwargs,
+        env_kwargs=made.run.env_kwargs,
         wrappers=made.run.wrappers,
         preset=preset,
         fixed=apply(arguments.assignments, {}),
