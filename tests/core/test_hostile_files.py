@@ -189,8 +189,8 @@ def test_a_file_larger_than_the_memory_is_refused_before_it_is_read(tmp_path, mo
 def test_no_array_is_read_that_the_model_does_not_have(kind, loaders, tmp_path, monkeypatch):
     """Six GiB in a hole of a few KiB are refused at once, by names and shapes."""
     path, load = tmp_path / "sparse.safetensors", loaders[0][kind]
-    names, read = [], checkpoint.TensorFile.read
-    monkeypatch.setattr(checkpoint.TensorFile, "read", lambda file, name: names.append(name) or read(file, name))
+    names, read = [], checkpoint.Contents.read
+    monkeypatch.setattr(checkpoint.Contents, "read", lambda file, prefix="": names.append(prefix) or read(file, prefix))
     monkeypatch.setattr(checkpoint, "physical_memory", lambda: 2**40)
     for one in hostile_files.sparse(CONTENTS[kind]):
         path.write_bytes(one.content)

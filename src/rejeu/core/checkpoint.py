@@ -19,6 +19,7 @@ import math
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -55,44 +56,27 @@ class ArraySpec(NamedTuple):
         return self.size * self.dtype.itemsize
 
 
-class TensorFile:
-    """An open file: metadata and specs are read at once, arrays when they are asked for. A context manager."""
+def specs_of(file: Any) -> dict[str, ArraySpec]:
+    """Returns shape and dtype of each array of an open safetensors file by name, in the order of the offsets.
 
-    def __init__(self, path: Path) -> None:
-        """Opens the file.
+    Raises:
+        Malformed: for dtypes that rejeu does not write.
+    """
+    specs = {}
+    for name in file.offset_keys():
+        array = file.get_slice(name)
+        if (dtype := array.get_dtype()) not in DTYPES:
+            raise Malformed(f"{shown(name)} has the dtype {shown(dtype)}, which rejeu does not write")
+        specs[name] = ArraySpec(tuple(array.get_shape()), np.dtype(DTYPES[dtype]))
+    return specs
 
-        Raises:
-            Malformed: if the table is too large, or holds dtypes that rejeu does not write.
-            SafetensorError: if it is not a valid safetensors file.
-            OSError: if it cannot be read.
-        """
-        with path.open("rb") as file:
-            size = int.from_bytes(file.read(8), "little")
-        if size > MAX_TABLE:  # else the objects built from it could take gigabytes
-            raise Malformed(f"its table has {size} bytes, expected at most {MAX_TABLE}")
-        self._file = safe_open(path, framework="numpy", backend="pread")
-        self.metadata: dict[str, str] = self._file.metadata() or {}
-        self.specs: dict[str, ArraySpec] = {}
-        """By name, in the order of the offsets."""
-        for name in self._file.offset_keys():
-            array = self._file.get_slice(name)
-            if (dtype := array.get_dtype()) not in DTYPES:
-                raise Malformed(f"{shown(name)} has the dtype {shown(dtype)}, which rejeu does not write")
-            self.specs[name] = ArraySpec(tuple(array.get_shape()), np.dtype(DTYPES[dtype]))
 
-    def read(self, name: str) -> np.ndarray:
-        """Returns an array.
-
-        Raises:
-            SafetensorError: if the file ends before the array does.
-        """
-        return self._file.get_tensor(name)
-
-    def __enter__(self) -> TensorFile:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._file.__exit__(None, None, None)
+def check_table(path: Path) -> None:
+    """Raises ``Malformed`` if the table of a file is too large: the objects built from it could take gigabytes."""
+    with path.open("rb") as file:
+        size = int.from_bytes(file.read(8), "little")
+    if size > MAX_TABLE:
+        raise Malformed(f"its table has {size} bytes, expected at most {MAX_TABLE}")
 
 
 def contiguous(name: str, value: Any) -> np.ndarray:
@@ -197,16 +181,19 @@ def write(path: str | Path, kind: str, arrays: Mapping[str, Any], header: Mappin
     return path
 
 
+@dataclass(frozen=True)
 class Contents:
     """An open file: its header, and the specs of its arrays, which are compared with what is expected before any is read."""
 
-    def __init__(self, path: Path, file: TensorFile, header: Header, sums: dict[str, int] | None) -> None:
-        self.path = path
-        self.header = header
-        """Of the current schema."""
-        self.specs: dict[str, ArraySpec] = file.specs
-        """Shape and dtype of each array, by name."""
-        self._file, self._sums = file, sums
+    path: Path
+    file: Any
+    """Of the safetensors library."""
+    header: Header
+    """Of the current schema."""
+    specs: dict[str, ArraySpec]
+    """Shape and dtype of each array, by name."""
+    sums: dict[str, int]
+    """Checksums of the arrays."""
 
     @property
     def room(self) -> int:
@@ -224,8 +211,8 @@ class Contents:
         with explained(self.path):
             for name in self.specs:
                 if name.startswith(prefix):
-                    arrays[name] = array = self._file.read(name)
-                    if self._sums is not None and self._sums[name] != _checksum(contiguous(name, array)):
+                    arrays[name] = array = self.file.get_tensor(name)
+                    if self.sums[name] != _checksum(contiguous(name, array)):
                         raise CheckpointError(
                             f"{self.path}: the array {shown(name)} is damaged (its checksum differs); restore the "
                             "file from a copy"
@@ -248,12 +235,14 @@ def opened(path: str | Path, kind: str) -> Iterator[Contents]:
     with contextlib.ExitStack() as stack:
         with explained(path):
             path = existing(path)
-            file = stack.enter_context(TensorFile(path))
-            header, sums = _head(path, file, kind)
+            check_table(path)
+            file = stack.enter_context(safe_open(path, framework="numpy", backend="pread"))
+            specs = specs_of(file)
+            header, sums = _head(path, file.metadata() or {}, {*specs}, kind)
             size, memory = path.stat().st_size, physical_memory()
             if memory is not None and size > memory:
                 raise CheckpointError(f"{path} has {size / 2**30:.1f} GiB and the machine {memory / 2**30:.1f} GiB")
-        yield Contents(path, file, header, sums)
+        yield Contents(path, file, header, specs, sums)
 
 
 def read(path: str | Path, kind: str) -> tuple[Header, dict[str, np.ndarray]]:
@@ -340,20 +329,18 @@ def existing(path: str | Path) -> Path:
         return path
 
 
-def _head(path: Path, file: TensorFile, kind: str) -> tuple[Header, dict[str, int] | None]:
-    """Returns the header and the arrays' checksums, both verified; None for schema 1, which has no checksums."""
-    text = file.metadata.get(HEADER_KEY)
+def _head(path: Path, metadata: Mapping[str, str], names: set[str], kind: str) -> tuple[Header, dict[str, int]]:
+    """Returns the header and the arrays' checksums, both verified."""
+    text = metadata.get(HEADER_KEY)
     if text is None:
         raise CheckpointError(f"{path} is a safetensors file, but not one that rejeu wrote: its header is missing")
-    header = _header(path, text, file.metadata.get(CHECKSUM_KEY))
+    header = _header(path, text, metadata.get(CHECKSUM_KEY))
     if header.get("kind") != kind:
         raise CheckpointError(f"{path} holds {shown(header.get('kind'))!r}, expected {kind!r}")
     sums = header.pop(CHECKSUMS, None)
-    if header["schema"] == 1:
-        return header, None
     if not isinstance(sums, dict) or not all(type(value) is int for value in sums.values()):
         raise CheckpointError(f"{path}: the header holds no checksums; restore the file from a copy")
-    if differing := file.specs.keys() ^ sums.keys():
+    if differing := names ^ sums.keys():
         raise CheckpointError(f"{path}: {shown(min(differing))} is among the arrays or the checksums, but not in both")
     return header, sums
 

@@ -16,7 +16,7 @@ is exactly the one that acted; rewards, and all of the first rollout, whose scal
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -277,40 +277,26 @@ def acting_normalized(algorithm: Algorithm, explorer: Explorer, normalizer: Norm
     The actor is the pair of the algorithm's actor and the statistics.
     """
 
-    def explore(actor: tuple[PyTree, Statistics], obs: PyTree, key: Array, clock: Clock) -> Array:
-        return algorithm.explore(actor[0], normalizer.obs(actor[1], obs), key, clock)
+    def by_actor(function: Callable[..., Any] | None, place: int = 0) -> Any:
+        """Returns a function whose argument at ``place`` is the actor, followed by observations; None of None."""
 
-    def exploit(actor: tuple[PyTree, Statistics], obs: PyTree) -> Array:
-        return algorithm.exploit(actor[0], normalizer.obs(actor[1], obs))
+        def call(*arguments: Any) -> Any:
+            (actor, statistics), obs, *rest = arguments[place:]
+            return function(*arguments[:place], actor, normalizer.obs(statistics, obs), *rest)  # type: ignore[misc]
 
-    def act(
-        carry: PyTree, actor: tuple[PyTree, Statistics], obs: PyTree, ended: Array, key: Array, clock: Clock
-    ) -> tuple[Array, PyTree]:
-        return explorer.act(carry, actor[0], normalizer.obs(actor[1], obs), ended, key, clock)
-
-    def recall(carry: PyTree, actor: tuple[PyTree, Statistics], obs: PyTree, ended: Array) -> tuple[Array, PyTree]:
-        assert algorithm.recall is not None
-        return algorithm.recall(carry, actor[0], normalizer.obs(actor[1], obs), ended)
+        return None if function is None else call
 
     def action_values(state: State, obs: PyTree, action: Array | None) -> Array:
         assert algorithm.action_values is not None
         return algorithm.action_values(state.learner, normalizer.obs(state.statistics, obs), action)
 
-    def state_value(carry: PyTree, actor: tuple[PyTree, Statistics], obs: PyTree, ended: Array) -> Array:
-        assert algorithm.state_value is not None
-        return algorithm.state_value(carry, actor[0], normalizer.obs(actor[1], obs), ended)
-
-    def imitation(actor: tuple[PyTree, Statistics], obs: PyTree, action: Any) -> Array:
-        assert algorithm.imitation is not None
-        return algorithm.imitation(actor[0], normalizer.obs(actor[1], obs), action)
-
     return algorithm._replace(
         actor=lambda state: (algorithm.actor(state.learner), state.statistics),
-        explore=explore,
-        exploit=exploit,
-        explorer=Explorer(lambda actor, n_envs: explorer.init(actor[0], n_envs), act),
-        recall=None if algorithm.recall is None else recall,
+        explore=by_actor(algorithm.explore),
+        exploit=by_actor(algorithm.exploit),
+        explorer=Explorer(lambda actor, n_envs: explorer.init(actor[0], n_envs), by_actor(explorer.act, 1)),
+        recall=by_actor(algorithm.recall, 1),
         action_values=None if algorithm.action_values is None else action_values,
-        state_value=None if algorithm.state_value is None else state_value,
-        imitation=None if algorithm.imitation is None else imitation,
+        state_value=by_actor(algorithm.state_value, 1),
+        imitation=by_actor(algorithm.imitation),
     )
