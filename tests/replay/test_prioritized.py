@@ -15,7 +15,7 @@ from scipy.stats import chisquare
 import rejeu
 from rejeu.callbacks import Checkpoint
 from rejeu.core import checkpoint
-from rejeu.core.errors import NonFiniteError
+from rejeu.core.errors import CheckpointError, NonFiniteError
 from rejeu.core.schedules import Linear
 from rejeu.core.spaces import leaves, structure
 from rejeu.envs.goals import GoalFunctions
@@ -430,17 +430,13 @@ def test_a_loaded_replay_buffer_forgets_the_td_errors_of_the_one_before(tmp_path
     assert_priorities_are_of_their_steps(agent, least=20)
 
 
-def test_checkpoints_in_which_draws_have_lost_their_td_errors_are_read(tmp_path):
-    """Older versions wrote such after an error: the draws ahead of the others had no TD errors any more."""
+def test_checkpoints_in_which_draws_have_no_td_errors_are_refused(tmp_path):
     agent = small_dqn().learn(40)
     path = Checkpoint(tmp_path).save(agent)
-    (draw, td_error), steps = agent.run.td_errors[0], np.arange(4)
     header, arrays = checkpoint.read(path, "run")
     drawn = header["run"]["dict"]["buffer"]["dict"]["priorities"]["dict"]["drawn"]
     drawn.insert(0, [{"array": "run.lost"}, {"array": "run.lost"}])
     kept = {key: value for key, value in header.items() if key not in checkpoint.RESERVED}
-    checkpoint.write(path, "run", {**arrays, "run.lost": steps}, kept)
-    with pytest.warns(UserWarning, match="at the start of new episodes"):
-        ((same, error),) = rejeu.DQN.resume(tmp_path, agent.env).run.td_errors
-    np.testing.assert_array_equal(same.position, draw.position)
-    np.testing.assert_array_equal(error, td_error)
+    checkpoint.write(path, "run", {**arrays, "run.lost": np.arange(4)}, kept)
+    with pytest.raises(CheckpointError, match="the TD errors under way are not those of the steps that were drawn"):
+        rejeu.DQN.resume(tmp_path, agent.env)

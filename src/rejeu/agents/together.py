@@ -148,15 +148,8 @@ def is_list_of_numbers(value: Any) -> bool:
 def sibling(agent: A, env: Any, seed: int) -> A:
     """Returns an agent with the same settings and compiled functions, other environments and another seed."""
     other = object.__new__(type(agent))
-    other.configure(
-        agent.policy_name,
-        agent.config,
-        seed,
-        agent.stats_window_size,
-        agent.success_threshold,
-        agent.best_window,
-        agent.device,
-    )
+    same = ("config", "stats_window_size", "success_threshold", "best_window", "device")
+    other.configure(agent.policy_name, seed=seed, **{name: getattr(agent, name) for name in same})
     other.set_outputs(agent.verbose, agent.log, agent.tensorboard_log)
     other.made_from_id = agent.made_from_id
     other.observation_space, other.action_space = agent.observation_space, agent.action_space

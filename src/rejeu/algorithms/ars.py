@@ -153,10 +153,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
             return jnp.argmax(outputs, axis=-1).astype(jnp.int32)
         return jnp.tanh(outputs) if widths else jnp.clip(outputs, -1.0, 1.0)
 
-    def explore(actor: Perturbation, obs: PyTree, key: Array, clock: Clock) -> Array:
-        return act(actor.network, obs)
-
-    def exploit(actor: Perturbation, obs: PyTree) -> Array:
+    def choose(actor: Perturbation, obs: PyTree, *_: Any) -> Array:
         return act(actor.network, obs)
 
     def begin(actor: Perturbation, n_envs: int) -> Playing:
@@ -204,7 +201,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         actor = dataclasses.replace(actor, network=network, n_rollouts=actor.n_rollouts + 1)
         return State(actor, state.n_updates + 1), metrics
 
-    return Algorithm(init, lambda state: state.actor, explore, exploit, update, Explorer(begin, play))
+    return Algorithm(init, lambda state: state.actor, choose, choose, update, Explorer(begin, play))
 
 
 def direction(actor: Perturbation, k: Array) -> Network:

@@ -302,8 +302,7 @@ def own_names(saved: Mapping[str, Any]) -> Iterator[tuple[tuple[str, ...], str]]
     for key, value in saved.items():
         if isinstance(value, Mapping) and set(value) == {OWN}:
             yield (key,), str(value[OWN])[:40]
-        elif isinstance(value, str) and key in (*OWN_MODULES, *NAMED) and value not in ("random", *NAMED.get(key, ())):
-            # Older files mention a torso in this way.
+        elif isinstance(value, str) and key in NAMED and value not in ("random", *NAMED[key]):
             yield (key,), value[:40]
         elif isinstance(value, Mapping):
             yield from (((key, *keys), name) for keys, name in own_names(value))

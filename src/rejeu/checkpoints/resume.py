@@ -159,15 +159,14 @@ def read_rows(path: Path, agent: BaseAgent) -> dict[str, np.ndarray]:
 def compared(agent: BaseAgent, header: RunHeader) -> Resumed:
     """Returns how a run resumes whose environments were restored."""
     here = xla.threads()
-    before = here if header.threads is None else header.threads
     if header.versions != versions():
         why = "by another version of rejeu, JAX or Optax, so"
     elif header.n_together > 1:
         why = f"alone: it was one of {header.n_together} runs in one program, whose sums are rounded otherwise, so"
-    elif before != here:
+    elif header.threads != here:
         why = (
-            f"JAX computes with {here} threads here and had {before}; resume in a new process, with the environment variable "
-            f"{xla.THREADS}={before} if JAX is used before, or"
+            f"JAX computes with {here} threads here and had {header.threads}; resume in a new process, with the environment "
+            f"variable {xla.THREADS}={header.threads} if JAX is used before, or"
         )
     else:
         return Resumed(agent.run.step, True, "")
@@ -249,7 +248,7 @@ def restore_counters(agent: BaseAgent, saved: SavedRun) -> None:
     run.rng.bit_generator.state = saved.rng
     run.monitor.n_skipped = saved.n_skipped
     run.seconds = {key: saved.seconds[key] for key in run.seconds}
-    agent.reset_seconds = number("before", saved.seconds.get("before", 0.0), least=0, most=run.seconds["total"])
+    agent.reset_seconds = number("before", saved.seconds["before"], least=0, most=run.seconds["total"])
     values, agent.logger.name_to_count = saved.logger
     agent.logger.name_to_value = {key: number(key, value) for key, value in values.items()}
     agent.n_predictions = saved.n_predictions
@@ -323,19 +322,13 @@ def restore_buffer(
 def with_draws(priorities: Priorities, drawn: Sequence[Any], td_errors: list[Array]) -> list[tuple[Draw, Array]]:
     """Returns TD errors with the draws that they belong to.
 
-    Older versions could save more draws than TD errors, or empty draws, after an error or after ``load_replay_buffer``. The
-    first draws then have no TD errors, and empty draws are dropped.
-
     Raises:
         ValueError: if they do not belong together, or to another replay buffer.
     """
     draws = [priorities.draw_of(index, time) for index, time in drawn]
-    if len(draws) < len(td_errors):
+    if [len(draw.position) for draw in draws] != [td_error.size for td_error in td_errors]:
         raise ValueError("the TD errors under way are not those of the steps that were drawn")
-    pairs = list(zip(draws[len(draws) - len(td_errors) :], td_errors, strict=True))
-    if any(len(draw.position) not in (0, td_error.size) for draw, td_error in pairs):
-        raise ValueError("the TD errors under way are not those of the steps that were drawn")
-    return [(draw, td_error) for draw, td_error in pairs if len(draw.position)]
+    return list(zip(draws, td_errors, strict=True))
 
 
 def like(expected: PyTree, given: list[np.ndarray], name: str) -> PyTree:

@@ -227,17 +227,16 @@ class RunHeader(msgspec.Struct):
     run_id: str
     run: Any
     """A :class:`SavedRun`, encoded by :mod:`rejeu.core.records`."""
+    threads: Annotated[int, Meta(ge=1, le=1024)]
+    """Of JAX's device."""
     env_id: Any = None
     backend: Any = None
     wait_for: Positive | None = None
-    """Missing in older checkpoints."""
     own_env: Any = False
-    threads: Annotated[int, Meta(ge=1, le=1024)] | None = None
-    """Of JAX's device; missing in older checkpoints."""
     n_together: Positive = 1
     """Runs in the program that trained it."""
     versions: Any = None
-    """:func:`versions` of the process that wrote it; missing in older checkpoints."""
+    """:func:`versions` of the process that wrote it."""
 
 
 class SavedBest(msgspec.Struct):

@@ -159,10 +159,6 @@ def _received(value: Any, place: str) -> str:
     return f"{name}={shown(repr(value), 40)}: "
 
 
-MAX_LEVELS = 32
-"""Upper limit on the levels of nesting."""
-
-
 def encode(value: Any, arrays: dict[str, np.ndarray], name: str) -> Any:
     """Returns ``value`` as JSON; its arrays are added to ``arrays`` under names that begin with ``name``.
 
@@ -190,23 +186,21 @@ def encode(value: Any, arrays: dict[str, np.ndarray], name: str) -> Any:
     raise TypeError(f"{name} is a {type(value).__name__}; expected numbers, strings, lists, tuples, dicts and arrays")
 
 
-def decode(value: Any, arrays: Mapping[str, np.ndarray], depth: int = 0) -> Any:
+def decode(value: Any, arrays: Mapping[str, np.ndarray]) -> Any:
     """Returns the value that :func:`encode` encoded.
 
     Raises:
         CheckpointError: if ``value`` cannot come from :func:`encode`.
     """
-    if depth > MAX_LEVELS:
-        raise CheckpointError(f"the data are nested more than {MAX_LEVELS} deep; the file is damaged")
     if isinstance(value, list):
-        return [decode(part, arrays, depth + 1) for part in value]
+        return [decode(part, arrays) for part in value]
     if not isinstance(value, dict):
         return value
     kind, content = next(iter(value.items())) if len(value) == 1 else (None, None)
     if kind == "dict" and isinstance(content, dict):
-        return {key: decode(part, arrays, depth + 1) for key, part in content.items()}
+        return {key: decode(part, arrays) for key, part in content.items()}
     if kind == "tuple" and isinstance(content, list):
-        return tuple(decode(part, arrays, depth + 1) for part in content)
+        return tuple(decode(part, arrays) for part in content)
     if kind == "float" and content in ("nan", "inf", "-inf"):
         return float(content)
     if kind in ("array", "scalar") and isinstance(content, str) and content in arrays:

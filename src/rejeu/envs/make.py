@@ -123,8 +123,7 @@ def make_vector(
     """
     if backend not in BACKENDS:
         raise ValueError(f"backend={backend!r} must be one of {', '.join(BACKENDS)}")
-    if isinstance(n_envs, bool) or not isinstance(n_envs, int) or n_envs < 1:
-        raise ValueError(f"n_envs={n_envs!r} must be a whole number of at least 1")
+    n_envs = validation.whole("n_envs", n_envs, least=1)
     workers = WorkerOptions(worker_timeout, restart_workers, wait_for, ray)
     check_workers(env, n_envs, backend, workers)
     if isinstance(env, VectorEnv | gym.vector.VectorEnv) or adapter_of(env) is not None:

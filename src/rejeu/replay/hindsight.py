@@ -30,6 +30,7 @@ from typing import Any
 import numpy as np
 
 from rejeu.core.algorithm import Transition
+from rejeu.core.validation import assign, coerce, flag, whole
 from rejeu.envs.goals import GoalFunctions
 from rejeu.replay.prioritized import Draw, Priorities
 from rejeu.replay.ring import LAST, Ring
@@ -201,8 +202,8 @@ class HindsightConfig:
     do not contain infos: after loading, those of earlier steps are empty."""
 
     def __post_init__(self) -> None:
-        if isinstance(self.n_sampled_goal, bool) or not isinstance(self.n_sampled_goal, int) or self.n_sampled_goal < 0:
-            raise ValueError(f"n_sampled_goal={self.n_sampled_goal!r} must be a whole number of at least 0")
+        coerce(self, "n_sampled_goal", whole, least=0)
+        coerce(self, "copy_info_dict", flag)
         strategy = name_of(self.goal_selection_strategy)
         if isinstance(strategy, GoalSelectionStrategy):
             strategy = strategy.value
@@ -212,9 +213,7 @@ class HindsightConfig:
                 f"goal_selection_strategy={strategy!r} must be one of {', '.join(known)}, or a function (steps) -> times; the "
                 "name of a function of yours is enough if it was registered before (register_goal_strategy)"
             )
-        object.__setattr__(self, "goal_selection_strategy", strategy)
-        if not isinstance(self.copy_info_dict, bool):
-            raise ValueError(f"copy_info_dict={self.copy_info_dict!r} must be True or False")
+        assign(self, goal_selection_strategy=strategy)
 
 
 def counters(config: HindsightConfig | None) -> tuple[str, ...]:

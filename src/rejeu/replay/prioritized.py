@@ -16,6 +16,7 @@ import numpy as np
 
 from rejeu.core import schedules
 from rejeu.core.schedules import Schedule
+from rejeu.core.validation import coerce, number
 from rejeu.replay.ring import LAST, Ring, Rows
 
 
@@ -31,11 +32,9 @@ class PriorityConfig:
     """Added to the absolute TD error, so that every step can be sampled. Positive."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "beta", schedules.parse("beta", self.beta))
-        if not 0 <= self.alpha <= 1:
-            raise ValueError(f"alpha={self.alpha!r} must be from 0 to 1")
-        if not self.epsilon > 0:
-            raise ValueError(f"epsilon={self.epsilon!r} must be positive")
+        coerce(self, "alpha", number, least=0, most=1)
+        coerce(self, "beta", schedules.parse)
+        coerce(self, "epsilon", number, above=0)
 
 
 class Draw(NamedTuple):

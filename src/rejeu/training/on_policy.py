@@ -20,9 +20,9 @@ from rejeu.algorithms.rollout_config import RolloutConfig
 from rejeu.core.algorithm import GRADIENT_STEPS, Clock, PyTree
 from rejeu.core.spaces import action_scaler
 from rejeu.envs.base import Step
-from rejeu.training.checks import check_obs, check_state, checked_reset, checked_step
+from rejeu.training.checks import check_state, checked_reset, checked_restart, checked_step
 from rejeu.training.learner import Learner
-from rejeu.training.run import Episode, Progress, Run, clock_of, record_step, restart, start_clock, timed
+from rejeu.training.run import Episode, Progress, Run, clock_of, record_step, start_clock, timed
 
 
 def on_policy(
@@ -112,7 +112,7 @@ def begin_episodes(run: Run, config: RolloutConfig, learner: Learner | None = No
     The current rollout keeps its steps, unless rollouts hold whole episodes: then it starts again too, and with it what
     ``learner`` carries from step to step, such as the number of the episode.
     """
-    check_obs(run, restart(run), run.step, "reset returned")
+    checked_restart(run)
     if config.n_episodes is not None and learner is not None:
         run.carry = learner.initial_carry(run.env.n_envs)
     if run.replay.length and config.n_episodes is None:

@@ -10,7 +10,7 @@
 from __future__ import annotations
 
 import difflib
-import importlib
+import pkgutil
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -75,26 +75,13 @@ def make(env_id: str, **kwargs: Any) -> FunctionalEnv:
         near = difflib.get_close_matches(env_id, REGISTRY, n=2, cutoff=0.4)
         hint = f"did you mean {' or '.join(near)}?" if near else f"there are {', '.join(REGISTRY)}"
         raise ValueError(f"no environment in JAX is called {env_id!r}; {hint}")
-    kind = _imported(REGISTRY[env_id].kind)
+    kind = imported(REGISTRY[env_id].kind)
     return kind(**kwargs)
 
 
-def without_limit(env_id: str) -> dict[str, None]:
-    """Returns the arguments that make an environment without the limit that Gymnasium's wrapper applies."""
-    return {"max_episode_steps": None} if env_id in REGISTRY and REGISTRY[env_id].max_episode_steps else {}
-
-
-def drawing_of(env_id: str) -> MakeDrawing | None:
-    """Returns the function that returns an environment's drawing, None if it has none."""
-    return _imported(REGISTRY[env_id].drawing) if env_id in REGISTRY else None
-
-
-def _imported(value: Any) -> Any:
+def imported(value: Any) -> Any:
     """Returns the object that one of our own strings names, and other values unchanged."""
-    if not isinstance(value, str):
-        return value
-    module, _, name = value.partition(":")
-    return getattr(importlib.import_module(module), name)
+    return pkgutil.resolve_name(value) if isinstance(value, str) else value
 
 
 def register(
@@ -145,7 +132,7 @@ if not TYPE_CHECKING:
         """Imports a class when it is first used, so that registering environments alone does not import JAX."""
         if name not in __all__:
             raise AttributeError(f"module 'rejeu.envs.functional' has no attribute {name!r}")
-        return getattr(importlib.import_module("rejeu.envs.functional.protocol"), name)
+        return pkgutil.resolve_name(f"rejeu.envs.functional.protocol:{name}")
 
     def __dir__() -> list[str]:
         return sorted({*globals(), *__all__})

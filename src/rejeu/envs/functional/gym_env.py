@@ -49,8 +49,12 @@ class GymnasiumEnv(gym.Env[Any, Any]):
         **env_kwargs: Any,
     ) -> None:
         if isinstance(env, str):
-            drawing = functional.drawing_of(env) if drawing is None else drawing
-            env = functional.make(env, **functional.without_limit(env), **env_kwargs)
+            spec = functional.REGISTRY.get(env)
+            if spec is not None:
+                drawing = functional.imported(spec.drawing) if drawing is None else drawing
+                if spec.max_episode_steps:  # Gymnasium's wrapper applies it
+                    env_kwargs["max_episode_steps"] = None
+            env = functional.make(env, **env_kwargs)
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise ValueError(f"render_mode={render_mode!r} must be None, 'human' or 'rgb_array'")
         if render_mode is not None and drawing is None:

@@ -18,6 +18,7 @@ from jax import Array
 
 from rejeu.core import prng
 from rejeu.core.spaces import cast, leaves
+from rejeu.core.validation import whole
 from rejeu.envs.base import Seed, Step, VectorEnv, success_of
 from rejeu.envs.functional.protocol import FunctionalEnv, GoalEnv
 from rejeu.envs.functional.validation import check
@@ -166,11 +167,9 @@ class JaxVector(VectorEnv):
         env_id: str | None = None,
         reward_threshold: float | None = None,
     ) -> None:
-        if isinstance(n_envs, bool) or not isinstance(n_envs, int) or n_envs < 1:
-            raise ValueError(f"n_envs={n_envs!r} must be a whole number of at least 1")
         check(env)
         self.env = env
-        self.n_envs = n_envs
+        self.n_envs = n_envs = whole("n_envs", n_envs, least=1)
         self.env_id = type(env).__name__ if env_id is None else env_id
         self.observation_space = env.observation_space
         self.action_space, self._action_leaves = env.action_space, leaves(env.action_space)

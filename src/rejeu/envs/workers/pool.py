@@ -24,6 +24,7 @@ import gymnasium as gym
 from gymnasium.vector.utils import CloudpickleWrapper
 
 from rejeu.core.errors import WorkerError
+from rejeu.core.validation import whole
 from rejeu.envs.workers import process
 from rejeu.envs.workers.process import Handover, WorkerDescription, WorkerFailure
 
@@ -385,8 +386,7 @@ def check_options(timeout: float | None, restarts: int) -> None:
     """Raises ``ValueError`` unless ``timeout`` is positive seconds or None, and ``restarts`` a non-negative integer."""
     if timeout is not None and not (isinstance(timeout, int | float) and 0 < timeout < math.inf):
         raise ValueError(f"worker_timeout={timeout!r} must be a number of seconds above 0, or None to wait for ever")
-    if isinstance(restarts, bool) or not isinstance(restarts, int) or restarts < 0:
-        raise ValueError(f"restart_workers={restarts!r} must be a whole number of at least 0")
+    whole("restart_workers", restarts, least=0)
 
 
 def check_sendable(make_one: Callable[[], gym.Env]) -> None:
