@@ -568,6 +568,15 @@ def _bounds(bounds: np.ndarray, dtype: Any) -> Any:
 def as_batch(observation: Any, space: spaces.Space, leaves: Sequence[Leaf]) -> tuple[Any, bool]:
     """Returns observations as a batch of arrays of the right types, and whether it was a single observation.
 
+    The arguments and errors are those of :func:`batch_arrays`.
+    """
+    arrays, single = batch_arrays(observation, space, leaves)
+    return structure(space).unflatten(arrays), single
+
+
+def batch_arrays(observation: Any, space: spaces.Space, leaves: Sequence[Leaf]) -> tuple[list[np.ndarray], bool]:
+    """Returns the parts of observations as batches of the right types, and whether it was a single observation.
+
     Args:
         observation: one of ``space``, or a batch with a leading axis; arrays, or lists of numbers.
         space: the observation space.
@@ -576,10 +585,9 @@ def as_batch(observation: Any, space: spaces.Space, leaves: Sequence[Leaf]) -> t
     Raises:
         ValueError: if structure or shapes do not match, or the parts are batches of different sizes.
     """
-    expected = structure(space)
     try:
-        nested = plain(space, observation)
-        arrays = [np.asarray(a, leaf.dtype) for a, leaf in zip(expected.flatten_up_to(nested), leaves, strict=True)]
+        found = parts(space, observation)
+        arrays = [np.asarray(one, leaf.dtype) for one, leaf in zip(found, leaves, strict=True)]
     except (KeyError, IndexError, TypeError, ValueError) as error:
         raise ValueError(
             f"the observation has the structure {described(observation)}, expected {space}, or a batch of it: "
@@ -594,7 +602,7 @@ def as_batch(observation: Any, space: spaces.Space, leaves: Sequence[Leaf]) -> t
         if (array.shape if single else array.shape[1:]) != leaf.shape:
             where = f" of {leaf.path!r}" if leaf.path else ""
             raise ValueError(f"the observation{where} has shape {array.shape}, expected {leaf.shape}, or a batch of it")
-    return expected.unflatten([array[None] if single else array for array in arrays]), single
+    return [array[None] if single else array for array in arrays], single
 
 
 def described(observation: Any) -> str:

@@ -192,7 +192,7 @@ class NumpyPolicy:
             raise ValueError("a policy in NumPy is deterministic; leave out deterministic=False, or use rejeu.load")
         if action_masks is not None and not self.takes_masks:
             raise ValueError("this policy takes no action_masks")
-        arrays, is_single = self._batch(observation)
+        arrays, is_single = spaces.batch_arrays(observation, self.observation_space, self._leaves)
         n = len(arrays[0])
         if self.takes_masks:
             shape = (n, *self.card["inputs"][len(arrays)]["shape"])
@@ -204,19 +204,6 @@ class NumpyPolicy:
         action, *after = self.program(n, arrays)
         action = action.astype(self.action_space.dtype)
         return (action[0] if is_single else action), tuple(after) if self._n_states else state
-
-    def _batch(self, observation: Any) -> tuple[list[np.ndarray], bool]:
-        """Returns the arrays of a batch of observations, and whether it was a single one."""
-        parts = spaces.parts(self.observation_space, observation)
-        arrays = [np.asarray(one, leaf.dtype) for one, leaf in zip(parts, self._leaves, strict=True)]
-        is_single = arrays[0].ndim == len(self._leaves[0].shape)
-        for array, leaf in zip(arrays, self._leaves, strict=True):
-            if array.shape[0 if is_single else 1 :] != leaf.shape:
-                where = f" of {leaf.path!r}" if leaf.path else ""
-                raise ValueError(
-                    f"the observation{where} has shape {array.shape}, expected {leaf.shape}, or a batch of it"
-                )
-        return [one[None] for one in arrays] if is_single else arrays, is_single
 
 
 def parse(content: bytes) -> NumpyPolicy:
