@@ -73,7 +73,7 @@ def run_class(arguments: Class) -> tuple[int, dict[str, Any]]:
         echo,
     )
     if not arguments.json:
-        show_table(board.texts["columns"], [leaderboard.cells_of(row, language) for row in board.rows], 3)
+        show_table(leaderboard.columns(language), [leaderboard.cells_of(row, language) for row in board.rows], 3)
         for note in leaderboard.notes(board):
             echo(note)
     echo(said("the page of the class: {}", f"rejeu studio {quoted(arguments.folder)}", language=language))

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 from fastapi import Request
 from nicegui import ui
 
-from rejeu.core.language import LANGUAGES, Language, chosen
+from rejeu.core.language import LANGUAGES, Language, chosen, said
 from rejeu.lab.reporting.rows import Row
 from rejeu.lab.studio.judging import Judging
 from rejeu.lab.studio.layout import EVERY, address
@@ -28,6 +28,7 @@ CSS = """
 .projector .title { font-size: min(3rem, 5vw); line-height: 1.2; }
 .projector .small { display: none; }
 """
+PLACES = "Models whose intervals overlap may be equally good: the place is the range that the intervals allow."
 NAMES = ("place", "name", "algorithm", "steps", "seed", "return", "interval", "success", "length")
 LEFT_OUT = dict.fromkeys(("algorithm", "steps", "seed", "length"), "gt-sm small") | dict.fromkeys(
     ("bar", "success"), "gt-xs"
@@ -58,16 +59,16 @@ def build(studio: Studio, request: Request) -> None:
     judging, asked = judging_of(studio), request.query_params
     language = chosen(asked.get("language") if asked.get("language") in LANGUAGES else None)
     is_large = "projector" in asked
-    texts = leaderboard.texts()[language]
+    say = partial(said, language=language)
     ui.query("body").classes("projector" if is_large else "")
     other: Language = "en" if language == "fr" else "fr"
     large = {} if is_large else {"projector": "1"}
     with ui.row().classes("items-center w-full"):
         title = ui.label().classes("text-h5 title")
         ui.space()
-        ui.link(texts["other_language"], address("/class", language=other, **({} if large else {"projector": "1"})))
-        ui.link(texts["projector"], address("/class", language=language, **large))
-    table = ui.table(rows=[], columns=columns(texts["columns"]), row_key="name", pagination=0)
+        ui.link(say("français"), address("/class", language=other, **({} if large else {"projector": "1"})))
+        ui.link(say("projector"), address("/class", language=language, **large))
+    table = ui.table(rows=[], columns=columns(leaderboard.columns(language)), row_key="name", pagination=0)
     table.classes("w-full class").props("flat bordered dense hide-pagination")
     for name, template in SLOTS.items():
         table.add_slot(f"body-cell-{name}", template)
@@ -82,11 +83,11 @@ def build(studio: Studio, request: Request) -> None:
             return
         seen = now
         board = judging.board(language)
-        title.text = f"{texts['title']} {board.env_id}"
+        title.text = say("Leaderboard: {}", board.env_id)
         table.rows = [*lines(studio, judging, board)]
-        doing = texts["evaluating"].format(name=judging.now) if judging.now else ""
-        said = f"{texts['episodes'].format(n=board.episodes)}. {texts['places']}" if board.rows else ""
-        notes.text = "\n".join(filter(None, (doing, judging.problem, said, *leaderboard.notes(board))))
+        doing = say("evaluating {} ...", judging.now) if judging.now else ""
+        about = f"{say(leaderboard.EPISODES, board.episodes)}. {say(PLACES)}" if board.rows else ""
+        notes.text = "\n".join(filter(None, (doing, judging.problem, about, *leaderboard.notes(board))))
 
     look()
     ui.timer(EVERY, look)
@@ -111,18 +112,17 @@ def columns(titles: list[str]) -> list[dict[str, Any]]:
 
 def lines(studio: Studio, judging: Judging, board: Leaderboard) -> list[dict[str, Any]]:
     """Returns the lines of the table: the models by mean return, then the runs that train and have no model yet."""
-    texts = board.texts
     ends = [end for row in board.rows for end in row.interval] or [0.0]
     scale = 100 / max(max(ends) - min(ends), 1e-9)
     running = {row["run"]: progress(row, board.language) for row in studio.rows if row["state"] == "running"}
-    found = []
+    found: list[dict[str, Any]] = []
     for row in board.rows:
         low, high = ((end - min(ends)) * scale for end in row.interval)
         path = judging.path_of(row.name)
         found.append(
             dict(zip(NAMES, leaderboard.cells_of(row, board.language), strict=True))
             | {"low": low, "width": high - low, "middle": (row.evaluation.mean_return - min(ends)) * scale - 1}
-            | {"training": running.pop(row.name, ""), "watch": texts["watch"]}
+            | {"training": running.pop(row.name, ""), "watch": said("watch", language=board.language)}
             | {"link": path and address("/play", agent=path.as_posix(), watch="1")}
         )
     return [*found, *({"name": name, "training": steps} for name, steps in running.items())]
@@ -132,4 +132,4 @@ def progress(row: Row, language: Language) -> str:
     """Returns how far a run is."""
     asked = row["steps_asked"]
     share = f"{row['steps'] / asked:.0%}" if asked else f"{row['steps']:,}"
-    return str(leaderboard.texts()[language]["training"].format(share=leaderboard.written(share, language)))
+    return said("trains: {}", leaderboard.written(share, language), language=language)

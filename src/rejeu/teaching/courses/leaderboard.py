@@ -8,14 +8,12 @@ from __future__ import annotations
 
 import hashlib
 import math
-import tomllib
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import partial
 from html import escape
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +31,7 @@ from rejeu.logs.evaluation import Evaluation, evaluate
 
 MAX_BYTES = 2**28
 """Upper limit on the size of a model."""
+EPISODES = "Episodes of each model: {}, with the same seeds"
 NARROW_SPACE = "\N{NARROW NO-BREAK SPACE}"
 PROBLEMS = (ArithmeticError, LookupError, MemoryError, OSError, RuntimeError, TypeError, ValueError)
 """Exceptions that a damaged or hostile model can cause."""
@@ -42,17 +41,17 @@ class Unranked(ValueError):
     """A model cannot be ranked.
 
     Args:
-        key: of the text that says why.
+        text: why, as :func:`rejeu.core.language.said` takes it.
         values: in that text.
     """
 
-    def __init__(self, key: str, **values: Any) -> None:
-        super().__init__(key)
-        self.key, self.values = key, values
+    def __init__(self, text: str, *values: Any) -> None:
+        super().__init__(text)
+        self.text, self.values = text, values
 
     def said(self, language: Language) -> str:
         """Returns why, in a language."""
-        return str(texts()[language][self.key].format(**self.values))
+        return said(self.text, *self.values, language=language)
 
 
 @dataclass(frozen=True)
@@ -90,16 +89,13 @@ class Leaderboard:
     equal: tuple[tuple[str, ...], ...] = ()
     """Names of files with the same bytes."""
 
-    @property
-    def texts(self) -> Mapping[str, Any]:
-        """The texts in its language."""
-        return texts()[self.language]
+
+COLUMNS = ("place", "model", "algorithm", "steps", "seed", "mean return", "95 % CI", "success rate", "length")
 
 
-@cache
-def texts() -> dict[str, dict[str, Any]]:
-    """Returns the texts of leaderboards by language and name."""
-    return tomllib.loads((resources.files("rejeu.teaching.courses") / "leaderboard.toml").read_text(encoding="utf-8"))
+def columns(language: Language) -> list[str]:
+    """Returns the titles of the columns."""
+    return [said(one, language=language) for one in COLUMNS]
 
 
 def models(folder: Path) -> list[Path]:
@@ -179,7 +175,7 @@ def header(path: Path) -> dict[str, Any]:
     """
     size = path.stat().st_size
     if size > MAX_BYTES:
-        raise Unranked("large", size=size / 2**20, most=MAX_BYTES >> 20)
+        raise Unranked("the file has {:,.0f} MiB, expected {} MiB at most", size / 2**20, MAX_BYTES >> 20)
     return dict(checkpoint.read_header(path, "agent"))
 
 
@@ -211,7 +207,7 @@ def build(
         report: called with a line for each model.
     """
     results: dict[Path, Entrant | Unranked] = {}
-    columns = texts()[language]["columns"]
+    titles = columns(language)
     with closing(make_vector(episodes)) as env:
         for path in paths:
             name = name_of(path, folder, paths)
@@ -220,7 +216,7 @@ def build(
                 text = found.said(language)
             else:
                 cells = cells_of(found, language)
-                text = f"{columns[5]} {cells[5]} ({columns[6]} {cells[6]})"
+                text = f"{titles[5]} {cells[5]} ({titles[6]} {cells[6]})"
             report(said("{}: {}", name, text, language=language))
     return board_of(folder, paths, env_id, episodes, results, language)
 
@@ -248,7 +244,7 @@ def result_of(path: Path, *how: Any) -> Entrant | Unranked:
         return error
     except PROBLEMS as error:
         text = str(error).replace(f"{path}: ", "").replace(str(path), "the file") or type(error).__name__
-        return Unranked("damaged", reason=shown(" ".join(text.split()), 300))
+        return Unranked("it cannot be evaluated: {}", shown(" ".join(text.split()), 300))
 
 
 def evaluated(
@@ -269,23 +265,23 @@ def evaluated(
     """
     trained_on = header(path).get("env_id")
     if trained_on != env_id:
-        raise Unranked("other_env", said=shown(trained_on), env_id=env_id)
+        raise Unranked("it was trained on {}, not on {}", shown(trained_on), env_id)
     end = xla.clock() + seconds
     agent = load(path)
     try:
         agent.check_spaces(env, env_id)
     except ValueError as error:
-        raise Unranked("spaces", env_id=env_id, reason=error) from None
+        raise Unranked("its spaces are others: {0}", error, env_id) from None
     choose = policy(agent, deterministic=True)
 
     def within_budget(obs: Any, started: np.ndarray) -> np.ndarray:
         if xla.clock() > end:
-            raise Unranked("slow", seconds=seconds, n=episodes)
+            raise Unranked("it needs more than {:g} seconds for {} episodes", seconds, episodes)
         return choose(obs, started)
 
     result = evaluate(within_budget, env, episodes, success_threshold, seed)
     if not np.isfinite(result.returns).all():
-        raise Unranked("not_finite")
+        raise Unranked("the return of an episode is not a finite number")
     return Entrant(name, agent.name, agent.num_timesteps, agent.seed, result)
 
 
@@ -328,14 +324,13 @@ def to_dict(board: Leaderboard) -> dict[str, Any]:
 
 def markdown(board: Leaderboard) -> str:
     """Returns a leaderboard as a Markdown table."""
-    columns = board.texts["columns"]
     rows = [
-        columns,
-        ["---"] * len(columns),
+        columns(board.language),
+        ["---"] * len(COLUMNS),
         *([quoted(cell) for cell in cells_of(row, board.language)] for row in board.rows),
     ]
     lines = ["| " + " | ".join(cells) + " |" for cells in rows]
-    lines += ["", f"{board.env_id}, {board.texts['episodes'].format(n=board.episodes)}.", ""]
+    lines += ["", f"{board.env_id}, {said(EPISODES, board.episodes, language=board.language)}.", ""]
     lines += [f"- {quoted(line)}" for line in notes(board)]
     return "\n".join(lines).rstrip() + "\n"
 
@@ -344,19 +339,19 @@ def notes(board: Leaderboard) -> list[str]:
     """Returns a line for each model without a place, and for each group of equal files."""
     said_of = ((name, reason.said(board.language)) for name, reason in board.problems)
     lines = [said("{}: {}", *one, language=board.language) for one in said_of]
-    return [*lines, *(board.texts["equal"] + ", ".join(names) for names in board.equal)]
+    return lines + [said("The same file: {}", ", ".join(names), language=board.language) for names in board.equal]
 
 
 def cells_of(row: Entrant, language: Language) -> list[str]:
     """Returns the cells of a row, in the order of the columns."""
-    to, result = texts()[language]["to"], row.evaluation
+    to, result = partial(said, "{} to {}", language=language), row.evaluation
     low, high = row.interval
-    place = f"{row.first}" if row.first == row.last else f"{row.first} {to} {row.last}"
+    place = f"{row.first}" if row.first == row.last else to(row.first, row.last)
     numbers = [
         f"{row.steps:,}",
         f"{row.seed}",
         f"{result.mean_return:,.1f}",
-        f"{low:,.1f} {to} {high:,.1f}",
+        to(f"{low:,.1f}", f"{high:,.1f}"),
         "" if math.isnan(result.success_rate) else f"{result.success_rate:.0%}",
         f"{result.mean_length:,.0f}",
     ]
