@@ -11,7 +11,7 @@ import pytest
 import rejeu
 from rejeu.demonstrations import clone, dagger, read, record
 from rejeu.lab.cli import main
-from rejeu.teaching.play.assist import Assist, Seat
+from rejeu.teaching.play.assist import Assist, Expert
 from rejeu.teaching.play.window import Window
 from tests.playing import LEVER, Pull, down, error_of, pygame, up
 from tests.tiers import exhaustive
@@ -88,7 +88,7 @@ def test_a_person_takes_over_from_a_clone(monkeypatch):
     at_steps(monkeypatch, held)
     env = gym.make(SLIDE, render_mode="rgb_array")
     agent = rejeu.PPO("MlpPolicy", env, **SMALL)
-    labeled = dagger(agent, Seat(env), env, takes_over=True, rounds=2, steps=20, updates=200, learning_rate=1e-2)
+    labeled = dagger(agent, Expert(env), env, takes_over=True, rounds=2, steps=20, updates=200, learning_rate=1e-2)
     assert {float(a) for episode in labeled.episodes for a in episode.actions.ravel()} == {2.0}
     assert {len(episode) for episode in labeled.episodes} <= {1, 2}
     assert agent.predict(np.zeros(1, np.float32), deterministic=True)[0][0] > 1.5
@@ -101,7 +101,7 @@ def test_a_clone_that_nobody_corrects_stays_as_it_is(monkeypatch):
     shown = record(Zero(), env, 2, seed=0)
     one, other = (rejeu.PPO("MlpPolicy", env, **SMALL) for _ in range(2))
     clone(one, shown, 20, seed=0)
-    labeled = dagger(other, Seat(env), env, shown, takes_over=True, rounds=2, steps=10, updates=20)
+    labeled = dagger(other, Expert(env), env, shown, takes_over=True, rounds=2, steps=10, updates=20)
     assert labeled.n_steps == shown.n_steps
     obs = np.ones(1, np.float32)
     assert one.predict(obs, deterministic=True)[0] == other.predict(obs, deterministic=True)[0]
@@ -160,7 +160,7 @@ def test_without_a_screen_nothing_is_trained_first(monkeypatch, tmp_path, capsys
     assert "cannot open a window" in error_of(capsys, "train", *how, "--out", str(out))
     assert not out.exists()
     with pytest.raises(OSError, match="cannot open a window"):
-        Seat(gym.make(SLIDE, render_mode="rgb_array"))
+        Expert(gym.make(SLIDE, render_mode="rgb_array"))
 
 
 def test_a_pause_ends_with_the_training(monkeypatch):

@@ -88,10 +88,10 @@ def learn_from_expert(
 
     with ExitStack() as stack:
         if expert is None:
-            from rejeu.teaching.play.assist import Seat
+            from rejeu.teaching.play.assist import Expert
 
             env = stack.enter_context(closing(session.environment.rendering()))
-            answer: Any = stack.enter_context(closing(Seat(env, fps=arguments.fps)))
+            answer: Any = stack.enter_context(closing(Expert(env, fps=arguments.fps)))
         else:
             env = stack.enter_context(closing(session.environment.make()))
             answer = lambda obs: expert.predict(obs, deterministic=True)[0]  # noqa: E731

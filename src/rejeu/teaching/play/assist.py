@@ -25,7 +25,7 @@ from rejeu.teaching.play.window import Window
 from rejeu.training.run import Progress
 
 
-class Seat:
+class Expert:
     """Where a person takes over by holding keys: a window on an environment that somebody else steps. Mutable.
 
     Called, it returns the action of the person, whatever the observation. The first call opens the window. ``p`` pauses, ``q``
@@ -109,7 +109,7 @@ class Assist(TrainingCallback):
         self, folder: str | Path | None = None, keys: Mapping[str, Any] | None = None, fps: float | None = None
     ) -> None:
         self.folder, self.keys, self.fps = folder, keys, fps
-        self.seat: Seat
+        self.seat: Expert
         self.recording: Recording | None = None
         self.steps = 0
         """Number of steps in which the person acted."""
@@ -118,7 +118,7 @@ class Assist(TrainingCallback):
     def before_training(self, agent: Agent) -> None:
         """Checks the agent; the window opens after the first step, when there is something to show."""
         check(agent)
-        self.seat = Seat(agent.run.env.envs[0], self.keys, self.fps)
+        self.seat = Expert(agent.run.env.envs[0], self.keys, self.fps)
         if self.folder is not None:
             self.recording = Recording(self.folder, agent.run.env.envs[0], None)
 
