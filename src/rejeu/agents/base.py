@@ -428,6 +428,11 @@ class BaseAgent(ABC):
         return self.run.env
 
     @property
+    def origin(self) -> tuple[str, Mapping[str, Any]] | None:
+        """Id and keyword arguments of its environments or those it was trained on; None if they were not made from an id."""
+        return self.trained_on if self.run.env is None else self.run.env.made_from
+
+    @property
     def _place(self) -> str:
         """The id of its environments; of a loaded agent, that of the environments it was trained on, if it is known."""
         if self.run.env is not None:

@@ -84,7 +84,7 @@ def export(
     card = card_of(agent, made, target, source, duration)
     if stack is not None:
         card["frame_stack"] = {"n": stack.n, "padding": "zero" if stack.zeros else "reset"}
-    about = agent.observation_space, agent.action_space, path.stem, *(made_from(agent) or ())
+    about = agent.observation_space, agent.action_space, path.stem, *(agent.origin or ())
     contents, run = form.files(Exportable(made, one, card, *about))
     found = None if run is None else check.compare(one, recording, run)
     if found is not None and not found.difference <= found.allowed:
@@ -216,7 +216,7 @@ def record(
 
 def environment(agent: BaseAgent, make_env: Callable[[], Any] | None) -> tuple[VectorEnv | None, float | None]:
     """Returns a new environment like those of training, None if none can be made, and the duration of its steps."""
-    origin = made_from(agent)
+    origin = agent.origin
     if make_env is None and origin is not None and register(origin[0]):
         make_env = maker(origin[0], **origin[1])
     if make_env is None:
@@ -225,11 +225,6 @@ def environment(agent: BaseAgent, make_env: Callable[[], Any] | None) -> tuple[V
     vector = agent.make_envs(env, 1, seed=0)
     agent.check_spaces(vector, "the environment to record observations in")
     return vector, seconds_per_step(env)
-
-
-def made_from(agent: BaseAgent) -> Any:
-    """Returns the id and the arguments of the environments of an agent, None if they were not made from an id."""
-    return agent.trained_on if agent.run.env is None else agent.run.env.made_from
 
 
 def seconds_per_step(env: Any) -> float | None:

@@ -159,7 +159,7 @@ def header(agent: BaseAgent) -> dict[str, Any]:
 
 def made_from(agent: BaseAgent) -> dict[str, Any] | None:
     """Returns id and keyword arguments of an agent's environments for a header; None if a file may not hold them."""
-    source = agent.trained_on if agent.run.env is None else agent.run.env.made_from
+    source = agent.origin
     if source is None or not is_plain_id(source[0]) or not are_plain(dict(source[1])):
         return None
     return {"env_id": source[0], "env_kwargs": dict(source[1])}

@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rejeu.core.validation import is_finite
+from rejeu.core.validation import coerce, is_finite, number
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,8 @@ class Linear:
     """Share of the run over which the value moves, in (0, 1]."""
 
     def __post_init__(self) -> None:
-        _check_numbers(self)
+        coerce(self, ("start", "end"), number)
+        coerce(self, "fraction", number, above=0, most=1)
 
     def __call__(self, progress: Any) -> Any:
         done = _clip(progress / self.fraction)
@@ -61,9 +62,8 @@ class Exponential:
     """Share of the run over which the value moves, in (0, 1]."""
 
     def __post_init__(self) -> None:
-        _check_numbers(self)
-        if not (self.start > 0 and self.end > 0):
-            raise ValueError(f"an exponential schedule needs positive ends, got start={self.start}, end={self.end}")
+        coerce(self, ("start", "end"), number, above=0)
+        coerce(self, "fraction", number, above=0, most=1)
 
     def __call__(self, progress: Any) -> Any:
         done = _clip(progress / self.fraction)
@@ -161,10 +161,7 @@ def _schedule_of(name: str, value: Any) -> Schedule:
             return Linear(float(value.removeprefix("lin_")))
         if isinstance(value, Mapping) and value.get("schedule") in SCHEDULES:
             given = {key: part for key, part in value.items() if key != "schedule"}
-            if value["schedule"] == "table":
-                return TableSchedule(**given)
-            kind: Any = SCHEDULES[value["schedule"]]
-            return kind(**{key: float(number) for key, number in given.items()})
+            return SCHEDULES[value["schedule"]](**given)
     except (TypeError, ValueError) as error:
         raise type(error)(f"{name}={value!r} is not a schedule: {error}") from None
     if callable(value):
@@ -200,13 +197,6 @@ def to_json(schedule: Any) -> dict[str, Any]:
     """Returns the JSON form that :func:`parse` reads."""
     name = next(key for key, kind in SCHEDULES.items() if isinstance(schedule, kind))
     return {"schedule": name, **asdict(schedule)}
-
-
-def _check_numbers(schedule: Any) -> None:
-    if not (math.isfinite(schedule.start) and math.isfinite(schedule.end)):
-        raise ValueError(f"start={schedule.start} and end={schedule.end} must be finite")
-    if not 0 < schedule.fraction <= 1:
-        raise ValueError(f"fraction={schedule.fraction} must be above 0 and at most 1")
 
 
 def _clip(done: Any) -> Any:

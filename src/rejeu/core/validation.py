@@ -9,6 +9,7 @@ import inspect
 import itertools
 import math
 import numbers
+import sys
 import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache
@@ -61,10 +62,7 @@ def whole_seed(seed: Any) -> int:
 
 def is_finite(value: float) -> bool:
     """Returns whether a number is finite as a float; an integer of 400 digits is not."""
-    try:
-        return math.isfinite(value)
-    except OverflowError:
-        return False
+    return abs(value) <= sys.float_info.max
 
 
 def flag(key: str, value: Any) -> bool:

@@ -24,7 +24,7 @@ from gymnasium import spaces
 from jax import Array
 from numpy.typing import ArrayLike
 
-from rejeu.core.validation import assign
+from rejeu.core.validation import assign, coerce, number
 from rejeu.exploration.parameter_space import ParameterNoise
 
 PerDimension = Any
@@ -73,7 +73,10 @@ class ActionNoise(ABC):
 
     mean: tuple[float, ...]
     sigma: tuple[float, ...]
-    _by_hand: _ByHand | None = None
+    _rng: np.random.Generator | None = None
+    """Of :meth:`__call__`."""
+    _state: Any = None
+    """That of :meth:`__call__`; None at the start of an episode."""
 
     @abstractmethod
     def init(self, n_envs: int) -> Any:
@@ -99,10 +102,12 @@ class ActionNoise(ABC):
 
         The result is not clipped: use ``np.clip(action + noise(action), -1, 1)``, scaled to the environment's range.
         """
-        if self._by_hand is None:
-            self.reset()
-        assert self._by_hand is not None
-        return self._by_hand(self, action)
+        rng = self._rng or np.random.default_rng()
+        before = np.broadcast_to(np.asarray(action, np.float32), (1, len(self.mean)))
+        state = self.init(1) if self._state is None else self._state  # NumPy does not start JAX's device
+        state, after = self.advance(state, before, rng.standard_normal(before.shape, np.float32))
+        assign(self, _rng=rng, _state=state)
+        return (after - before)[0]
 
     def reset(self, seed: int | None = None) -> None:
         """Resets the process of :meth:`__call__` to the start of an episode.
@@ -110,24 +115,7 @@ class ActionNoise(ABC):
         Args:
             seed: also restarts its random numbers; None lets them continue.
         """
-        if self._by_hand is None or seed is not None:
-            assign(self, _by_hand=_ByHand(np.random.default_rng(seed)))
-        assert self._by_hand is not None
-        self._by_hand.state = None
-
-
-class _ByHand:
-    """A process stepped by hand, in NumPy, which does not start JAX's device."""
-
-    def __init__(self, rng: np.random.Generator) -> None:
-        self.rng = rng
-        self.state: Any = None
-
-    def __call__(self, noise: Any, action: ArrayLike) -> np.ndarray:
-        state = noise.init(1) if self.state is None else self.state
-        before = np.broadcast_to(np.asarray(action, np.float32), (1, len(noise.mean)))
-        self.state, after = noise.advance(state, before, self.rng.standard_normal(before.shape, np.float32))
-        return (after - before)[0]
+        assign(self, _rng=self._rng if seed is None else np.random.default_rng(seed), _state=None)
 
 
 @dataclass(frozen=True)
@@ -203,10 +191,8 @@ class OrnsteinUhlenbeckActionNoise(ActionNoise):
             if getattr(self, key) is None:
                 assign(self, **{key: (0.0,)})
         _as_tuples(self, "mean", "sigma", "initial_noise", "drift", "repulsive")
-        if not 0 <= self.theta < math.inf:
-            raise ValueError(f"{type(self).__name__}: theta={self.theta!r} must be a number of at least 0")
-        if not 0 < self.dt < math.inf:
-            raise ValueError(f"{type(self).__name__}: dt={self.dt!r} must be a positive number")
+        coerce(self, "theta", number, least=0)
+        coerce(self, "dt", number, above=0)
         if min(self.repulsive) < 0:
             raise ValueError(f"{type(self).__name__}: repulsive={self.repulsive} must not be negative")
 
@@ -303,14 +289,14 @@ def read(text: str, n: int) -> Noise:
     settings: dict[str, Any] = {} if kind is ParameterNoise else {"mean": [0.0] * n, first: 0.1}
     known = [field.name for field in dataclasses.fields(kind) if field.name != "mean"]
     for i, part in enumerate(filter(None, (part.strip() for part in found[2].split(",")))):
-        name, equals, number = part.partition("=")
-        name, number = (name.strip(), number) if equals else (first, name)
+        name, equals, value = part.partition("=")
+        name, value = (name.strip(), value) if equals else (first, name)
         if name not in known or (not equals and i > 0):
             raise TypeError(f"action_noise={text!r} has no setting {part!r}; {found[1]} has {', '.join(known)}")
         try:
-            settings[name] = float(number)
+            settings[name] = float(value)
         except ValueError:
-            raise ValueError(f"action_noise={text!r}: {number.strip()!r} is not a number") from None
+            raise ValueError(f"action_noise={text!r}: {value.strip()!r} is not a number") from None
         if name == "adaptation_interval":
             settings[name] = int(settings[name])
     return kind(**settings)

@@ -101,8 +101,8 @@ def offline(
     check_state(run, learner)
     start_clock(run)
     while last is None or run.step < last:
-        due = STEPS_OFFLINE - run.step % STEPS_OFFLINE
-        n = due if last is None else min(due, last - run.step)
+        n = STEPS_OFFLINE - run.step % STEPS_OFFLINE
+        n = n if last is None else min(n, last - run.step)
         learn_from(run, learner, config, run.replay, [progress(run.step + i - first) for i in range(n)])
         run.step += n
         run.monitor.read()
@@ -183,10 +183,10 @@ def choose(run: Run, learner: Learner, config: OffPolicyConfig, clock: Clock, wh
     """
     random = None
     if run.step < config.learning_starts:
-        mask = unmasked(run.obs)[1]
-        mask = mask if mask is None or which is None else mask[which]
+        allowed = unmasked(run.obs)[1]
+        allowed = allowed if allowed is None or which is None else allowed[which]
         n = run.env.n_envs if which is None else len(which)
-        random = random_action(run.env.action_space, n, run.rng, mask)
+        random = random_action(run.env.action_space, n, run.rng, allowed)
         if learner.algorithm.recall is None:
             return random, len(run.monitor)
     if learner.algorithm.recall is not None:
