@@ -14,17 +14,17 @@ import gymnasium as gym
 
 from rejeu.core import validation
 from rejeu.envs import functional
-from rejeu.envs.base import Seed, Step, VectorEnv, checked_seed
-from rejeu.envs.envpool import EnvPool, check_envpool_knows, envpool_knows
+from rejeu.envs.base import Seed, Step as Step, VectorEnv as VectorEnv, checked_seed
+from rejeu.envs.envpool import EnvPool as EnvPool, check_envpool_knows, envpool_knows
 from rejeu.envs.functional.protocol import FunctionalEnv
 from rejeu.envs.functional.vector import JaxVector
-from rejeu.envs.gymnasium_vector import GymnasiumVector
-from rejeu.envs.in_process import InProcess
+from rejeu.envs.gymnasium_vector import GymnasiumVector as GymnasiumVector
+from rejeu.envs.in_process import InProcess as InProcess
 from rejeu.envs.registry import maker, register
 from rejeu.envs.validation import environment_fault
 from rejeu.envs.workers.pool import TIMEOUT, check_options
 from rejeu.envs.workers.remote import Actors
-from rejeu.envs.workers.vector import InWorkers
+from rejeu.envs.workers.vector import InWorkers as InWorkers
 
 KINDS = "an id, a Gymnasium environment, a function that makes one or a vector environment"
 """What the functions that make vector environments take."""
@@ -34,18 +34,6 @@ WORKERS: tuple[Backend, ...] = ("gymnasium-async", "ray")
 """Backends whose environments are in worker processes."""
 ENVPOOL_FROM = 4
 """Smallest number of environments for which ``backend="auto"`` prefers EnvPool."""
-
-__all__ = [
-    "Backend",
-    "EnvPool",
-    "GymnasiumVector",
-    "InProcess",
-    "InWorkers",
-    "Step",
-    "VectorEnv",
-    "make_vec",
-    "make_vector",
-]
 
 
 Adapter = Callable[[Any, Any], VectorEnv]

@@ -22,21 +22,13 @@ from rejeu.core.algorithm import Masked
 from rejeu.core.errors import BadEnvironmentError
 from rejeu.core.spaces import Leaf
 from rejeu.envs import functional, snapshot
-from rejeu.envs.base import Seed
+from rejeu.envs.base import Seed, Step, VectorEnv
+from rejeu.envs.envpool import EnvPool
 from rejeu.envs.functional.protocol import FunctionalEnv
 from rejeu.envs.functional.vector import JaxVector, goal_functions
 from rejeu.envs.goals import GoalFunctions, attribute
-from rejeu.envs.make import (
-    Backend,
-    EnvPool,
-    InProcess,
-    Step,
-    VectorEnv,
-    WorkerOptions,
-    adapter_of,
-    check_workers,
-    make_vector,
-)
+from rejeu.envs.in_process import InProcess
+from rejeu.envs.make import Backend, WorkerOptions, adapter_of, check_workers, make_vector
 from rejeu.envs.registry import maker
 from rejeu.envs.validation import id_of
 from rejeu.envs.workers.pool import TIMEOUT

@@ -247,20 +247,3 @@ def find(env_id: str, algorithm: str | None = None) -> Preset | None:
         return found
     twin = find(TWINS[env_id], algorithm)
     return twin and dataclasses.replace(twin, env_id=env_id, backend="jax", source=f"the preset of {twin.env_id}")
-
-
-__all__ = [
-    "ALGORITHM_FOR",
-    "ALL",
-    "Preset",
-    "PresetResult",
-    "default",
-    "every",
-    "find",
-    "find_result",
-    "named",
-    "read",
-    "register",
-    "results",
-    "write",
-]
