@@ -185,7 +185,7 @@ def test_progress_bar_prints_a_line_every_ten_seconds_without_a_terminal(monkeyp
 def test_progress_bar_draws_a_bar_on_a_terminal():
     console = Console(file=io.StringIO(), force_terminal=True, width=100, _environ={"TERM": "xterm"})
     text = shown(100, None, range(1, 101), console)
-    assert "━" in text
+    assert "█" in text
     assert "100%" in text
 
 

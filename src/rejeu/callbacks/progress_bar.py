@@ -29,7 +29,7 @@ RATE_SECONDS = 10.0
 
 
 BAR_WIDTH = 40
-"""Characters of the bar in a notebook."""
+"""Characters of the bar."""
 
 
 class _Mark(NamedTuple):
@@ -65,18 +65,16 @@ class ProgressBar(TrainingCallback):
             taken: steps of a resumed run that were taken before.
             spent: time that it had taken before, in seconds.
         """
-        from rich.progress import BarColumn, Progress as RichProgress, TaskProgressColumn, TextColumn
+        from rich.live import Live
 
         self.n_steps, self.seconds = n_steps, seconds
         self._console = formatting.console() if console is None else console
         self._display = formatting.Display() if self._console.is_jupyter else None
-        self._animated = self._console.is_terminal and not self._console.is_dumb_terminal
+        is_animated = self._console.is_terminal and not self._console.is_dumb_terminal
+        self._live = Live(console=self._console, auto_refresh=False) if is_animated else None
         self._period = (
-            NOTEBOOK_SECONDS if self._display is not None else REFRESH_SECONDS if self._animated else LINE_SECONDS
+            NOTEBOOK_SECONDS if self._display is not None else REFRESH_SECONDS if is_animated else LINE_SECONDS
         )
-        columns = (BarColumn(bar_width=None), TaskProgressColumn(), TextColumn("{task.description}", markup=False))
-        self._bar = RichProgress(*columns, console=self._console, auto_refresh=False, expand=True)
-        self._task = self._bar.add_task("", total=1.0)
         self._began = xla.clock()
         self._refresh_at = -math.inf
         self._taken, self._spent = taken, spent
@@ -95,7 +93,7 @@ class ProgressBar(TrainingCallback):
         """Notes the step at which training begins, since the bar is first called after a turn, or after many at once."""
         self._step_before = agent.run.step
         xla.on_compile = lambda event, seconds: (
-            self._show_compiling() if seconds > LONG_TRACE and "trace" in event else None
+            self._show("compiling") if seconds > LONG_TRACE and "trace" in event else None
         )
 
     def __call__(self, agent: Any, progress: Progress) -> None:
@@ -111,24 +109,28 @@ class ProgressBar(TrainingCallback):
         """Closes it."""
         self.close()
 
-    def _show_compiling(self) -> None:
-        """Says why nothing moves when a large function has been traced; the next refresh replaces it."""
-        if self._animated:
-            self._bar.start()
-            self._bar.update(self._task, description="compiling")
-            self._bar.refresh()
+    def _show(self, *texts: str, share: float | None = None) -> None:
+        """Shows texts below a bar, where that can be replaced by the next, else on a line."""
+        from rich.text import Text
+
+        below = "\n".join([*([] if share is None else [bar(share)]), *texts])
+        if self._live is not None:
+            self._live.start()
+            self._live.update(Text(below), refresh=True)
         elif self._display is not None:
-            self._display.show("compiling")
+            self._display.show(below)
         else:
-            self._console.print("compiling", highlight=False)
+            line = ("" if share is None else f"{share:4.0%}  ") + " · ".join(texts)
+            self._console.print(line, soft_wrap=True, highlight=False, markup=False)
+            self._console.file.flush()
 
     def close(self) -> None:
         """Shows the last step and releases the terminal."""
         xla.on_compile = lambda event, seconds: None
         if self._latest is not None and self._latest[1] != self._shown_step:
             self._refresh(*self._latest, xla.clock())
-        if self._animated:
-            self._bar.stop()
+        if self._live is not None:
+            self._live.stop()
 
     def _start(self, agent: Any, progress: Progress, now: float) -> None:
         before = self._step_before
@@ -136,9 +138,7 @@ class ProgressBar(TrainingCallback):
             before = step_before(agent, progress, None if self.n_steps is None else self.n_steps - self._taken)
         self._first_step = before - self._taken
         self._marks.append(_Mark(self._began, before, agent.seconds))
-        if self._animated:
-            self._bar.start()
-        elif self._display is None:
+        if self._live is None and self._display is None:
             self._refresh_at = now + LINE_SECONDS
 
     def _refresh(self, agent: Any, step: int, now: float) -> None:
@@ -162,16 +162,7 @@ class ProgressBar(TrainingCallback):
             done, self.n_steps, rate, _mean(e["r"] for e in agent.ep_info_buffer), _mean(agent.ep_success_buffer),
             min(left, default=math.nan),
         )  # fmt: skip
-        spent = time_spent(then.seconds, agent.seconds)
-        if self._animated:
-            self._bar.update(self._task, completed=share, description="\n".join(filter(None, (text, spent))))
-            self._bar.refresh()
-        elif self._display is not None:
-            self._display.show("\n".join(filter(None, (bar(share), text, spent))))
-        else:
-            line = " · ".join(filter(None, (text, spent)))
-            self._console.print(f"{share:4.0%}  {line}", soft_wrap=True, highlight=False, markup=False)
-            self._console.file.flush()
+        self._show(*filter(None, (text, time_spent(then.seconds, agent.seconds))), share=share)
 
 
 def bar(share: float) -> str:
