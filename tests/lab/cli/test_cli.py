@@ -278,7 +278,7 @@ def test_help_of_train_begins_with_what_people_need_first_and_has_five_groups(ca
 
 def test_set_takes_dotted_names_numbers_lists_and_words():
     argv = ['train_freq=[1,"episode"]', "learning_rate=1e-3", "policy_kwargs.net_arch=[64,64]", "ent_coef=auto_0.1"]
-    assert config.apply(argv, {"policy_kwargs": {"layer_norm": True}, "gamma": 0.9}) == {
+    assert config.merged(config.assigned(argv), {"policy_kwargs": {"layer_norm": True}, "gamma": 0.9}) == {
         "policy_kwargs": {"layer_norm": True, "net_arch": [64, 64]},
         "gamma": 0.9,
         "train_freq": [1, "episode"],
@@ -288,9 +288,11 @@ def test_set_takes_dotted_names_numbers_lists_and_words():
 
 
 def test_set_understands_pythons_false_and_leaves_the_preset_as_it_was():
-    assert config.apply(["policy_kwargs.layer_norm=False"], {}) == {"policy_kwargs": {"layer_norm": False}}
+    assert config.merged(config.assigned(["policy_kwargs.layer_norm=False"]), {}) == {
+        "policy_kwargs": {"layer_norm": False}
+    }
     preset = rejeu.agents.presets.find("parking-v0")
-    config.apply(["policy_kwargs.net_arch=[1]"], preset.hyperparameters)
+    config.merged(config.assigned(["policy_kwargs.net_arch=[1]"]), preset.hyperparameters)
     assert preset.hyperparameters["policy_kwargs"]["net_arch"] != [1]
 
 

@@ -347,8 +347,8 @@ def test_clone(spy, tmp_path):
     read, begun = spy(demonstrations, "read", shown), spy(clone, "begin", session)
     cloned, offline, taught = (spy(demonstrations, name) for name in ("clone", "learn_offline", "dagger"))
     spy(demonstrations, "check"), spy(demonstrations, "keeping_policy")
-    found = spy(clone, "find_model", "model")
-    spy(clone, "load", agent := mock.Mock(**{"learner.algorithm.recall": None}))
+    found = spy(models, "find_model", "model")
+    spy(models, "load", agent := mock.Mock(**{"learner.algorithm.recall": None}))
     spy(clone.environment, "recorded_id", TYPED)
     argv = ["clone", "shown", "--env", TYPED, "--algo", "SAC", "--set", "gamma=0.5", "--updates", "7", "--seed", "5"]
     argv += ["--learning-rate", "0.1", "--evaluate-episodes", "6", "--device", "cpu", "--no-report", "--no-video"]

@@ -89,7 +89,7 @@ def test_command_has_wrappers_nulls_and_long_values(folder):
     words = shlex.split(read_run(folder).command)
     assert words[:3] == ["rejeu", "train", "my_env:Walk-v0"]
     assert [words[i + 1] for i, word in enumerate(words) if word == "--wrapper"] == ["my_env:Shaped", "a b"]
-    given = config.apply(words[words.index("--set") + 1 :], {})
+    given = config.merged(config.assigned(words[words.index("--set") + 1 :]), {})
     assert (given["max_grad_norm"], given["action_noise"]) == (None, noise)
 
 

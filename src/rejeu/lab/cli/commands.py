@@ -216,7 +216,7 @@ class Tune(EnvironmentOptions):
     """auto, envpool, gymnasium, gymnasium-async or jax; by default the preset's, else auto."""
     preset: Annotated[Path | None, Shown("FILE"), Topic.TRAINING] = None
     """Where the search starts, and the other hyperparameters; by default rejeu's preset, else the algorithm's defaults."""
-    assignments: Annotated[Assignments, Shown("NAME=VALUE ...", "set")] = ()
+    hyperparameters: Annotated[dict[str, Any], Shown("NAME=VALUE ...", "set")] = field(default_factory=dict)
     """Hyperparameters to set instead of searching them, as for rejeu train."""
     search: Annotated[Assignments, Shown("NAME=LOW..HIGH ...")] = ()
     """Other ranges, or further hyperparameters: learning_rate=1e-4..1e-2 "batch_size=[64,128]" tau=log:0.001..0.1"""

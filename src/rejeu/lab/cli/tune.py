@@ -14,7 +14,7 @@ from rejeu.lab.cli.environment import Environment
 from rejeu.lab.cli.output import echo
 from rejeu.lab.experiments import space, study as studies, study_plan as plans, tune as tuning
 from rejeu.lab.experiments.study import Study, StudyFolder
-from rejeu.lab.runs.config import apply
+from rejeu.lab.runs.config import merged
 from rejeu.logs.formatting import counted, quoted
 
 OF_THE_PLAN = (
@@ -41,7 +41,7 @@ def run_tune(arguments: Tune) -> tuple[int, dict[str, Any]]:
         env_kwargs=made.run.env_kwargs,
         wrappers=made.run.wrappers,
         preset=preset,
-        fixed=apply(arguments.assignments, {}),
+        fixed=merged(arguments.hyperparameters, {}),
         search=read_search(arguments.search, algorithm),
         n_envs=arguments.envs,
         **{name: getattr(arguments, name) for name in OF_THE_PLAN},

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
@@ -99,30 +100,15 @@ def find(path: Path) -> list[Path]:
         return [path]
     if not path.is_dir():
         raise FileNotFoundError(f"there is no run folder {shown(path, 300)}")
-    folders: list[Path] = []
-    level = [path]
-    for _ in range(MAX_DEPTH + 1):
-        below: list[Path] = []
-        for folder in level:
-            if is_run(folder):
-                folders.append(folder)
-            else:
-                below += subfolders(folder)
-        level = below[: MAX_RUNS * 2]
-    return sorted(folders)[:MAX_RUNS]
-
-
-def subfolders(folder: Path) -> list[Path]:
-    """Returns the folders in a folder that may hold runs."""
-    try:
-        inside = sorted(folder.iterdir())
-    except OSError:
-        return []
-    return [
-        one
-        for one in inside
-        if one.name not in SKIPPED and one.name[0] != "." and not one.is_symlink() and one.is_dir()
-    ]
+    found: list[Path] = []
+    for root, names, _ in os.walk(path):
+        folder = Path(root)
+        if is_run(folder):
+            found.append(folder)
+        depth = len(folder.relative_to(path).parts)
+        is_searched = folder not in found[-1:] and depth < MAX_DEPTH and len(found) < MAX_RUNS
+        names[:] = sorted(name for name in names if name not in SKIPPED and name[0] != ".") if is_searched else []
+    return sorted(found)
 
 
 def is_ours(folder: Path) -> bool:

@@ -25,13 +25,11 @@ from rejeu.agents import presets
 from rejeu.algorithms.catalog import CATALOG
 from rejeu.checkpoints.run_folder import RunFolder, newest_inside, newest_step
 from rejeu.core.errors import CheckpointError
-from rejeu.core.records import Malformed, convert, is_deep, parse_json, shown
+from rejeu.core.records import Malformed, convert, parse_json, shown
 from rejeu.lab.runs.config import MAX_BYTES, RunConfig
 from rejeu.logs.formatting import quoted
 from rejeu.logs.tables import EMPTY, Table, flat, read_bytes, read_table
 
-MAX_DEPTH = 20
-"""Upper limit on the levels of a ``config.json``."""
 MAX_WARNINGS = 100
 MAX_WARNINGS_BYTES = 2**16
 MAX_VIDEOS = 1000
@@ -193,8 +191,6 @@ def read_config(path: Path) -> tuple[RunConfig, dict[str, str | None], list[str]
     """Returns the description of a run, the versions of what ran, and notes about what is missing or damaged."""
     try:
         content = parse_json(read_bytes(path, MAX_BYTES))
-        if is_deep(content, MAX_DEPTH):
-            raise Malformed("it is nested too deeply")
         config, versions = convert(content, RunConfig), convert(content.get("versions", {}), dict[str, str | None])
         env, algorithm = shown(config.env, MAX_NAME), shown(config.algorithm or "", MAX_NAME)
         return replace(config, env=env, algorithm=algorithm), versions, []

@@ -79,11 +79,6 @@ def merged(values: Mapping[str, Any], before: Mapping[str, Any], option: str = "
     return result
 
 
-def apply(assignments: Iterable[str], before: Mapping[str, Any], option: str = "--set") -> dict[str, Any]:
-    """Returns ``before`` with the assignments made; see :func:`assigned` and :func:`merged`."""
-    return merged(assigned(assignments, option), before, option)
-
-
 def assignment_words(option: str, values: Mapping[str, Any]) -> list[str]:
     """Returns values as an option of the command line.
 

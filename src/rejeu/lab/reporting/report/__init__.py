@@ -44,14 +44,16 @@ def write_report(
     """
     if isinstance(runs, Agent):
         out = Path("report.html" if out is None else out)
-        return write_page([record(runs, out, [*evaluations])], out)
-    paths = [Path(runs)] if isinstance(runs, str | Path) else [Path(run) for run in runs]
-    if not 1 <= len(paths) <= MAX_RUNS:
-        raise ValueError(f"a report shows 1 to {MAX_RUNS} runs, got {len(paths)}")
-    read = [read_run(path) for path in paths]
-    if out is None:
-        out = RunFolder(read[0].path).report if len(read) == 1 else Path("report.html")
-    return write_page(read, Path(out))
+        read = [record(runs, out, [*evaluations])]
+    else:
+        paths = [Path(runs)] if isinstance(runs, str | Path) else [Path(run) for run in runs]
+        if not 1 <= len(paths) <= MAX_RUNS:
+            raise ValueError(f"a report shows 1 to {MAX_RUNS} runs, got {len(paths)}")
+        read = [read_run(path) for path in paths]
+        usual = RunFolder(read[0].path).report if len(read) == 1 else Path("report.html")
+        out = usual if out is None else Path(out)
+    parts = sections.build(read, out.absolute().parent)
+    return atomic.write(out, page.render("report.html", parts.data, title=sections.title_of(read), runs=parts.runs))
 
 
 def record(agent: Agent, path: Path, evaluations: Sequence[tuple[int, Evaluation]]) -> RunSummary:
@@ -83,20 +85,3 @@ def given_config(agent: Agent) -> Any:
     default = type(config)()
     is_default = config.policy_kwargs == configs.with_widths(default, agent.obs_leaves).policy_kwargs
     return dataclasses.replace(config, policy_kwargs=default.policy_kwargs) if is_default else config
-
-
-def write_page(runs: Sequence[RunSummary], out: Path) -> Path:
-    """Writes the page of runs that were read or made, and returns its path."""
-    return atomic.write(out, render(runs, out.absolute().parent))
-
-
-def render(runs: Sequence[RunSummary], folder: Path | None) -> str:
-    """Returns the page as text.
-
-    Args:
-        runs: what is shown.
-        folder: where the page will be, for links to videos that are not embedded; None for no links.
-    """
-    parts = sections.build(runs, folder)
-    title = sections.title_of(runs)
-    return page.render("report.html", parts.data, title=title, runs=parts.runs)
