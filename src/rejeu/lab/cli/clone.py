@@ -9,16 +9,16 @@ from typing import Any
 import gymnasium as gym
 
 from rejeu import demonstrations
-from rejeu.agents import Agent, load
+from rejeu.agents import Agent
 from rejeu.callbacks import Checkpoint
 from rejeu.callbacks.base import stateful
-from rejeu.checkpoints.run_folder import find_model
 from rejeu.core.interrupt import Interrupt
 from rejeu.demonstrations import Demonstrations
 from rejeu.envs.registry import register
 from rejeu.lab.cli import environment
 from rejeu.lab.cli.commands import Clone, Train
 from rejeu.lab.cli.environment import Environment
+from rejeu.lab.cli.models import agent_of
 from rejeu.lab.cli.output import Stopwatch, echo
 from rejeu.lab.cli.session import Session
 from rejeu.lab.cli.train import begin
@@ -116,10 +116,7 @@ def expert_of(run: Path, arguments: Clone, made: Environment) -> Agent:
     Raises:
         ValueError: if it was trained on another environment, or has a memory.
     """
-    model = find_model(run, arguments.which)
-    if (trained_on := environment.recorded_id(model)) != made.env_id:
-        raise ValueError(f"--expert {run}: that agent plays {trained_on}, not {made.env_id}")
-    agent = load(model, device=arguments.device)
+    agent = agent_of("--expert", run, arguments.which, made, arguments.device)
     if agent.learner.algorithm.recall is not None:
         raise ValueError(
             f"--expert {run}: {agent.name} has a memory, and labels single steps; use one without a memory"

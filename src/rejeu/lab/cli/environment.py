@@ -176,14 +176,12 @@ class Environment:
         Raises:
             ValueError: for ``envpool`` with wrappers or keyword arguments, which it does not take.
         """
-        if not self.wrappers:
-            return make_vector(
-                self.env_id, n_envs, backend, seed, **workers._asdict(), **self.run.env_kwargs  # type: ignore[arg-type]
-            )  # fmt: skip
-        if backend == "envpool":
+        if self.wrappers and backend == "envpool":
             raise ValueError("the envpool backend takes no wrappers; use --backend gymnasium")
-        make = Wrapped(maker(self.env_id, **self.run.env_kwargs), self.wrappers)
-        return make_vector(make, n_envs, backend, seed, **workers._asdict())  # type: ignore[arg-type]
+        kwargs = self.run.env_kwargs
+        make = Wrapped(maker(self.env_id, **kwargs), self.wrappers) if self.wrappers else self.env_id
+        of_env = {} if self.wrappers else kwargs
+        return make_vector(make, n_envs, backend, seed, **workers._asdict(), **of_env)  # type: ignore[arg-type]
 
     def rendering(self) -> gym.Env:
         """Returns a new one that renders to arrays.

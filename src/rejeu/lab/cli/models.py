@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from contextlib import closing, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
-from rejeu.agents import load
+from rejeu.agents import Agent, load
 from rejeu.agents.exporting import export
 from rejeu.checkpoints.run_folder import RunFolder, find_model
 from rejeu.core import devices
@@ -15,6 +15,7 @@ from rejeu.core.errors import CheckpointError
 from rejeu.export import FORMATS, target_of
 from rejeu.lab.cli import environment
 from rejeu.lab.cli.commands import Evaluate, Export, Import, Play, Pull, Push, Record, Watch
+from rejeu.lab.cli.environment import Environment
 from rejeu.lab.cli.output import echo
 from rejeu.lab.runs.config import value
 from rejeu.logs.formatting import counted, quoted
@@ -123,13 +124,8 @@ def run_play(arguments: Play) -> tuple[int, dict[str, Any]]:
     from rejeu.teaching.play.keys import full_name
 
     made = environment.from_arguments(full_name(arguments.env), arguments)
-    agent = None
-    if arguments.against is not None:
-        model = find_model(arguments.against, arguments.which)
-        trained_on = environment.recorded_id(model)
-        if trained_on != made.env_id:
-            raise ValueError(f"--against {arguments.against}: that agent plays {trained_on}, not {made.env_id}")
-        agent = load(model)
+    against = arguments.against
+    agent = None if against is None else agent_of("--against", against, arguments.which, made)
     game = play(
         made.make,
         keys=parse_keys(arguments.keys),
@@ -143,6 +139,18 @@ def run_play(arguments: Play) -> tuple[int, dict[str, Any]]:
     if (recording := game.players[0].recording) is not None:
         echo(recording)
     return 0, as_dict(game)
+
+
+def agent_of(option: str, run: Path, which: Literal["best", "last"], made: Environment, device: str = "auto") -> Agent:
+    """Returns the agent of a run folder or model file that an option names.
+
+    Raises:
+        ValueError: if it was trained on another environment.
+    """
+    model = find_model(run, which)
+    if (trained_on := environment.recorded_id(model)) != made.env_id:
+        raise ValueError(f"{option} {run}: that agent plays {trained_on}, not {made.env_id}")
+    return load(model, device=device)
 
 
 def parse_keys(assignments: Iterable[str]) -> dict[str, Any]:

@@ -177,18 +177,16 @@ def rescaled(old: Any, value: Any) -> Any:
     return value
 
 
-def start_of(value: Any) -> Any:
-    """Returns the starting value of a schedule, and any other value as it is."""
-    return value["start"] if isinstance(value, Mapping) and "schedule" in value else value
-
-
 def values_at(config: Mapping[str, Any], space: SearchSpace) -> dict[str, Any]:
-    """Returns the values of a space's hyperparameters in a configuration as JSON, as far as it has them."""
+    """Returns the values of a space's hyperparameters in a configuration as JSON, as far as it has them.
+
+    That of a schedule is its start.
+    """
     found = {}
     for name in space:
         value: Any = config
         for key in name.split("."):
             value = value.get(key) if isinstance(value, Mapping) else None
         if value is not None:
-            found[name] = start_of(value)
+            found[name] = value["start"] if isinstance(value, Mapping) and "schedule" in value else value
     return found

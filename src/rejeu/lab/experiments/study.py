@@ -115,15 +115,17 @@ class Study:
     def take(self) -> tuple[optuna.Trial, int] | None:
         """Returns the next trial with its index, locks it, and writes its preset; None if no trial is left to begin.
 
-        Trials whose process has died come first.
+        Trials whose process has died come first. The sampler, TPE, expects nothing of trials that still run.
         """
+        from optuna.samplers import TPESampler
+
         with self.folder.lock(), readable(self.folder.journal):
             self.enter_interrupted()
             index = self.next_index()
             if index is None:
                 return None
             space = self.plan.search_space
-            self.optuna_study.sampler = make_sampler(self.plan.sampler_seed(index))
+            self.optuna_study.sampler = TPESampler(seed=self.plan.sampler_seed(index), constant_liar=True)
             trial = self.optuna_study.ask(spaces.distributions(space))
             trial.set_user_attr(INDEX, index)
             lock = hold(self.folder.trial(index) / LOCK)
@@ -309,13 +311,6 @@ def require() -> None:
         import optuna  # noqa: F401 - only whether it is there
     except ImportError:
         raise MissingExtra("rejeu tune", "optuna", "tune") from None
-
-
-def make_sampler(seed: int) -> optuna.samplers.BaseSampler:
-    """Returns the sampler of one trial: TPE, which expects nothing of trials that still run."""
-    from optuna.samplers import TPESampler
-
-    return TPESampler(seed=seed, constant_liar=True)
 
 
 def make_pruner(plan: StudyPlan) -> optuna.pruners.BasePruner:

@@ -191,9 +191,7 @@ def choose_space(
         if name not in own:
             raise ValueError(validation.unknown_name(name, own, f"the search space of {algorithm}"))
     own = {name: one for name, one in own.items() if not only or name in only}
-    for name, dimension in own.items():
-        for value in dimension.ends():
-            validation.build(config_class, spaces.applied(values, {name: value}))
+    check_ends(config_class, values, own)
     if not own:
         raise ValueError(f"there is nothing to search for {algorithm}; give a range, such as learning_rate=1e-4..1e-2")
     return own
@@ -218,10 +216,14 @@ def read(path: Path) -> StudyPlan:
 
 def check(plan: StudyPlan, path: Path) -> None:
     """Raises ``ValueError`` or ``TypeError`` if the algorithm of a plan from a file does not take its hyperparameters."""
-    config_class = agent_of_file(plan.default.algorithm, path).algorithm.Config
-    for name, dimension in plan.search_space.items():
+    check_ends(agent_of_file(plan.default.algorithm, path).algorithm.Config, plan.fixed, plan.search_space)
+
+
+def check_ends(config_class: type, values: Mapping[str, Any], space: SearchSpace) -> None:
+    """Raises ``ValueError`` or ``TypeError`` if an extreme value of a space is invalid, where the others are ``values``."""
+    for name, dimension in space.items():
         for value in dimension.ends():
-            validation.build(config_class, spaces.applied(plan.fixed, {name: value}))
+            validation.build(config_class, spaces.applied(values, {name: value}))
 
 
 def default_values(plan: StudyPlan) -> dict[str, Any]:

@@ -75,6 +75,11 @@ def next_mode(button: ui.button, dark: ui.dark_mode) -> None:
     button.props(f"icon={MODES[dark.value]}")
 
 
+def action(text: str, icon: str | None, on_click: Callable[..., object]) -> ui.button:
+    """Makes a small button."""
+    return ui.button(text, icon=icon, on_click=on_click).props("outline dense no-caps padding='2px 10px'")
+
+
 def follow(studio: Studio, show: Callable[[], object], every: float = EVERY) -> None:
     """Calls a function now, and again whenever the rows of the studio have changed, as long as the page is open."""
     seen = -1

@@ -23,7 +23,7 @@ from rejeu.lab.runs import requests
 from rejeu.lab.studio import processes
 from rejeu.lab.studio.branch import open_form
 from rejeu.lab.studio.figures import Figure
-from rejeu.lab.studio.layout import EVERY, address
+from rejeu.lab.studio.layout import EVERY, action, address
 from rejeu.lab.studio.player import BEST, CURRENT, LiveEpisode, LivePlayer, lower_priority
 from rejeu.lab.studio.runs import COLORS
 from rejeu.lab.studio.screen import CSS, Screen
@@ -160,22 +160,14 @@ def show_actions(page: RunPage, row: Row) -> None:
     folder = RunFolder(page.path)
     is_alone = not (page.path.parent / HIDDEN).is_dir()  # a sweep would continue a run that stops
     if row["state"] == "running" and page.is_ours and is_alone:
-        ui.button("Stop", icon="stop", on_click=lambda event: stop(event.sender, folder)).props(
-            "outline dense no-caps padding='2px 10px'"
-        )
+        action("Stop", "stop", lambda event: stop(event.sender, folder))
     if row["state"] in ("paused", "interrupted", "crashed") and page.is_ours:
         words, text = ["resume", str(page.path)], "The run continues from its newest checkpoint."
-        resume = ui.button(
-            "Resume", icon="play_arrow", on_click=lambda event: command(event.sender, words, page.path, text)
-        )
-        resume.props("outline dense no-caps padding='2px 10px'")
+        action("Resume", "play_arrow", lambda event: command(event.sender, words, page.path, text))
     if page.is_ours:
         play = address("/play", agent=page.name)
-        ui.button("Play", icon="sports_esports", on_click=lambda: ui.navigate.to(play)).props(
-            "outline dense no-caps padding='2px 10px'"
-        )
-        branch = ui.button("Branch", icon="call_split", on_click=lambda: open_form(page.studio, page.name, page.path))
-        branch.props("outline dense no-caps padding='2px 10px'")
+        action("Play", "sports_esports", lambda: ui.navigate.to(play))
+        action("Branch", "call_split", lambda: open_form(page.studio, page.name, page.path))
 
 
 def stop(button: Any, folder: RunFolder) -> None:
@@ -284,7 +276,7 @@ class LiveView:
         with ui.row().classes("items-center w-full no-wrap gap-4"):
             self.slider = ui.slider(min=0, max=0, value=0, on_change=self.chosen).props("label-always=false")
             self.label = ui.label().classes("quiet").style("min-width: 9em")
-            ui.button("best", on_click=lambda: self.choose(BEST)).props("outline dense no-caps padding='2px 10px'")
+            action("best", None, lambda: self.choose(BEST))
         self.player = LivePlayer(page.path, page.studio.given(page.name), self.screen.show)
         self.screen.on_leave = self.player.close
         ui.add_body_html(SEEN)
@@ -347,10 +339,8 @@ class Episodes:
         with ui.expansion("Episodes", value=True).classes("w-full"):
             self.title = ui.label().classes("text")
             self.figure = Figure(height="200px", choose=self.choose)
-            self.play = ui.button(
-                f"Play {REPLAYS} episodes", icon="replay", on_click=lambda event: self.replay(event.sender)
-            )
-            self.play.props("outline dense no-caps padding='2px 10px'").set_visibility(False)
+            self.play = action(f"Play {REPLAYS} episodes", "replay", lambda event: self.replay(event.sender))
+            self.play.set_visibility(False)
             self.table = ui.table(rows=[], columns=EPISODES, row_key="seed", pagination=10).props("flat dense")
             self.table.on("rowClick", lambda event: self.watch(event.args[1]))
             self.table.set_visibility(False)
