@@ -97,17 +97,6 @@ class Step(NamedTuple):
         return float(total) if math.isnan(counted) else counted
 
 
-class Description(NamedTuple):
-    """Properties of the registration of an environment."""
-
-    env_id: str
-    """The id, or the name of its class if it has none."""
-    max_episode_steps: int | None
-    """The time limit, None if unknown."""
-    reward_threshold: float | None
-    """The return at which the environment counts as solved, None if it declares none."""
-
-
 class VectorEnv(ABC):
     """``n_envs`` environments of one kind."""
 
@@ -267,17 +256,17 @@ class VectorEnv(ABC):
         return f"<{type(self).__name__}: {self.n_envs} x {self.env_id}, backend {self.backend!r}>"
 
 
-def describe_spec(env: gym.Env | gym.vector.VectorEnv) -> Description:
-    """Returns id, time limit and reward threshold of a Gymnasium environment or vector environment."""
+def describe_spec(env: gym.Env | gym.vector.VectorEnv) -> tuple[str, int | None, float | None]:
+    """Returns id or name of the class, time limit and reward threshold of an environment or a vector of Gymnasium."""
     if env.spec is None:
-        return Description(type(env.unwrapped).__name__, None, None)
+        return type(env.unwrapped).__name__, None, None
     limit = env.spec.max_episode_steps
     if limit is None and env.spec.id.startswith("parking-"):  # which ends its episodes itself, after so many seconds
         config = env.unwrapped.config  # type: ignore[union-attr]
         limit = round(config["duration"] * config["policy_frequency"])
     elif limit is None and isinstance(own := getattr(env.unwrapped, "max_episode_steps", None), int):
         limit = own
-    return Description(env.spec.id, limit, env.spec.reward_threshold)
+    return env.spec.id, limit, env.spec.reward_threshold
 
 
 def each_info(info: Any, n_envs: int, begun: bool = False) -> list[dict[str, Any]]:

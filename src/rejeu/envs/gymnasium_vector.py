@@ -95,7 +95,8 @@ class GymnasiumVector(VectorEnv):
                 for i in done.tolist():
                     final = plain(self.observation_space, info["final_obs"][i])
                     self._compare(final, i)
-                    _put(obs, i, final)
+                    for store, part in zip(jax.tree.leaves(obs), jax.tree.leaves(final), strict=True):
+                        store[i] = part
         else:
             self._flags = terminated, truncated
         self._obs = obs
@@ -222,8 +223,3 @@ def worker_ended(env: AsyncVectorEnv) -> WorkerError:
     return WorkerError(
         f"a worker process ended by itself: {'; '.join(gone) or 'unknown which'}; what it printed may say why"
     )
-
-
-def _put(batch: Any, i: int, one: Any) -> None:
-    for store, part in zip(jax.tree.leaves(batch), jax.tree.leaves(one), strict=True):
-        store[i] = part

@@ -416,7 +416,11 @@ def _array_fault(space: spaces.Space, obs: Any, what: str, strict: bool) -> str 
     if array.dtype.kind not in "fiub":
         return f"{what} as {describe_value(obs)}, expected numbers of shape {leaf.shape} and dtype {space.dtype}"
     if array.shape != leaf.shape:
-        fix = f"return it with .reshape({leaf.shape})" if array.size == _size(leaf) else "return the declared shape"
+        fix = (
+            f"return it with .reshape({leaf.shape})"
+            if array.size == math.prod(leaf.shape)
+            else "return the declared shape"
+        )
         return f"{what} of shape {array.shape}, expected {leaf.shape}; {fix}, or declare {array.shape} in the space"
     if not keeps_values(array, leaf.dtype):
         with np.errstate(invalid="ignore", over="ignore"):
@@ -490,10 +494,6 @@ def far_outside(space: spaces.Space, obs: Any) -> str | None:
                 f"the declared bounds [{part.low[where]:.4g}, {part.high[where]:.4g}]"
             )
     return None
-
-
-def _size(leaf: Leaf) -> int:
-    return int(np.prod(leaf.shape, dtype=int))
 
 
 def _place(at: tuple[int, ...]) -> str:

@@ -144,10 +144,11 @@ def to_space(space: Any) -> gym.Space:
     if isinstance(space, gym.Space):
         return space
     if hasattr(space, "low") and hasattr(space, "high"):
-        dtype = getattr(space, "dtype", None) or np.float32
+        dtype = np.dtype(getattr(space, "dtype", None) or np.float32)
+        dtype = np.dtype(np.int8) if dtype.kind == "b" else dtype
         shape = tuple(getattr(space, "shape", None) or np.shape(space.low))
         low, high = (np.broadcast_to(np.asarray(bound, dtype), shape) for bound in (space.low, space.high))
-        return gym.spaces.Box(low, high, shape, dtype)
+        return gym.spaces.Box(low, high, shape, dtype.type)
     if hasattr(space, "n"):
         return gym.spaces.Discrete(int(space.n))
     raise ValueError(

@@ -135,11 +135,8 @@ def pick(row: Array, ends: Array, mass: Array) -> tuple[Array, Array]:
 
 def noted(pending: Pending, number: Array, position: Array, time: Array, td_error: Array) -> Pending:
     """Returns what is pending with the ``number``-th gradient step of a turn, on steps ``(batch_size,)``."""
-    return Pending(
-        pending.position.at[number].set(position),
-        pending.time.at[number].set(time),
-        pending.td_error.at[number].set(td_error.astype(jnp.float32)),
-    )
+    pairs = zip(pending, (position, time, td_error), strict=True)
+    return Pending(*(rows.at[number].set(new.astype(rows.dtype)) for rows, new in pairs))
 
 
 def updated(

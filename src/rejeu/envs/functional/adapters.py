@@ -17,6 +17,7 @@ from jax import Array
 
 from rejeu.core.spaces import leaves
 from rejeu.envs.functional.protocol import FunctionalEnv, time_is_up
+from rejeu.envs.wrappers import to_space
 
 
 def from_gymnax(env: Any, params: Any = None) -> GymnaxEnv:
@@ -84,12 +85,7 @@ def converted(space: Any) -> gym.Space:
         if isinstance(parts, dict):
             return spaces.Dict({key: converted(part) for key, part in parts.items()})
         return spaces.Tuple([converted(part) for part in parts])
-    if hasattr(space, "n"):
-        return spaces.Discrete(int(space.n))
-    dtype = np.dtype(space.dtype)
-    dtype = np.dtype(np.int8) if dtype.kind == "b" else dtype
-    low, high = (np.broadcast_to(np.asarray(bound, dtype), space.shape) for bound in (space.low, space.high))
-    return spaces.Box(low, high, dtype=dtype.type)
+    return to_space(space)
 
 
 class BraxState(NamedTuple):
