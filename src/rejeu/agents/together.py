@@ -22,7 +22,7 @@ from rejeu.callbacks.base import Callback, in_order, listed
 from rejeu.callbacks.progress_bar import ProgressBar
 from rejeu.core import devices
 from rejeu.core.interrupt import Interrupt
-from rejeu.core.validation import whole, whole_seed
+from rejeu.core.validation import is_number, whole, whole_seed
 from rejeu.envs.functional.protocol import FunctionalEnv
 from rejeu.envs.make import make_vector
 from rejeu.exploration import explorer as exploration
@@ -141,7 +141,6 @@ def is_list_of_numbers(value: Any) -> bool:
     >>> is_list_of_numbers([1e-3, 1e-4]), is_list_of_numbers((4, "step")), is_list_of_numbers([True])
     (True, False, False)
     """
-    is_number = lambda one: isinstance(one, int | float) and not isinstance(one, bool)  # noqa: E731
     return isinstance(value, list) and bool(value) and all(map(is_number, value))
 
 

@@ -17,7 +17,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from rejeu.core.validation import is_finite
+from rejeu.core.validation import is_number
 
 
 @dataclass(frozen=True)
@@ -115,11 +115,6 @@ Dimension = Range | Choice
 """Where the value of one hyperparameter is searched."""
 SearchSpace = Mapping[str, Dimension]
 """Where hyperparameters are searched, by their names."""
-
-
-def is_number(value: Any) -> bool:
-    """Returns whether a value is a finite number, and not True or False."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and is_finite(value)
 
 
 def plain(value: Any) -> str:

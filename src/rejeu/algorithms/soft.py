@@ -44,7 +44,7 @@ from rejeu.core.algorithm import (
 )
 from rejeu.core.prng import nth
 from rejeu.core.schedules import at
-from rejeu.core.validation import coerce, number, whole
+from rejeu.core.validation import coerce, is_number, number, whole
 
 ALPHA_OPTIMIZER = optimizers.make("adam")
 """Of the temperature, whatever the optimizer of the networks is."""
@@ -287,6 +287,6 @@ def initial_temperature(ent_coef: float | str) -> float:
             value = -1.0
         if ent_coef.startswith("auto") and 0 < value < math.inf:
             return value
-    elif not isinstance(ent_coef, bool) and isinstance(ent_coef, int | float) and 0 < ent_coef < math.inf:
+    elif is_number(ent_coef) and ent_coef > 0:
         return float(ent_coef)
     raise ValueError(f"ent_coef={ent_coef!r} must be 'auto', 'auto_0.1' or a positive number")

@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rejeu.core.validation import coerce, is_finite, number
+from rejeu.core.validation import assign, coerce, number
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class TableSchedule:
     """The values, two or more."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "values", tuple(map(float, self.values)))
+        assign(self, values=tuple(map(float, self.values)))
         if len(self.values) < 2 or not all(map(math.isfinite, self.values)):
             raise ValueError(f"a schedule needs two values or more, all finite; got {self.values!s:.80}")
 
@@ -136,21 +136,12 @@ def parse(name: str, value: Any, least: float = -math.inf) -> float | Schedule:
         TypeError: for anything else.
         ValueError: for a number that is not finite, or a value below ``least`` at the beginning or the end.
     """
-    parsed = _parse(name, value)
+    is_plain = isinstance(value, int | float) and not isinstance(value, bool)
+    parsed = number(name, value) if is_plain else _schedule_of(name, value)
     ends = [float(at(parsed, end)) for end in (0.0, 1.0)]
     if min(ends) < least - ROUNDING * max(map(abs, ends)):
         raise ValueError(f"{name}={value!r} must not fall below {least:g}")
     return parsed
-
-
-def _parse(name: str, value: Any) -> float | Schedule:
-    if isinstance(value, bool):
-        raise TypeError(f"{name}={value!r} must be a number or a schedule")
-    if not isinstance(value, int | float):
-        return _schedule_of(name, value)
-    if not is_finite(value):
-        raise ValueError(f"{name}={value} must be finite")
-    return float(value)
 
 
 def _schedule_of(name: str, value: Any) -> Schedule:

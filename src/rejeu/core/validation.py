@@ -28,7 +28,7 @@ def whole(key: str, value: Any, least: int, most: int = 2**63 - 1) -> int:
     Raises:
         ValueError: if it is not a whole number from ``least`` to ``most``.
     """
-    good = isinstance(value, int | float) and not isinstance(value, bool) and is_finite(value) and value == int(value)
+    good = is_number(value) and value == int(value)
     if not good or not least <= value <= most:
         named = most < 2**62 or (good and value > most)  # a limit that nobody reaches is named to those who exceed it
         raise ValueError(f"{key}={value!r} must be a whole number of at least {least}" + f" and at most {most}" * named)
@@ -41,8 +41,7 @@ def number(key: str, value: Any, least: float = -math.inf, above: float = -math.
     Raises:
         ValueError: if it is not.
     """
-    good = isinstance(value, int | float) and not isinstance(value, bool) and is_finite(value)
-    if not (good and least <= value <= most and value > above):
+    if not (is_number(value) and least <= value <= most and value > above):
         bounds = [f"above {above}"] * (above > -math.inf) + [f"at least {least}"] * (least > -math.inf)
         bounds += [f"at most {most}"] * (most < math.inf)
         raise ValueError(f"{key}={value!r} must be a finite number" + (", " + " and ".join(bounds) if bounds else ""))
@@ -60,9 +59,9 @@ def whole_seed(seed: Any) -> int:
     return int(seed)
 
 
-def is_finite(value: float) -> bool:
-    """Returns whether a number is finite as a float; an integer of 400 digits is not."""
-    return abs(value) <= sys.float_info.max
+def is_number(value: Any) -> bool:
+    """Returns whether a value is a number that is finite as a float, and not True or False; one of 400 digits is not."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
 
 
 def flag(key: str, value: Any) -> bool:

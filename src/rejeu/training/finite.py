@@ -364,7 +364,7 @@ def load_batch(agent: Any, path: str | Path) -> tuple[Transition | Rollout, Cloc
         arrays = file.read()
     try:
         clock = header["clock"]
-        step, episode, n_envs = map(np.uint32, (clock["step"], clock["episode"], clock.get("n_envs", 1)))
+        step, episode, n_envs = (np.uint32(clock[name]) for name in ("step", "episode", "n_envs"))
         clock = Clock(step, episode, np.float32(clock["progress"]), n_envs)
     except (KeyError, TypeError, ValueError, OverflowError):
         raise CheckpointError(f"{path}: the header is damaged") from None
