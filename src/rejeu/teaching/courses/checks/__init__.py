@@ -14,7 +14,7 @@ small case, the right result and those of typical mistakes, each with its messag
 The names of ``case`` are the arguments, in their order; text is the name of a function, which the module gives to
 :func:`tabulated`. Comments say how results were computed. With ``compiles = true`` the arguments are arrays of JAX, and JAX
 must be able to compile the student's function. With ``each = ["NAME"]`` the function is called once for each value of these
-arguments. Other checks are functions::
+arguments. With ``gradient = true`` the gradient with respect to the first argument must not be 0. Other checks are functions::
 
     @exercise
     def td_error(student):
@@ -180,6 +180,9 @@ def of_table(
         diagnose(np.stack(found) if each else found[0], right, **wrong)
         if is_compiled:
             compiles(student, *given[0])
+        if section.get("gradient"):
+            gradient = jax.tree.leaves(call(jax.grad(student), *given[0]))
+            mistakes(no_gradient=all(close(leaf, np.zeros(leaf.shape)) for leaf in gradient))
 
     check.__name__, check.__module__ = name, module
     check.__doc__ = f"Checks ``{name}({', '.join(case)})``."

@@ -11,7 +11,23 @@ import numpy as np
 from rejeu.core.algorithm import Transition
 from rejeu.teaching.courses.checks import Wrong, call, close, compiles, diagnose, exercise, mistakes, numbers, tabulated
 
-globals().update(tabulated(__name__))
+
+def _linear(weight: Any, obs: Any) -> Any:
+    return obs @ weight
+
+
+_NETWORKS = {
+    "network": jax.tree_util.Partial(_linear, jnp.array([[1.0, -1.0], [0.5, 2.0]])),
+    "target_network": jax.tree_util.Partial(_linear, jnp.array([[-1.0, 1.5], [2.0, 0.5]])),
+}
+_BATCH = Transition(
+    obs=jnp.array([[1.0, 0.0], [0.5, -1.0], [2.0, 1.0]]),
+    action=jnp.array([0, 1, 1]),
+    reward=jnp.array([1.0, -1.0, 0.5]),
+    next_obs=jnp.array([[0.0, 1.0], [1.0, 1.0], [-1.0, 0.5]]),
+    discount=jnp.array([0.9, 0.9, 0.0]),
+)
+globals().update(tabulated(__name__, **_NETWORKS, batch=_BATCH))
 
 
 @exercise
@@ -57,42 +73,6 @@ def _sampled(memory: Any) -> set[int]:
     mistakes(ignores_rng=len(np.unique(numbers(np.stack(again), (8, 2, 2)), axis=0)) > 1)
     mistakes(always_the_same=found[0].any() and all((one == found[0]).all() for one in found))
     return set(np.concatenate(found).tolist())
-
-
-@exercise
-def td_loss(student: Any) -> None:
-    """Checks ``td_loss(network, target_network, batch)``: its value, and its gradient with respect to the network."""
-    network = jax.tree_util.Partial(_linear, jnp.array([[1.0, -1.0], [0.5, 2.0]]))
-    target_network = jax.tree_util.Partial(_linear, jnp.array([[-1.0, 1.5], [2.0, 0.5]]))
-    batch = Transition(
-        obs=jnp.array([[1.0, 0.0], [0.5, -1.0], [2.0, 1.0]]),
-        action=jnp.array([0, 1, 1]),
-        reward=jnp.array([1.0, -1.0, 0.5]),
-        next_obs=jnp.array([[0.0, 1.0], [1.0, 1.0], [-1.0, 0.5]]),
-        discount=jnp.array([0.9, 0.9, 0.0]),
-    )
-
-    def error(network: Any, frozen: Any) -> Any:
-        taken = jnp.take_along_axis(network(batch.obs), batch.action[:, None], axis=1)[:, 0]
-        return batch.reward + batch.discount * frozen(batch.next_obs).max(axis=1) - taken
-
-    result = numbers(call(student, network, target_network, batch), ())
-    right = error(network, target_network)
-    diagnose(
-        result,
-        jnp.mean(right**2),
-        own_targets=jnp.mean(error(network, network) ** 2),
-        exchanged=jnp.mean(error(target_network, network) ** 2),
-        only_target=jnp.mean(error(target_network, target_network) ** 2),
-        sum=jnp.sum(right**2),
-        not_squared=jnp.mean(right),
-    )
-    gradient = call(jax.grad(student), network, target_network, batch).args[0]
-    mistakes(no_gradient=close(gradient, jnp.zeros((2, 2))))
-
-
-def _linear(weight: Any, obs: Any) -> Any:
-    return obs @ weight
 
 
 @exercise
