@@ -27,7 +27,7 @@ from rejeu.core import validation
 from rejeu.lab import cli
 from rejeu.lab.experiments import process
 from rejeu.lab.experiments.plan import read_plan
-from rejeu.lab.runs.config import apply
+from rejeu.lab.runs.config import assigned, merged
 from rejeu.sb3 import load_zip
 from tests.sb3_models import MadeUp
 from tests.tiers import only
@@ -246,7 +246,7 @@ def test_the_settings_of_the_page_on_rl_zoo_exist():
     assert len(spans) > 8
     for span in spans:
         words = shlex.split(span)
-        given = apply(words[words.index("--set") + 1 :], {})
+        given = merged(assigned(words[words.index("--set") + 1 :]), {})
         config = ppo.Config if "clip_range" in given or "vf" in span else sac.Config
         hindsight = {"replay_buffer_class": "HerReplayBuffer"} if "replay_buffer_kwargs" in given else {}
         validation.build(config, given | hindsight)
