@@ -31,11 +31,6 @@ PARTS = ("env", "replay", "update")
 """Stepping environments; storing and sampling; waiting for the device."""
 
 
-def no_time() -> dict[str, float]:
-    """Returns the seconds of all parts, and in total, before training."""
-    return dict.fromkeys((*PARTS, "total"), 0.0)
-
-
 class Episode(NamedTuple):
     """One finished episode."""
 
@@ -118,7 +113,7 @@ class Run:
     td_errors: list[tuple[Draw, Array]] = field(default_factory=list)
     """Those of the newest updates, each with the draw of its batch; they set the priorities of the replay buffer one turn
     later."""
-    seconds: dict[str, float] = field(default_factory=no_time)
+    seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys((*PARTS, "total"), 0.0))
     """Wall time of the parts of the loop, and in total; see :func:`timed`."""
     began: float = 0.0
     """When training would have begun had it not been interrupted; see :func:`start_clock`."""

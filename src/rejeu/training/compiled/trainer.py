@@ -94,13 +94,9 @@ class DeviceTrainer:
 
     def take(self, limits: Limits) -> None:
         """Takes a chunk of turns, and copies what it did to the host, apart from experience."""
-        self.start(limits)
-        self.finish()
-
-    def start(self, limits: Limits) -> None:
-        """Starts a chunk of turns, and does not wait for it."""
         chunk = self.compiled(take_chunk, donate_argnums=3)
         self.carry, self.experience, self.report = chunk(self.carry, limits, self.experience)
+        self.finish()
 
     def finish(self) -> None:
         """Waits for the chunk, and copies what it did to the host, apart from experience."""
