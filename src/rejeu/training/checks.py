@@ -140,10 +140,13 @@ def _check_action(run: Run, taken: int) -> None:
 
 def check_state(run: Run, learner: Learner) -> None:
     """Raises ``NonFiniteError`` if the state is not finite when training begins; waits for the device."""
-    if not (bad := learner.bad_leaves(run.state)):
-        return
+    if bad := learner.bad_leaves(run.state):
+        raise _state_error(run, bad)
+
+
+def _state_error(run: Run, bad: list[str]) -> Exception:
     more = f" and {len(bad) - 1} more of its arrays are" if len(bad) > 1 else " is"
-    raise NonFiniteError(
+    return NonFiniteError(
         f"{bad[0]} of the agent's state{more} not finite before learning begins (step {run.step}, update "
         f"{run.n_updates}); set_parameters or a file put them there: give it finite numbers, or load another model",
         names=[text.split(" ")[0] for text in bad],
