@@ -135,6 +135,17 @@ def test_a_failed_run_does_not_stop_the_others_and_only_resume_repeats_it(tmp_pa
     assert states["job-1"] == "failed"
 
 
+def test_a_run_whose_model_is_gone_is_not_done_and_is_trained_again(tmp_path):
+    folder = make_folder(tmp_path, 2)
+    work(folder, Launcher())
+    of_first = folder.works()[0]
+    of_first.files.agent.unlink()
+    assert [one.state for one in folder.works()] == ["stopped", "done"]
+    again = Launcher()
+    work(folder, again)
+    assert [name for _, name in again.started] == ["job-0"]
+
+
 @pytest.mark.parametrize("status", [-9, 143, 75])
 def test_a_lost_run_continues_from_its_checkpoint_or_starts_anew_and_its_files_are_kept(tmp_path, status):
     folder, launcher = make_folder(tmp_path, 1), Launcher(ends={"job-0": [status, status, 0]})
