@@ -4,7 +4,8 @@
 
 The change is what differs from COMMIT (default: ``main``), including what is not committed yet. The tests of a changed module
 are the files that have its name, and those that import it, directly or through modules of ``tests``. If there are none, they
-are those of the modules that import it, and so on. A test file that has changed is one of them.
+are those of the modules that import it, and so on. A test file that has changed is one of them. So are all tests of a folder
+in :data:`SERVED`, whose modules run in a process that tests start.
 """
 
 from __future__ import annotations
@@ -22,6 +23,8 @@ from typing import NamedTuple
 from structure import imports, parse  # beside this file
 
 ROOT = Path(__file__).resolve().parents[1]
+SERVED = {"rejeu.lab.studio": "tests.lab.studio"}
+"""Folders of modules that tests reach by a server in another process, and the folders of these tests."""
 
 
 def definitions(modules: dict[str, tuple[Path, ast.Module]]) -> dict[tuple[str, str], str]:
@@ -108,6 +111,8 @@ def tests_of(changed: Iterable[str]) -> list[str]:
             ring = set[str]().union(*(importers[one] for one in ring)) - seen
             seen |= ring
         found |= of_ring if ring else set()
+        served = SERVED.get(module.rpartition(".")[0])
+        found |= {name for name in needs if name.rpartition(".")[0] == served}
     return sorted(path for path, name in paths.items() if name in found)
 
 

@@ -77,6 +77,14 @@ def test_evaluate_saves_only_when_the_best_so_far_is_beaten(tmp_path):
     assert evaluate.best.step == 40
 
 
+def test_of_equal_evaluations_the_first_is_the_best():
+    agent = scripted_agent([evaluation([1]), evaluation([1])])
+    evaluate = Evaluate("Pendulum-v1", 10, episodes=1, seed=0)
+    best = [evaluate.best.step for step in (10, 20) if evaluate.run(agent, step)]
+    evaluate.close()
+    assert best == [10, 10]
+
+
 def test_an_evaluation_of_nan_is_worse_than_any_other():
     agent = scripted_agent([evaluation([math.nan]), evaluation([-5]), evaluation([math.nan]), evaluation([-6])])
     evaluate = Evaluate("Pendulum-v1", 10, episodes=1, seed=0)
