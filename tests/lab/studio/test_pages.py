@@ -47,6 +47,17 @@ def test_a_run_that_changes_and_one_that_disappears_are_followed(browser, served
         row.locator("text=its folder is no longer there").wait_for()
 
 
+@pytest.mark.parametrize("is_paused", [True, False])
+def test_a_run_that_was_stopped_can_be_resumed(browser, served, is_paused):
+    folder = write(served.folder / f"stopped_{is_paused}", {**CONFIG, "steps": 100_000}, videos=False)
+    if is_paused:
+        (folder / "paused").touch()
+    with opened(browser, served, f"/run?run={folder.name}") as page:
+        page.locator(".q-badge", has_text="paused" if is_paused else "interrupted").wait_for()
+        page.get_by_role("button", name="Resume").wait_for()
+    shutil.rmtree(folder)
+
+
 def check_hints(page):
     """Checks that the hints of a form keep clear of the fields below, as wide as a phone's and as a desktop's."""
     page.wait_for_timeout(300)  # the animation of an opened section
