@@ -63,7 +63,6 @@ JUDGED_BY_SUCCESS = (
     "FetchPush-v4",
     "FetchReach-v4",
     "PointMaze_Large-v3",
-    "PointMaze_Medium-v3",
     "parking-v0",
     "rejeu/Ball-v0",
 )
