@@ -27,7 +27,8 @@ from rejeu.sb3.common.buffers import HerReplayBuffer
 from rejeu.sb3.common.callbacks import LogEveryNTimesteps
 from rejeu.sb3.common.env_util import make_atari_env, make_vec_env
 from rejeu.sb3.common.monitor import ResultsWriter, load_results
-from rejeu.sb3.common.vec_env import VecTransposeImage, is_vecenv_wrapped
+from rejeu.sb3.common.vec_env import DummyVecEnv, VecNormalize, VecTransposeImage, is_vecenv_wrapped
+from rejeu.sb3.common.vec_env.base_vec_env import VecEnvWrapper
 from tests.sb3 import envs
 from tests.sb3.test_original import Features
 from tests.tiers import crossed, exhaustive
@@ -155,6 +156,25 @@ def test_a_refused_setting_is_an_assertion_error_and_a_value_error():
         sb3.PPO("MlpPolicy", "CartPole-v1", clip_range_vf=-0.2)
     with pytest.raises(ValueError, match="DQN"):
         sb3.DQN("MlpPolicy", "Pendulum-v1")
+
+
+class Named(VecEnvWrapper):
+    """A wrapper with an attribute."""
+
+    level = "inner"
+
+    def reset(self):
+        return self.venv.reset()
+
+    def step_wait(self):
+        return self.venv.step_wait()
+
+
+def test_an_attribute_of_two_inner_wrappers_is_ambiguous():
+    inner = Named(DummyVecEnv([lambda: gym.make("CartPole-v1")]))
+    assert VecNormalize(inner).level == "inner"
+    with pytest.raises(AttributeError, match="ambiguous: Named and Named"):
+        _ = VecNormalize(Named(inner)).level
 
 
 def test_actor_and_critic_share_their_extractor_or_not():

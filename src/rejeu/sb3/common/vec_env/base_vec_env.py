@@ -315,6 +315,13 @@ class VecEnvWrapper(VecEnv):
     def __getattr__(self, name: str) -> Any:
         if name == "venv":
             raise AttributeError(f"{type(self).__name__}.__init__ must call super().__init__(venv) first")
+        inner: Any = self.venv
+        owners = []
+        while isinstance(inner, VecEnvWrapper):
+            owners += [type(inner).__name__] if name in vars(inner) or hasattr(type(inner), name) else []
+            inner = inner.venv
+        if len(owners) > 1:
+            raise AttributeError(f"{name!r} is ambiguous: {' and '.join(owners)} have it; ask one of them through venv")
         return getattr(self.venv, name)
 
 
