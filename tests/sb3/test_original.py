@@ -359,7 +359,9 @@ def test_logger_formats(tmp_path, capsys):
     assert model.logger.name_to_value["time/fps"] > 0
 
 
-@pytest.mark.parametrize("kind", [envs.IdentityEnv, envs.IdentityEnvBox, envs.FakeImageEnv, envs.BitFlippingEnv])
+@pytest.mark.parametrize(
+    "kind", [envs.IdentityEnv, envs.IdentityEnvBox, envs.FakeImageEnv, envs.BitFlippingEnv, envs.SimpleMultiObsEnv]
+)
 def test_environments_pass_the_checker_without_warnings(kind):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -370,6 +372,16 @@ def test_the_checker_states_the_difference():
     env = envs.IdentityEnvBox()
     env.step = lambda action: (np.full(1, 3.0, np.float32), 0.0, False, False, {})
     with pytest.raises(AssertionError, match=r"3\.0 at index 0, outside of the declared bounds \[-1\.0, 1\.0\]"):
+        env_checker.check_env(env)
+
+
+def test_the_checker_refuses_actions_without_bounds_and_warns_of_others_than_those_of_the_policy():
+    env = envs.IdentityEnvBox()
+    env.action_space = spaces.Box(-np.inf, np.inf, (1,), np.float32)
+    with pytest.raises(AssertionError, match="must have finite bounds"):
+        env_checker.check_env(env)
+    env.action_space = env.observation_space = spaces.Box(0, 2, (1,), np.float32)
+    with pytest.warns(UserWarning, match="bounds of -1 and 1 are recommended"):
         env_checker.check_env(env)
 
 

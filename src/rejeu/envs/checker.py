@@ -409,15 +409,18 @@ def advice_on_actions(space: spaces.Space) -> Iterator[str]:
         )
 
 
-def advice_on_observations(space: spaces.Space, path: str = "") -> Iterator[str]:
-    """Yields advice on an observation space, one sentence each: nothing fails, but learning may be slower."""
+def advice_on_observations(space: spaces.Space, path: str = "", dtypes: bool = True) -> Iterator[str]:
+    """Yields advice on an observation space, one sentence each: nothing fails, but learning may be slower.
+
+    ``dtypes=False`` leaves out those of vectors, of which Stable-Baselines3 does not warn.
+    """
     where = f" under {path!r}" if path else ""
     if isinstance(space, spaces.Dict | spaces.Tuple):
         for key, part in space.spaces.items() if isinstance(space, spaces.Dict) else enumerate(space.spaces):
             name = f"{path}.{key}".lstrip(".")
             if isinstance(part, spaces.Dict | spaces.Tuple):
                 yield f"the observation under {name!r} is nested; rejeu takes it, Stable-Baselines3 takes one level only"
-            yield from advice_on_observations(part, name)
+            yield from advice_on_observations(part, name, dtypes)
     elif not isinstance(space, spaces.Box):
         return
     elif len(space.shape) == 3:
@@ -429,5 +432,5 @@ def advice_on_observations(space: spaces.Space, path: str = "") -> Iterator[str]
             yield f"the image{where} has the shape {space.shape}; below 36x36 small convolutions are used, below 8x8 none"
     elif len(space.shape) > 1:
         yield f"the observation{where} has the shape {space.shape}; arrays of two axes are flattened"
-    elif space.dtype != np.float32 and space.dtype != np.uint8:
+    elif dtypes and space.dtype != np.float32 and space.dtype != np.uint8:
         yield f"the observation{where} has the dtype {space.dtype}; use float32, which it is turned into"

@@ -5,6 +5,8 @@ from __future__ import annotations
 import warnings
 
 import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
 
 from rejeu.envs import checker, validation
 
@@ -18,16 +20,20 @@ def check_env(env: gym.Env, warn: bool = True, skip_render_check: bool = True) -
 
     Args:
         env: a Gymnasium environment.
-        warn: warn of observations that are hard to learn from, and of actions without bounds.
+        warn: warn of observations that are hard to learn from, and of actions whose bounds are not -1 and 1.
         skip_render_check: False renders once too.
 
     Raises:
-        AssertionError: if it does not follow Gymnasium's interface, or an observation is outside of its space.
+        AssertionError: if it does not follow Gymnasium's interface, an observation is outside of its space, or continuous
+            actions have no bounds.
     """
     try:
         faults = [one.text for one in checker.quick_findings(env) if one.level == "error"]
     except TypeError as error:
         faults = [str(error)]
+    actions = env.action_space if not faults and isinstance(env.action_space, spaces.Box) else None
+    if actions is not None and not actions.is_bounded():
+        faults = [f"the continuous actions {actions} must have finite bounds"]
     if not faults:
         seen = env.reset()[0], env.step(env.action_space.sample())[0]
         found = [validation.bounds_fault(env.observation_space, obs) for obs in seen]
@@ -35,8 +41,10 @@ def check_env(env: gym.Env, warn: bool = True, skip_render_check: bool = True) -
     if faults:
         raise AssertionError("\n".join(faults))
     if warn:
-        advice = checker.advice_on_observations(env.observation_space), checker.advice_on_actions(env.action_space)
-        for text in (*advice[0], *advice[1]):
+        advice = [*checker.advice_on_observations(env.observation_space, dtypes=False)]
+        if actions is not None and not (np.all(actions.low == -1) and np.all(actions.high == 1)):
+            advice.append(f"the actions {actions} are scaled for the policy; bounds of -1 and 1 are recommended")
+        for text in advice:
             warnings.warn(text, UserWarning, stacklevel=2)
     if not skip_render_check and env.render_mode is not None:
         env.render()
