@@ -83,6 +83,9 @@ def train_one(preset: presets.Preset, seed: int, arguments: argparse.Namespace) 
         )
     if arguments.best:
         agent.restore_best()
+    if arguments.keep is not None:
+        arguments.keep.mkdir(parents=True, exist_ok=True)
+        agent.save(arguments.keep / f"{preset.env_id.replace('/', '-')}-{arguments.algorithm}-{seed}.safetensors")
     evaluation_env = environments(10, 1_000_000 + 100 * seed, arguments.evaluation_backend or backend)
     evaluation = agent.evaluate(arguments.episodes, env=evaluation_env)
     return {
@@ -156,6 +159,7 @@ def main() -> None:
     parser.add_argument("--name", help="of the result file")
     parser.add_argument("--zoo", action="store_true", help="with the hyperparameters of RL Zoo in benchmarks/zoo.toml")
     parser.add_argument("--continue", action="store_true", dest="goes_on", help="keep the seeds of the result file")
+    parser.add_argument("--keep", type=Path, metavar="FOLDER", help="save the trained agents there")
     parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the result file")
     arguments = parser.parse_args()
     find = zoo if arguments.zoo else presets.find
@@ -193,7 +197,7 @@ def described(preset: presets.Preset, arguments: argparse.Namespace, runs: list[
     installed = {dist.name for dist in importlib.metadata.distributions()}
     versions = {name: importlib.metadata.version(name) for name in ("jax", "gymnasium", "envpool") if name in installed}
     return {
-        **provenance({str(arguments.out): "FOLDER"}),
+        **provenance({str(arguments.out): "FOLDER", str(arguments.keep): "FOLDER"}),
         "machine": {**machine(), "device": jax.devices()[0].device_kind},
         "versions": {"rejeu": rejeu.__version__, **versions},
         "hyperparameters": configs.to_json(config),

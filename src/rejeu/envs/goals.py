@@ -13,6 +13,9 @@ from rejeu.envs.validation import describe_value
 PARKING_WEIGHTS = np.array([1.0, 0.3, 0.0, 0.0, 0.02, 0.02])
 """Weights of x, y, vx, vy, cos h, sin h in highway-env's ``parking-v0`` (1.12, default configuration)."""
 
+NUMBERS = {bool, int, float, np.bool_, np.float32, np.float64}
+"""Types of one number that functions of goals usually return."""
+
 
 class GoalFunctions(NamedTuple):
     """The reward and termination functions of a goal environment: ``(achieved (n, ...), desired (n, ...)) -> (n,)``."""
@@ -81,14 +84,17 @@ def over_batches(function: Callable[..., Any], dtype: Any) -> Callable[..., np.n
     def by_row(achieved: np.ndarray, desired: np.ndarray, infos: Sequence[Any] | None = None) -> np.ndarray:
         each = [{}] * len(achieved) if infos is None else infos
         try:
-            rows = [one_number(function(a, d, info)) for a, d, info in zip(achieved, desired, each, strict=True)]
+            rows = [function(a, d, info) for a, d, info in zip(achieved, desired, each, strict=True)]
         except KeyError as error:
             raise info_fault(name, error) from error
-        if any(row is None or np.shape(row) != () for row in rows):
-            wrong = next(row for row in rows if row is None or np.shape(row) != ())
-            raise BadEnvironmentError(
-                f"{name} returned {describe_value(wrong)} of one goal, expected one number; rejeu.check_env(env) says more"
-            )
+        if not set(map(type, rows)) <= NUMBERS:  # of any other kind, each is looked at, which takes far longer
+            rows = [one_number(row) for row in rows]
+            wrong = [row for row in rows if row is None or np.shape(row) != ()]
+            if wrong:
+                raise BadEnvironmentError(
+                    f"{name} returned {describe_value(wrong[0])} of one goal, expected one number; "
+                    "rejeu.check_env(env) says more"
+                )
         return np.array(rows, dtype)
 
     def call(achieved: np.ndarray, desired: np.ndarray, infos: Sequence[Any] | None = None) -> np.ndarray:
