@@ -1,31 +1,43 @@
 """Trains Stable-Baselines3 with the settings of ``zoo.toml``, where rejeu differs from what RL Zoo published.
 
     python benchmarks/zoo_original.py LunarLander-v3 A2C --seeds 0 1 2
+    python benchmarks/zoo_original.py parking-v0 SAC --goals --seeds 0
 
 It runs in an environment with Stable-Baselines3 and without rejeu, and plays 100 episodes with the last weights, as
-``learning.py --zoo`` does. The seeds are added to those in ``benchmarks/results/zoo_original.json``.
+``learning.py --zoo`` does. The seeds are added to those in ``benchmarks/results/zoo_original.json``. ``--goals`` takes the
+settings of rejeu's preset but for ``layer_norm`` and ``n_steps``, which Stable-Baselines3 does not have with hindsight, and
+records success rates and seconds in ``benchmarks/results/goals_original.json``.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import time
 import tomllib
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import stable_baselines3
 import torch
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 HERE = Path(__file__).parent
-RESULTS = HERE / "results" / "zoo_original.json"
+ZOO, RESULTS = HERE / "zoo.toml", HERE / "results" / "zoo_original.json"
+GOALS, GOAL_RESULTS = (
+    HERE.parent / "src" / "rejeu" / "agents" / "presets" / "presets.toml",
+    HERE / "results" / "goals_original.json",
+)
+MARKS = (50_000, 100_000, 300_000)
+"""Steps after which the success of an agent is measured, besides the end."""
 
 
-def train(preset: dict[str, Any], seed: int) -> float:
-    """Returns the mean return of 100 episodes after training."""
+def train(preset: dict[str, Any], seed: int) -> Any:
+    """Returns the mean return of 100 episodes after training; of goals, success rates by steps and the seconds."""
     settings = dict(preset["hyperparameters"])
     is_normalized = settings.pop("normalize", False)
     if isinstance(rate := settings.get("learning_rate"), str):
@@ -39,26 +51,72 @@ def train(preset: dict[str, Any], seed: int) -> float:
         test = VecNormalize(test, training=False, norm_reward=False)
         test.obs_rms = env.obs_rms
     algorithm = getattr(stable_baselines3, preset["algorithm"])
-    model = algorithm("MlpPolicy", env, seed=seed, device="cpu", **{**settings, "policy_kwargs": policy})
-    model.learn(preset["total_steps"])
-    return float(evaluate_policy(model, test, 100)[0])
+    if has_goals := "replay_buffer_class" in settings:
+        policy.pop("layer_norm", None)
+        settings.pop("n_steps", None)
+        settings |= {"replay_buffer_class": stable_baselines3.HerReplayBuffer, "gradient_steps": -1}
+    kind = "MultiInputPolicy" if has_goals else "MlpPolicy"
+    model = algorithm(kind, env, seed=seed, device="cpu", **{**settings, "policy_kwargs": policy})
+    if not has_goals:
+        model.learn(preset["total_steps"])
+        return float(evaluate_policy(model, test, 100)[0])
+    watch = Success(test)
+    model.learn(preset["total_steps"], callback=watch)
+    watch.measure()
+    return {"success_curve": watch.curve, "seconds": round(watch.training, 1)}
+
+
+class Success(BaseCallback):
+    """Measures the success rate of 100 episodes at each of :data:`MARKS`, and the seconds of training alone."""
+
+    def __init__(self, test: VecEnv) -> None:
+        super().__init__()
+        self.test, self.curve, self.training, self.since = test, [], 0.0, time.perf_counter()
+
+    def _on_step(self) -> bool:
+        before = self.num_timesteps - self.training_env.num_envs
+        if any(before < mark <= self.num_timesteps for mark in MARKS):
+            self.measure()
+        return True
+
+    def measure(self) -> None:
+        self.training += time.perf_counter() - self.since
+        succeeded: list[bool] = []
+
+        def after(local: dict[str, Any], _: Any) -> None:
+            if local["done"]:  # as rejeu counts: whether the goal is reached at the end
+                info = local["info"]
+                succeeded.append(bool(info.get("is_success", info.get("success"))))
+
+        evaluate_policy(self.model, self.test, 100, callback=after)
+        self.curve.append([self.num_timesteps, sum(succeeded) / len(succeeded)])
+        print(self.curve[-1], f"{self.training:.0f} s", flush=True)
+        self.since = time.perf_counter()
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("env_id")
     parser.add_argument("algorithm")
+    parser.add_argument("--goals", action="store_true", help="with the settings of rejeu's preset")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    known = tomllib.loads((HERE / "zoo.toml").read_text(encoding="utf-8"))["preset"]
+    source, results = (GOALS, GOAL_RESULTS) if arguments.goals else (ZOO, RESULTS)
+    if arguments.goals:
+        import gymnasium_robotics
+        import highway_env
+
+        gym.register_envs(gymnasium_robotics)
+        gym.register_envs(highway_env)
+    known = tomllib.loads(source.read_text(encoding="utf-8"))["preset"]
     ours = (arguments.env_id, arguments.algorithm)
     preset = next(one for one in known if (one["env_id"], one["algorithm"]) == ours)
     for seed in arguments.seeds:
-        found = json.loads(RESULTS.read_text(encoding="utf-8")) if RESULTS.exists() else {}
+        found = json.loads(results.read_text(encoding="utf-8")) if results.exists() else {}
         found["version"] = stable_baselines3.__version__
         found.setdefault("-".join(ours), {})[str(seed)] = train(preset, seed)
-        RESULTS.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+        results.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

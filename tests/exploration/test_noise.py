@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.stats
 from gymnasium import spaces
 
 import rejeu
@@ -344,3 +346,26 @@ def test_noise_of_the_users_own_is_added_and_mentioned_in_files(tmp_path):
     assert rejeu.load(path, action_noise=noise).config.action_noise is noise
     with pytest.raises(TypeError, match="init and perturb"):
         rejeu.DDPG("MlpPolicy", "Pendulum-v1", action_noise=object())
+
+
+def test_the_share_random_of_actions_is_uniform_and_the_others_are_noisy():
+    """``random=0.3``, for 20,000 environments: a binomial share, uniform values, and rows replaced as a whole."""
+    n, key = 20_000, jax.random.PRNGKey(3)
+    plain, noise = NormalActionNoise([0.0] * 2, 0.01), NormalActionNoise([0.0] * 2, 0.01, random=0.3)
+    action = jnp.full((n, 2), 0.9)
+    _, expected = plain.perturb(plain.init(n), action, key)
+    _, taken = noise.perturb(noise.init(n), action, key)
+    kept = np.isclose(taken, expected).all(axis=1)
+    replaced = np.asarray(taken)[~kept]
+    assert 1 - kept.mean() == pytest.approx(0.3, abs=4 * math.sqrt(0.3 * 0.7 / n))
+    assert not np.isclose(replaced, np.asarray(expected)[~kept]).all(axis=1).any()
+    assert scipy.stats.kstest(replaced.ravel(), "uniform", (-1, 2)).pvalue > 1e-3
+    assert np.corrcoef(replaced.T)[0, 1] == pytest.approx(0.0, abs=0.06)
+
+
+def test_the_share_random_is_read_from_a_string_and_saved():
+    noise = for_actions(parse("normal(0.2, random=0.3)"), spaces.Box(-1, 1, (2,)))
+    assert noise == NormalActionNoise([0.0] * 2, 0.2, random=0.3)
+    assert parse(to_json(noise)) == noise
+    with pytest.raises(ValueError, match=r"random=1\.5"):
+        NormalActionNoise([0.0], 0.1, random=1.5)

@@ -19,6 +19,7 @@ from dataclasses import KW_ONLY, InitVar, asdict, dataclass
 from typing import Any, Protocol, runtime_checkable
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from gymnasium import spaces
 from jax import Array
@@ -123,7 +124,7 @@ class NormalActionNoise(ActionNoise):
     """Independent Gaussian noise, the same at every step (Stable-Baselines3's class of that name).
 
     >>> NormalActionNoise(mean=[0.0, 0.0], sigma=[0.2, 0.2])
-    NormalActionNoise(mean=(0.0, 0.0), sigma=(0.2, 0.2))
+    NormalActionNoise(mean=(0.0, 0.0), sigma=(0.2, 0.2), random=0.0)
     """
 
     mean: PerDimension
@@ -132,10 +133,15 @@ class NormalActionNoise(ActionNoise):
     """Standard deviation per action dimension, at least 0."""
     dtype: InitVar[Any] = np.float32
     """Accepted for compatibility with Stable-Baselines3; the noise is always float32."""
+    _: KW_ONLY
+    random: float = 0.0
+    """Probability that an action is replaced by a uniformly random one, as in hindsight experience replay's experiments
+    (Plappert et al. 2018, arXiv 1802.09464: 0.3, with ``sigma=0.2``). An agent replaces them, a call by hand does not."""
 
     def __post_init__(self, dtype: Any) -> None:
         _check_dtype(self, dtype)
         _as_tuples(self, "mean", "sigma")
+        coerce(self, "random", number, least=0, most=1)
 
     def init(self, n_envs: int) -> Any:
         """Returns the state of the noise of ``n_envs`` environments: nothing."""
@@ -143,6 +149,15 @@ class NormalActionNoise(ActionNoise):
 
     def advance(self, state: Any, action: Any, normal: Any) -> tuple[Any, Any]:
         return state, action + (_row(self.mean) + _row(self.sigma) * normal)
+
+    def perturb(self, state: Array, action: Array, key: Array) -> tuple[Array, Array]:
+        state, noisy = super().perturb(state, action, key)
+        if self.random == 0:
+            return state, noisy
+        which, what = jax.random.split(jax.random.fold_in(key, 1))
+        is_random = jax.random.bernoulli(which, self.random, action.shape[:1])
+        uniform = jax.random.uniform(what, action.shape, action.dtype, -1.0, 1.0)
+        return state, jnp.where(is_random[:, None], uniform, noisy)
 
 
 @dataclass(frozen=True)
@@ -306,7 +321,7 @@ def for_actions(noise: Noise | float | str | None, action_space: spaces.Space) -
     """Returns noise for these actions: a string from :func:`parse` gets as many dimensions as they have.
 
     >>> for_actions("normal(0.1)", spaces.Box(-1, 1, (2,)))
-    NormalActionNoise(mean=(0.0, 0.0), sigma=(0.1, 0.1))
+    NormalActionNoise(mean=(0.0, 0.0), sigma=(0.1, 0.1), random=0.0)
     """
     assert not isinstance(noise, float | int)  # parse turns numbers into strings
     return read(noise, math.prod(action_space.shape or (1,))) if isinstance(noise, str) else noise

@@ -73,25 +73,31 @@ def push(source: str | Path, repo: str, private: bool = False, note: Callable[[s
         OSError: if the hub cannot be reached or refuses.
         MissingExtra: if ``huggingface-hub`` is not installed.
     """
-    source = Path(source)
-    model = find_model(source)
-    agent = load(model)
     with tempfile.TemporaryDirectory() as made, interface() as hub:
-        room = Path(made)
-        shutil.copyfile(model, room / MODEL)
-        for name in FILES if source.is_dir() else ():
-            if runs.is_file(source / name):
-                shutil.copyfile(source / name, room / name)
-        try:
-            agent.export(room / ONNX)
-        except (ImportError, OSError, RuntimeError, ValueError) as error:
-            note(f"without {ONNX}: {brief(error)}")
-        (room / CARD).write_text(card(agent, repo, source, {one.name for one in room.iterdir()}), encoding="utf-8")
+        agent = lay_out(source, Path(made), repo, note)
         api = hub.HfApi()
         address = api.create_repo(repo, private=private or None, exist_ok=True)
         message = f"{agent.name}, {counted(agent.num_timesteps, 'step')}"
-        api.upload_folder(repo_id=repo, folder_path=room, commit_message=message)
+        api.upload_folder(repo_id=repo, folder_path=made, commit_message=message)
     return str(address)
+
+
+def lay_out(source: str | Path, folder: Path, repo: str, note: Callable[[str], Any] = print) -> Agent:
+    """Writes the files of a repository to an empty folder and returns the agent; arguments are those of :func:`push`."""
+    source = Path(source)
+    model = find_model(source)
+    agent = load(model)
+    shutil.copyfile(model, folder / MODEL)
+    for name in FILES if source.is_dir() else ():
+        if runs.is_file(source / name):
+            shutil.copyfile(source / name, folder / name)
+    try:
+        agent.export(folder / ONNX)
+    except (ImportError, OSError, RuntimeError, ValueError) as error:
+        note(f"without {ONNX}: {brief(error)}")
+    names = {one.name for one in folder.iterdir()}
+    (folder / CARD).write_text(card(agent, repo, source, names), encoding="utf-8")
+    return agent
 
 
 def pull(repo: str, out: str | Path | None = None) -> Path:
