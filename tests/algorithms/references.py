@@ -288,7 +288,9 @@ class SAC(Reference):
         return self.backed_up(batch, value, self.alpha * log_prob)
 
     def backed_up(self, batch: Transition, value: np.ndarray, cost: np.ndarray) -> np.ndarray:
-        return batch.reward + batch.discount * (value - cost)
+        target = batch.reward + batch.discount * (value - cost)
+        bounds = self.config.v_min, self.config.v_max
+        return target if bounds == (None, None) else np.clip(target, *bounds)
 
     def actor_loss(self, batch: Transition) -> tuple[float, np.ndarray]:
         """Returns the loss, and the entropies of the policy or their estimates, ``(batch,)``."""
@@ -331,7 +333,7 @@ class DiscreteSAC(SAC):
         probabilities = softmax(forward(self.actor, batch.next_obs))
         rows = zip(probabilities, self.least(self.drawn(self.keys), batch.next_obs), strict=True)
         soft = [sum(p * (q - self.alpha * np.log(p)) for p, q in zip(*row, strict=True)) for row in rows]
-        return batch.reward + batch.discount * soft
+        return self.backed_up(batch, np.array(soft), 0.0)
 
     def actor_loss(self, batch: Transition) -> tuple[float, np.ndarray]:
         probabilities = softmax(forward(self.actor, batch.obs))

@@ -69,6 +69,11 @@ class Config(EntropyConfig):
     target_subset: int | None = None
     """Number of critics, drawn anew for each update, of which the target takes the smallest value; the actor then follows
     the mean of all (REDQ, arXiv 2101.05982). A larger number is more pessimistic. None: the smallest of all, for both."""
+    v_min: float | None = None
+    """Least return, to which the targets of the critics are clipped: with a reward of -1 in every step until the goal it is
+    ``-1 / (1 - gamma)`` (the clipped targets of hindsight experience replay). None for no bound."""
+    v_max: float | None = None
+    """Largest return, likewise: 0 with such rewards."""
     use_sde: bool = False
     """Explore by state-dependent noise (gSDE, arXiv 2005.05719), which is kept for many steps and gives smooth motion. Box
     actions only, without ``action_noise``."""
@@ -88,6 +93,9 @@ class Config(EntropyConfig):
         coerce(self, "target_subset", whole, least=1, optional=True)
         if (self.target_subset or 0) > self.n_critics:
             raise ValueError(f"target_subset={self.target_subset} is more than n_critics={self.n_critics}")
+        coerce(self, ("v_min", "v_max"), number, optional=True)
+        if self.v_min is not None and self.v_max is not None and self.v_min >= self.v_max:
+            raise ValueError(f"v_min={self.v_min} must be below v_max={self.v_max}")
         coerce(self, "use_sde", flag)
         coerce(self, "sde_sample_freq", whole, least=-1)
         coerce(self, "sde_log_std_init", number)
@@ -184,6 +192,9 @@ def make_with(
 def algorithm_of(parts: SoftCritic, config: Config, explore: Any, exploit: Any, others: Mapping[str, Any]) -> Algorithm:
     """Returns the algorithm of these parts and parts of :class:`Algorithm`, with REDQ, dropout and memory if they are set."""
     parts = parts if config.target_subset is None and not config.policy_kwargs.dropout else drawn(parts, config)
+    bounds, target = (config.v_min, config.v_max), parts.target
+    if bounds != (None, None):
+        parts = parts._replace(target=lambda *arguments: jnp.clip(target(*arguments), *bounds))
     optimizer = optimizers.make(config.optimizer, config.max_grad_norm)
     algorithm = soft_actor_critic(parts, config, explore, exploit, optimizer)._replace(**others)
     return remembering(algorithm, config.policy_kwargs, lambda state: (state.actor, state.critics))
