@@ -200,11 +200,32 @@ def goals(choice: str = "") -> str:
                 " to ".join(dict.fromkeys(f"{one:.1f}" for one in (min(minutes), max(minutes)))),
                 str(len(runs)),
                 content["commit"],
-                code(re.sub(r" *--out \S+", "", options).strip()),
+                code(re.sub(r" *--(out|keep) \S+", "", options).strip()),
             ]
         )
     columns = ["environment", "algorithm", *(f"at {mark:,}" for mark in marks), "at the end", "minutes", "seeds"]
     return table([*columns, "commit", "options"], rows)
+
+
+def other_goals() -> str:
+    """Success of others in goal environments: as published, and of Stable-Baselines3 with the settings of the preset."""
+    rows = []
+
+    def add(env_id: str, learner: str, entry: dict[str, Any], minutes: float) -> None:
+        rates = ", ".join(f"{100 * rate:.0f} % at {step:,}" for step, rate in entry["success_curve"])
+        rows.append([env_id, learner, rates, f"{minutes:.0f}"])
+
+    for entry in load("published.json"):
+        if "success_curve" in entry:
+            learner = f"[{entry['algorithm']} of {entry['by']}]({entry['source']})"
+            add(entry["version"], learner, entry, entry["minutes"])
+    original = load("goals_original.json")
+    version = original.pop("version")
+    for name, seeds in original.items():
+        env_id, _, algorithm = name.rpartition("-")
+        for seed, entry in seeds.items():
+            add(env_id, f"{algorithm} of Stable-Baselines3 {version}, seed {seed}", entry, entry["seconds"] / 60)
+    return table(["environment", "learner", "success", "minutes"], sorted(rows))
 
 
 def success(rates: list[float]) -> str:
@@ -486,6 +507,7 @@ BLOCKS: dict[str, Callable[..., str]] = {
     "curve": curve,
     "equal-time": equal_time,
     "goals": goals,
+    "other-goals": other_goals,
     "learned": learned,
     "hyperparameters": hyperparameters,
     "shared-hyperparameters": shared_hyperparameters,
