@@ -162,17 +162,10 @@ SHARE: dict[str, tuple[int, str, dict[str, Any]]] = {
         },
     ),
     "jax/Parking-v0": (16, "auto", hyperparameters("parking-v0")),
-    "FetchPush-v4": (
-        8,
-        "envpool",
-        {
-            **hyperparameters("FetchPush-v4"),
-            "policy_kwargs": {"net_arch": [64, 64, 64], "layer_norm": True},
-            "batch_size": 128,
-        },
-    ),
+    "FetchPush-v4": (8, "envpool", {**hyperparameters("FetchPush-v4"), "priorities": None}),
 }
-"""Number of environments, backend and hyperparameters of ``share``; the network of FetchPush is smaller than its preset's."""
+"""Number of environments, backend and hyperparameters of ``share``: those of presets without priorities, which cannot be
+combined with demonstrations."""
 WAYS = {"none": "", "share": "", "clone": "clone", "clone and critics": "clone critics"}
 """What is done before training, by the name of a way; all but the first have a share of demonstrations in each batch."""
 

@@ -60,9 +60,12 @@ SHARED = (
 )
 """Configurations from which others are derived, and where their hyperparameters are explained: by whom, and the page."""
 JUDGED_BY_SUCCESS = (
+    "FetchPickAndPlace-v4",
     "FetchPush-v4",
     "FetchReach-v4",
     "PointMaze_Large-v3",
+    "PointMaze_Medium-v3",
+    "PointMaze_UMaze-v3",
     "parking-v0",
     "rejeu/Ball-v0",
 )
@@ -85,8 +88,13 @@ def load(name: str, folder: Path = DATA) -> Any:
 
 
 def measured() -> list[PresetResult]:
-    """Returns the results of all presets from ``benchmarks/results/learning``, with the unmodified preset first."""
-    found = [result_of(load(path.name, path.parent)) for path in sorted((DATA / "learning").glob("*.json"))]
+    """Returns the results of all presets from ``benchmarks/results/learning``, with the unmodified preset first.
+
+    Those in goal environments are in ``goals``, unless there is a file of the same name with another budget.
+    """
+    files = [*(DATA / "learning" / "goals").glob("*.json"), *(DATA / "learning").glob("*.json")]
+    paths = {path.name: path for path in files if not path.name.startswith("choice-")}
+    found = [result_of(load(path.name, path.parent)) for path in paths.values()]
     return sorted(found, key=lambda result: (result.env_id, result.algorithm, result.setting))
 
 
