@@ -79,6 +79,22 @@ def test_a_model_is_pushed_with_its_card_and_pulled_again(server, run, capsys, m
     assert "config.json" not in server["me/last"]
 
 
+def test_the_files_are_written_to_a_folder_without_an_upload(server, run, tmp_path, capsys, monkeypatch):
+    """``--out``; the video of a model file is the one of its name."""
+    monkeypatch.setattr(rejeu.DQN, "export", lambda agent, path: Path(path).write_bytes(b"onnx"))
+    (run / "agent.mp4").write_bytes(b"film")
+    assert main(["push", str(run / "agent.safetensors"), "me/cart", "--out", str(tmp_path / "files")]) == 0
+    assert not server
+    assert "video.mp4" in capsys.readouterr().out
+    written = {one.name: one.read_bytes() for one in (tmp_path / "files").iterdir()}
+    assert {*written} == {"agent.safetensors", "README.md", "policy.onnx", "video.mp4"}
+    assert written["video.mp4"] == b"film"
+    assert written["agent.safetensors"] == (run / "agent.safetensors").read_bytes()
+    assert b'src="video.mp4"' in written["README.md"]
+    assert main(["push", str(run), "me/cart", "--out", str(tmp_path / "files")]) == 2
+    assert "not an empty folder" in capsys.readouterr().err
+
+
 def test_models_of_stable_baselines3_are_pulled(server, capsys):
     server["me/theirs"] = {
         f"{name}{suffix}": (SB3 / f"ppo-normalized{suffix}").read_bytes()

@@ -25,7 +25,8 @@ from rejeu.lab.reporting import run_list, runs
 from rejeu.logs import statistics
 from rejeu.logs.formatting import counted
 
-FILES = ("config.json", "episodes.csv", "metrics.csv", "evaluations.csv", "curve.png", "video.mp4")
+VIDEO = "video.mp4"
+FILES = ("config.json", "episodes.csv", "metrics.csv", "evaluations.csv", "curve.png", VIDEO)
 """Files of a run folder that are pushed, besides the model."""
 MODEL, ONNX, CARD = "agent.safetensors", "policy.onnx", "README.md"
 WANTED = (*FILES, MODEL, ONNX, f"{ONNX}.json", CARD, "*.zip", "*.pkl", "args.yml", "config.yml", "env_kwargs.yml")
@@ -83,14 +84,23 @@ def push(source: str | Path, repo: str, private: bool = False, note: Callable[[s
 
 
 def lay_out(source: str | Path, folder: Path, repo: str, note: Callable[[str], Any] = print) -> Agent:
-    """Writes the files of a repository to an empty folder and returns the agent; arguments are those of :func:`push`."""
+    """Writes the files of a repository to a new or empty folder, and returns the agent.
+
+    The other arguments and errors are those of :func:`push`. The video of a model file has its name, as ``rejeu record``
+    writes it.
+
+    Raises:
+        FileExistsError: if the folder holds something.
+    """
     source = Path(source)
     model = find_model(source)
     agent = load(model)
+    check_free(folder)
+    folder.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(model, folder / MODEL)
-    for name in FILES if source.is_dir() else ():
-        if runs.is_file(source / name):
-            shutil.copyfile(source / name, folder / name)
+    files = [source / name for name in FILES] if source.is_dir() else [source.with_suffix(".mp4")]
+    for path in filter(runs.is_file, files):
+        shutil.copyfile(path, folder / (path.name if source.is_dir() else VIDEO))
     try:
         agent.export(folder / ONNX)
     except (ImportError, OSError, RuntimeError, ValueError) as error:
@@ -117,8 +127,7 @@ def pull(repo: str, out: str | Path | None = None) -> Path:
         MissingExtra: if ``huggingface-hub`` is not installed.
     """
     out = Path(repo.rpartition("/")[2] if out is None else out)
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise FileExistsError(f"{out} exists and is not an empty folder; name another with --out")
+    check_free(out)
     parent = out.absolute().parent
     parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=parent) as made, interface() as hub:
@@ -138,6 +147,12 @@ def pull(repo: str, out: str | Path | None = None) -> Path:
             out.rmdir()
         room.rename(out)
     return out
+
+
+def check_free(folder: Path) -> None:
+    """Raises ``FileExistsError`` unless a folder is new or empty."""
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise FileExistsError(f"{folder} exists and is not an empty folder; name another with --out")
 
 
 def is_wanted(name: str) -> bool:
@@ -168,7 +183,7 @@ def card(agent: Agent, repo: str, source: Path, names: set[str]) -> str:
     lines += [evaluation[0], ""] if evaluation is not None else []
     lines += ["```", f"rejeu pull {repo}", f"rejeu evaluate {repo.rpartition('/')[2]}/{MODEL}", "```", ""]
     lines += ["![Learning curve](curve.png)", ""] if "curve.png" in names else []
-    lines += ['<video controls src="video.mp4"></video>', ""] if "video.mp4" in names else []
+    lines += ['<video controls src="video.mp4"></video>', ""] if VIDEO in names else []
     if ONNX in names:
         lines += [f"`{ONNX}` is the policy from observation to action, with its normalization and scaling.", ""]
     return "\n".join(lines)

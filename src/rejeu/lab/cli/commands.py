@@ -530,6 +530,8 @@ class Push:
     repo: Annotated[str, Shown("USER/MODEL", is_positional=True)]
     private: bool = False
     """Make a new repository private."""
+    out: Annotated[Path | None, Shown("FOLDER")] = None
+    """Write the files to this new folder instead, and upload nothing."""
     json: Json = False
 
 

@@ -215,9 +215,13 @@ def run_import(arguments: Import) -> tuple[int, dict[str, Any]]:
 
 
 def run_push(arguments: Push) -> tuple[int, dict[str, Any]]:
-    """Uploads a model and prints its address."""
+    """Uploads a model, or writes the files that would be, and prints where they are."""
     from rejeu.lab import hub
 
+    if arguments.out is not None:
+        hub.lay_out(arguments.run, arguments.out, arguments.repo, echo)
+        echo(f"{arguments.out}: {', '.join(sorted(one.name for one in arguments.out.iterdir()))}")
+        return 0, {"folder": arguments.out}
     address = hub.push(arguments.run, arguments.repo, arguments.private, echo)
     echo(address)
     return 0, {"address": address}
