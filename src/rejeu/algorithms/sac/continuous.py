@@ -40,7 +40,7 @@ from rejeu.algorithms.soft import EntropyConfig, SoftCritic, soft_actor_critic
 from rejeu.core.algorithm import Algorithm, Clock, Explorer, PyTree, Transition, weighted_mean
 from rejeu.core.distributions import TanhNormal
 from rejeu.core.spaces import Leaf, action_dimension, check_box_action
-from rejeu.core.validation import coerce, flag, number, whole
+from rejeu.core.validation import LARGEST_VALUE, coerce, flag, number, whole
 from rejeu.exploration.held_noise import held_explorer
 from rejeu.networks import (
     Network,
@@ -93,7 +93,7 @@ class Config(EntropyConfig):
         coerce(self, "target_subset", whole, least=1, optional=True)
         if (self.target_subset or 0) > self.n_critics:
             raise ValueError(f"target_subset={self.target_subset} is more than n_critics={self.n_critics}")
-        coerce(self, ("v_min", "v_max"), number, optional=True)
+        coerce(self, ("v_min", "v_max"), number, least=-LARGEST_VALUE, most=LARGEST_VALUE, optional=True)
         if self.v_min is not None and self.v_max is not None and self.v_min >= self.v_max:
             raise ValueError(f"v_min={self.v_min} must be below v_max={self.v_max}")
         coerce(self, "use_sde", flag)
