@@ -196,7 +196,7 @@ def goals(choice: str = "") -> str:
         words, runs = shlex.split(content["command"]), content["runs"]
         if path.name.startswith("choice-") != bool(choice):
             continue
-        curves = [dict(run["success_curve"]) for run in runs]
+        curves = [dict(run.get("success_curve", [])) for run in runs]
         minutes = [run["seconds"] / 60 for run in runs]
         options = " ".join(words[4:]).replace("--continue", "")
         rows.append(
