@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 
@@ -12,6 +13,15 @@ class MissingExtra(ImportError):
     def __init__(self, purpose: str, package: str, extra: str = "") -> None:
         needed = f'"rejeu[{extra}]"' if extra else package
         super().__init__(f"{purpose} needs {package}, which is not installed; run: pip install {needed}")
+
+
+@contextmanager
+def requires(purpose: str, package: str, extra: str = "") -> Iterator[None]:
+    """Raises :class:`MissingExtra` with these arguments in the place of an ``ImportError`` inside."""
+    try:
+        yield
+    except ImportError:
+        raise MissingExtra(purpose, package, extra) from None
 
 
 class CheckpointError(ValueError):

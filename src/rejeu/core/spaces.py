@@ -220,12 +220,7 @@ def check_box_action(space: spaces.Space, algorithm: str) -> spaces.Box:
         ValueError: otherwise, naming what to use instead.
     """
     if not isinstance(space, spaces.Box):
-        instead = (
-            "for this environment use DQN"
-            if isinstance(space, spaces.Discrete)
-            else "wrap the environment in a gymnasium.ActionWrapper with a Box action space"
-        )
-        raise ValueError(f"{algorithm} needs a Box action space, got {space}; {instead}")
+        raise wrong_action(space, algorithm, "Box", "use DQN" if isinstance(space, spaces.Discrete) else "")
     check_not_empty(space)
     if not bounded(space).all():
         raise ValueError(
@@ -246,13 +241,15 @@ def check_discrete_action(space: spaces.Space, algorithm: str) -> int:
         ValueError: for another space, naming what to use instead.
     """
     if not isinstance(space, spaces.Discrete):
-        instead = (
-            "for this environment use SAC or TD3"
-            if isinstance(space, spaces.Box)
-            else "wrap the environment in a gymnasium.ActionWrapper with a Discrete action space"
-        )
-        raise ValueError(f"{algorithm} needs a Discrete action space, got {space}; {instead}")
+        raise wrong_action(space, algorithm, "Discrete", "use SAC or TD3" if isinstance(space, spaces.Box) else "")
     return int(space.n)
+
+
+def wrong_action(space: spaces.Space, algorithm: str, kind: str, advice: str) -> ValueError:
+    """Returns the error for actions that are not of ``kind``, with advice for these, if there is any."""
+    wrapped = f"wrap the environment in a gymnasium.ActionWrapper with a {kind} action space"
+    instead = f"for this environment {advice}" if advice else wrapped
+    return ValueError(f"{algorithm} needs a {kind} action space, got {space}; {instead}")
 
 
 def check_action(space: spaces.Space, algorithm: str) -> spaces.Space:

@@ -31,7 +31,7 @@ from gymnasium.envs.registration import EnvSpec
 from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.core import interrupt, spaces
 from rejeu.core.algorithm import Algorithm, Clock, Metrics, PyTree, averaged_fields, names
-from rejeu.core.errors import MissingExtra
+from rejeu.core.errors import requires
 from rejeu.core.validation import number, whole
 from rejeu.demonstrations import dataset
 from rejeu.envs.masks import for_agent, split
@@ -105,10 +105,8 @@ def read(path: str | Path) -> Demonstrations:
         ValueError: if there are several, or the dataset has no step or is damaged.
         MissingExtra: if Minari is not installed.
     """
-    try:
+    with requires("reading demonstrations", "minari[hdf5]", "play"):
         import h5py  # noqa: F401
-    except ImportError:
-        raise MissingExtra("reading demonstrations", "minari[hdf5]", "play") from None
     path = Path(path)
     files = (file for pattern in (dataset.METADATA, "*.hdf5") for file in path.rglob(pattern))
     found = sorted({file.parent for file in files if file.parent.name == "data"})

@@ -14,7 +14,7 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
 from rejeu.core import atomic
-from rejeu.core.errors import MissingExtra
+from rejeu.core.errors import requires
 from rejeu.core.failed_writes import FailedWrites
 from rejeu.demonstrations import dataset
 from rejeu.envs.validation import id_of
@@ -45,12 +45,10 @@ class Recording:
     """
 
     def __init__(self, folder: str | Path, env: gym.Env, fps: float | None, by: str = "human") -> None:
-        try:
+        with requires("recording", "minari[hdf5]", "play"):
             import h5py  # noqa: F401 - Minari's files
             import minari
             from minari.serialization import serialize_space
-        except ImportError:
-            raise MissingExtra("recording", "minari[hdf5]", "play") from None
         if fps is not None:
             ffmpeg()
         self.folder = Path(folder).absolute()

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rejeu.core.errors import MissingExtra
+from rejeu.core.errors import requires
 
 
 class Scene(NamedTuple):
@@ -52,10 +52,8 @@ class Canvas(Drawing):
         Raises:
             MissingExtra: if pygame is not installed.
         """
-        try:
+        with requires(f"drawing {title}", "pygame-ce", "play"):
             import pygame
-        except ImportError:
-            raise MissingExtra(f"drawing {title}", "pygame-ce", "play") from None
         self.pygame: Any = pygame
         self.size, self.fps, self.fine = size, fps, fine
         self.surface = pygame.Surface((size[0] * fine, size[1] * fine))

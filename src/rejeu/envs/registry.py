@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
 
-from rejeu.core.errors import MissingExtra
+from rejeu.core.errors import MissingExtra, requires
 
 PLAIN_ID = re.compile(r"[\w./-]{1,200}")
 """Pattern of ids that are looked up. An id with a colon makes Gymnasium import a module."""
@@ -225,10 +225,8 @@ def import_envpool() -> Any:
         MissingExtra: if it is not installed.
     """
     if "envpool" in sys.modules or not (tables := _tables_of_envpool()):
-        try:
+        with requires("backend='envpool'", f"EnvPool ({ENVPOOL_SIZE})", "envpool"):
             return importlib.import_module("envpool")
-        except ImportError:
-            raise MissingExtra("backend='envpool'", f"EnvPool ({ENVPOOL_SIZE})", "envpool") from None
     sys.modules["envpool.entry"] = ModuleType("envpool.entry")
     envpool = importlib.import_module("envpool")
     for name, path in tables.items():

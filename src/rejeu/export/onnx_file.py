@@ -8,17 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from rejeu.core.errors import MissingExtra
+from rejeu.core.errors import requires
 from rejeu.export import PRIMITIVES
 from rejeu.export.check import Run, one_by_one
 from rejeu.export.contract import Exportable, Policy
 from rejeu.export.program import Operation, Value, unsupported
 
-try:
+with requires("export to ONNX", "onnx", "export"):
     import onnx
     from onnx import helper, numpy_helper
-except ImportError:
-    raise MissingExtra("export to ONNX", "onnx", "export") from None
 
 OPSET, IR_VERSION = 18, 8
 """Of December 2022; ONNX Runtime reads them since version 1.14."""

@@ -19,7 +19,7 @@ from rejeu.agents import load, zip_files
 from rejeu.agents.agent import Agent
 from rejeu.checkpoints import pickled
 from rejeu.checkpoints.run_folder import find_model
-from rejeu.core.errors import MissingExtra
+from rejeu.core.errors import requires
 from rejeu.core.records import brief
 from rejeu.lab.reporting import run_list, runs
 from rejeu.logs import statistics
@@ -40,11 +40,9 @@ def interface() -> Iterator[Any]:
     Raises:
         MissingExtra: if it is not installed.
     """
-    try:
+    with requires("the hub", "huggingface-hub", "hub"):
         import huggingface_hub
         from huggingface_hub import errors
-    except ImportError:
-        raise MissingExtra("the hub", "huggingface-hub", "hub") from None
     transport: Any = errors.HfHubHTTPError.__bases__[0]  # of the library for HTTP, which depends on the version
     try:
         yield huggingface_hub

@@ -24,7 +24,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from rejeu.core import atomic
-from rejeu.core.errors import MissingExtra
+from rejeu.core.errors import requires
 from rejeu.core.failed_writes import MAX_ROWS, RETRY_SECONDS, FailedWrites
 from rejeu.logs import trackers
 from rejeu.logs.formatting import LOGS, Display
@@ -300,11 +300,9 @@ def import_tensorboard() -> tuple[Any, Any]:
     Raises:
         MissingExtra: if it is not installed.
     """
-    try:
+    with requires("logging to TensorBoard", "tensorboard", "tensorboard"):
         from tensorboard.compat.proto.event_pb2 import Event
         from tensorboard.summary.writer.record_writer import RecordWriter
-    except ImportError:
-        raise MissingExtra("logging to TensorBoard", "tensorboard", "tensorboard") from None
     return Event, RecordWriter
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Protocol, runtime_checkable
 
-from rejeu.core.errors import MissingExtra
+from rejeu.core.errors import requires
 from rejeu.logs.tables import flat
 
 PROJECT = "rejeu"
@@ -196,13 +196,11 @@ def imported(kind: str) -> Any:
     Raises:
         MissingExtra: if it is not installed.
     """
-    try:
+    with requires(f"the log {kind!r}", kind, kind):
         if kind == "wandb":
             import wandb as package
         elif kind == "mlflow":
             import mlflow as package
         else:
             import trackio as package
-    except ImportError:
-        raise MissingExtra(f"the log {kind!r}", kind, kind) from None
     return package

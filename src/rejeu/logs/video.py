@@ -19,7 +19,7 @@ import gymnasium as gym
 import numpy as np
 
 from rejeu.core import atomic
-from rejeu.core.errors import MissingExtra
+from rejeu.core.errors import requires
 from rejeu.core.interrupt import Interrupt
 from rejeu.core.validation import number, whole
 from rejeu.envs.make import InProcess
@@ -37,10 +37,8 @@ def ffmpeg() -> str:
     Raises:
         MissingExtra: if imageio-ffmpeg, which contains it, is not installed.
     """
-    try:
+    with requires("recording a video", "imageio-ffmpeg", "video"):
         import imageio_ffmpeg
-    except ImportError:
-        raise MissingExtra("recording a video", "imageio-ffmpeg", "video") from None
     return imageio_ffmpeg.get_ffmpeg_exe()
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from gymnasium import spaces
 from jax import Array
 
-from rejeu.core.errors import MissingExtra
+from rejeu.core.errors import requires
 from rejeu.envs.functional.protocol import FunctionalEnv, time_is_up
 
 INVERTED_PENDULUM = """
@@ -140,8 +140,6 @@ def import_mjx() -> Any:
     Raises:
         MissingExtra: if it is not installed.
     """
-    try:
+    with requires("environments on MJX", "mujoco-mjx", "mjx"):
         from mujoco import mjx
-    except ImportError:
-        raise MissingExtra("environments on MJX", "mujoco-mjx", "mjx") from None
     return mjx

@@ -8,7 +8,7 @@ from dataclasses import fields
 from pathlib import Path
 
 from rejeu.core import devices
-from rejeu.core.errors import MissingExtra
+from rejeu.core.errors import requires
 from rejeu.lab.cli.commands import PORT, Studio
 from rejeu.lab.cli.environment import Environment
 from rejeu.lab.runs.config import EnvironmentOptions, RunConfig
@@ -50,10 +50,8 @@ def open_studio(
         MissingExtra: if NiceGUI is not installed.
         OSError: if no port is free.
     """
-    try:
+    with requires("the studio", "nicegui", "studio"):
         import nicegui  # noqa: F401 - a missing one is named in one line
-    except ImportError:
-        raise MissingExtra("the studio", "nicegui", "studio") from None
     devices.start_with("--device", "cpu")  # the memory of a GPU is for what trains
     from rejeu.lab.studio import server, state
 

@@ -29,7 +29,7 @@ from rejeu.agents.presets import Preset
 from rejeu.checkpoints.model_files import WRONG
 from rejeu.checkpoints.run_folder import File
 from rejeu.core import atomic
-from rejeu.core.errors import CheckpointError, MissingExtra
+from rejeu.core.errors import CheckpointError, requires
 from rejeu.core.records import json_text
 from rejeu.lab.experiments import space as spaces, study_plan as plans
 from rejeu.lab.experiments.folder import begin
@@ -307,10 +307,8 @@ def readable(journal: Path) -> Iterator[None]:
 
 def require() -> None:
     """Raises :class:`MissingExtra` if Optuna is not installed."""
-    try:
+    with requires("rejeu tune", "optuna", "tune"):
         import optuna  # noqa: F401 - only whether it is there
-    except ImportError:
-        raise MissingExtra("rejeu tune", "optuna", "tune") from None
 
 
 def make_pruner(plan: StudyPlan) -> optuna.pruners.BasePruner:

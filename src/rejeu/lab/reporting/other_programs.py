@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from rejeu.algorithms.catalog import CATALOG
-from rejeu.core.errors import MissingExtra
+from rejeu.core.errors import requires
 from rejeu.core.records import Malformed, parse_json, shown
 from rejeu.lab.reporting.runs import MAX_NAME, MAX_STEP, RunSummary, is_file, ordered
 from rejeu.lab.runs.config import RunConfig
@@ -125,10 +125,8 @@ def read_tensorboard(folder: Path) -> RunSummary:
     Raises:
         MissingExtra: if tensorboard is not installed.
     """
-    try:
+    with requires("reading TensorBoard files", "tensorboard", "tensorboard"):
         import tensorboard.backend.event_processing.event_file_loader  # noqa: F401 - where it is used it may not fail
-    except ImportError:
-        raise MissingExtra("reading TensorBoard files", "tensorboard", "tensorboard") from None
     notes = []
     values: dict[str, dict[int, tuple[float, float]]] = {}
     for file in files(folder, EVENTS):

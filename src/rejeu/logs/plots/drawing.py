@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rejeu.core import atomic
-from rejeu.core.errors import MissingExtra
+from rejeu.core.errors import requires
 from rejeu.logs.charts import GROUP_COLORS, Chart
 
 if TYPE_CHECKING:
@@ -38,12 +38,10 @@ def make_figure(what: str, width: float = WIDTH, height: float = 4.2) -> Picture
     Raises:
         MissingExtra: if matplotlib is not installed. The message says that ``what`` needs it.
     """
-    try:
+    with requires(what, "matplotlib", "plot"):
         import matplotlib.figure  # noqa: F401 - also where our own module was imported before
 
         from rejeu.logs.plots.picture import Picture
-    except ImportError:
-        raise MissingExtra(what, "matplotlib", "plot") from None
     return Picture(figsize=(width, height), dpi=150, layout="constrained", facecolor="white")
 
 

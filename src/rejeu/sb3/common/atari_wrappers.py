@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from rejeu.core.errors import MissingExtra
+from rejeu.core.errors import requires
 
 __all__ = [
     "AtariWrapper",
@@ -130,10 +130,8 @@ class WarpFrame(gym.ObservationWrapper):
 
     def __init__(self, env: gym.Env, width: int = 84, height: int = 84) -> None:
         super().__init__(env)
-        try:
+        with requires("WarpFrame", "opencv-python-headless", "opencv-python-headless"):
             import cv2
-        except ImportError:
-            raise MissingExtra("WarpFrame", "opencv-python-headless", "opencv-python-headless") from None
         self._cv2 = cv2
         self.width, self.height = width, height
         self.observation_space = spaces.Box(0, 255, (height, width, 1), np.uint8)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from rejeu.core.errors import MissingExtra
+from rejeu.core.errors import requires
 from rejeu.sb3.common.monitor import load_results
 
 __all__ = [
@@ -73,10 +73,8 @@ def plot_curves(
     Raises:
         MissingExtra: if matplotlib is not installed.
     """
-    try:
+    with requires("plotting results", "matplotlib", "plot"):
         from matplotlib import pyplot
-    except ImportError:
-        raise MissingExtra("plotting results", "matplotlib", "plot") from None
     pyplot.figure(title, figsize=figsize)
     for x, y in xy_list:
         pyplot.scatter(x, y, s=2)

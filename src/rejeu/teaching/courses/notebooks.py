@@ -41,7 +41,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from rejeu.core.atomic import make_folder
-from rejeu.core.errors import MissingExtra
+from rejeu.core.errors import requires
 from rejeu.core.language import LANGUAGES, Language
 
 Version = Literal["exercise", "solution"]
@@ -112,10 +112,8 @@ def jupytext() -> Any:
     Raises:
         MissingExtra: if it is not installed.
     """
-    try:
+    with requires("notebooks of the courses", "jupytext", "course"):
         import jupytext
-    except ImportError:
-        raise MissingExtra("notebooks of the courses", "jupytext", "course") from None
     return jupytext
 
 

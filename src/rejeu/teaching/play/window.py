@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 
 from rejeu.core import hardware
-from rejeu.core.errors import MissingExtra
+from rejeu.core.errors import requires
 from rejeu.core.language import said
 from rejeu.logs.formatting import counted
 from rejeu.teaching.play.game import Event, Game, Player
@@ -53,10 +53,8 @@ class Window:
     """
 
     def __init__(self, title: str) -> None:
-        try:
+        with requires("playing", "pygame-ce", "play"):
             import pygame
-        except ImportError:
-            raise MissingExtra("playing", "pygame-ce", "play") from None
         self.pygame: Any = pygame
         self.title = title
         hardware.quiet_sdl()

@@ -10,7 +10,7 @@ from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rejeu.core.errors import MissingExtra
+from rejeu.core.errors import MissingExtra, requires
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -55,10 +55,8 @@ def render(template: str, data: Any, **context: Any) -> str:
 @cache
 def environment() -> Environment:
     """Returns the templates, which escape everything."""
-    try:
+    with requires("a report", "jinja2", "report"):
         import jinja2
-    except ImportError:
-        raise MissingExtra("a report", "jinja2", "report") from None
     return jinja2.Environment(
         loader=jinja2.FileSystemLoader(TEMPLATES),
         autoescape=True,

@@ -20,7 +20,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector.utils import concatenate, create_empty_array
 
-from rejeu.core.errors import MissingExtra
+from rejeu.core.errors import requires
 from rejeu.envs.rendering import check_renders, rgb_frame
 from rejeu.envs.workers.process import call_method
 from rejeu.logs.formatting import counted
@@ -405,10 +405,8 @@ def show(image: np.ndarray) -> None:
     Raises:
         MissingExtra: if pygame is not installed.
     """
-    try:
+    with requires("render('human')", "pygame-ce", "play"):
         import pygame
-    except ImportError:
-        raise MissingExtra("render('human')", "pygame-ce", "play") from None
     pygame.display.init()
     size = image.shape[1], image.shape[0]
     window = pygame.display.get_surface()
