@@ -253,7 +253,7 @@ def write(arguments: argparse.Namespace, results: list[dict[str, Any]]) -> None:
     """Writes the results so far with their summary over the seeds, and prints the newest."""
     print(json.dumps(results[-1]), flush=True)
     content = {
-        **provenance({str(arguments.shown): "FOLDER"}),
+        **provenance({str(arguments.shown): "FOLDER", str(arguments.out): "FILE"}),
         "machine": machine(),
         "summary": summarized(results),
         "results": results,
