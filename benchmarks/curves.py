@@ -1,7 +1,7 @@
 """Records the learning curves of the pages on algorithms, and plots them.
 
     python benchmarks/curves.py record SAC     # trains three seeds; writes benchmarks/results/curves/SAC.json
-    python benchmarks/curves.py plot           # writes docs/images/curves/ALGORITHM.png for each of these files
+    python benchmarks/curves.py plot           # writes docs/images/curves/ALGORITHM.png for each of these files, and goals.png
 
 A curve is the mean return of the latest 20 training episodes, exploration included, at 100 equally spaced steps. The dashed
 line is the published return of ``benchmarks/results/published.json``.
@@ -90,6 +90,21 @@ def plot(path: Path, published: list[dict[str, Any]]) -> None:
     style.save(figure, PICTURES / f"{data['algorithm']}.png")
 
 
+def plot_goals(panel: Any, title: str, paths: list[Path]) -> None:
+    """Plots the success rates of files of ``learning.py`` against steps: the mean of the seeds and their range."""
+    style.format_axes(panel)
+    for (color, _), path in zip(style.GROUP_COLORS, paths, strict=False):
+        runs = json.loads(path.read_text(encoding="utf-8"))["runs"]
+        steps = [step for step, _ in runs[0]["success_curve"]]
+        rates = np.array([[rate for _, rate in run["success_curve"]] for run in runs])
+        label = path.stem.removeprefix("choice-").removesuffix("-SAC")
+        panel.plot(steps, rates.mean(axis=0), color=color, label=f"{label} ({len(runs)})", marker=".")
+        panel.fill_between(steps, rates.min(axis=0), rates.max(axis=0), color=color, alpha=0.15, linewidth=0)
+    panel.set(xlabel="environment steps", ylabel="success rate", ylim=(0, 1.02))
+    panel.xaxis.set_major_formatter("{x:,.0f}")
+    style.add_title_and_legend(panel, title)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("action", choices=("record", "plot"))
@@ -102,6 +117,18 @@ def main() -> None:
     published = json.loads((RESULTS / "published.json").read_text(encoding="utf-8"))
     for path in sorted((RESULTS / "curves").glob("*.json")):
         plot(path, published)
+    files = [path for path in sorted((RESULTS / "learning" / "goals").glob("*.json")) if curved(path)]
+    figure = style.make_figure("success in goal environments", height=7.2)
+    above, below = figure.subplots(2, 1)
+    chosen = [path for path in files if path.stem.startswith("choice-")]
+    plot_goals(above, "Presets (number of seeds)", [path for path in files if path not in chosen])
+    plot_goals(below, "What was compared (number of seeds)", chosen)
+    style.save(figure, PICTURES / "goals.png")
+
+
+def curved(path: Path) -> bool:
+    """Returns whether a file of ``learning.py`` has success rates on the way."""
+    return all("success_curve" in run for run in json.loads(path.read_text(encoding="utf-8"))["runs"])
 
 
 if __name__ == "__main__":
