@@ -89,7 +89,15 @@ def test_an_impossible_setting_is_refused_in_one_line(name, settings, message):
 
 
 WRONG = object(), float("nan"), -1e30
-NEGATIVE = ("target_entropy", "log_std_init", "sde_log_std_init", "munchausen_clip", "v_min", "v_max", "alive_bonus_offset")
+NEGATIVE = (
+    "target_entropy",
+    "log_std_init",
+    "sde_log_std_init",
+    "munchausen_clip",
+    "v_min",
+    "v_max",
+    "alive_bonus_offset",
+)
 """Settings that take any finite number, which may be below 0."""
 ALIASES = {"rnd": "(rnd|coefficient)", "action_noise": "(action_noise|sigma)", "vf": "(vf|qf)"}
 """What errors may name instead: a nested setting, or the critic's widths."""
