@@ -25,6 +25,8 @@ from structure import imports, parse  # beside this file
 ROOT = Path(__file__).resolve().parents[1]
 SERVED = {"rejeu.lab.studio": "tests.lab.studio"}
 """Folders of modules that tests reach by a server in another process, and the folders of these tests."""
+DISPATCHING = {"rejeu.algorithms.ddpg", "rejeu.algorithms.sac"}
+"""Packages whose ``make`` chooses one of their modules by the spaces. Tests of such a module call it by its package."""
 
 
 def definitions(modules: dict[str, tuple[Path, ast.Module]]) -> dict[tuple[str, str], str]:
@@ -106,7 +108,9 @@ def tests_of(changed: Iterable[str]) -> list[str]:
     found: set[str] = set()
     for module in (paths[one] for one in changed if one in paths):
         found |= {name for name in needs if f"test_{module.rpartition('.')[2]}" == name.rpartition(".")[2]}
-        ring, seen = {module}, {module}
+        package = {module.rpartition(".")[0]}
+        ring = {module} | (package if package <= importers[module] & DISPATCHING else set())
+        seen = set(ring)
         while ring and not (of_ring := {name for name, modules in needs.items() if modules & ring}):
             ring = set[str]().union(*(importers[one] for one in ring)) - seen
             seen |= ring

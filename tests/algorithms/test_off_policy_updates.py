@@ -91,7 +91,7 @@ CASES = {
     "SAC": Case(sac, references.SAC, {**TEMPERATURE, "n_critics": 3}),
     "SAC, fixed": Case(sac, references.SAC, {**FIXED, "n_critics": 3}, weighted=True),
     "SAC, target entropy": Case(sac, references.SAC, {**TEMPERATURE, "target_entropy": -0.5, "n_critics": 3}),
-    "SAC, bounds": Case(sac, references.SAC, {**TEMPERATURE, "n_critics": 3, "v_min": -0.3, "v_max": 0.4}),
+    "SAC, bounds": Case(sac, references.SAC, {**TEMPERATURE, "n_critics": 3, "v_min": -0.3, "v_max": 0.1}),
     "SAC, Discrete, bound": Case(sac, references.DiscreteSAC, {**TEMPERATURE, "v_max": 0.2}, discrete=True),
     "SAC, REDQ": Case(sac, references.SAC, {**TEMPERATURE, **REDQ}, weighted=True),
     "SAC, Discrete": Case(sac, references.DiscreteSAC, TEMPERATURE, discrete=True),
