@@ -165,8 +165,7 @@ def main() -> None:
     find = zoo if arguments.zoo else presets.find
     of = arguments.preset or arguments.algorithm
     if of == "default":
-        config = rejeu.AGENTS[arguments.algorithm].algorithm.Config
-        preset = presets.default(arguments.env_id, arguments.algorithm, config.for_new)
+        preset = presets.default(arguments.env_id, arguments.algorithm, presets.small(arguments.algorithm))
     else:
         preset = find(arguments.env_id, of) or presets.named(of, arguments.env_id, arguments.algorithm)
     if preset is None:

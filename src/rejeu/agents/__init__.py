@@ -157,8 +157,10 @@ def find_preset(env_id: str, algorithm: str | None, path: str | Path | None) -> 
     return preset
 
 
-def choose_algorithm(preset: Preset | None, env_id: str, actions: gym.Space) -> str:
-    """Returns the algorithm of a preset, else the default for a space of actions.
+def choose_algorithm(
+    preset: Preset | None, env_id: str, observations: gym.Space, actions: gym.Space, is_long: bool = False
+) -> str:
+    """Returns the algorithm of a preset, else the default for the spaces.
 
     Raises:
         ValueError: if there is none.
@@ -169,7 +171,8 @@ def choose_algorithm(preset: Preset | None, env_id: str, actions: gym.Space) -> 
     if kind not in all_presets.ALGORITHM_FOR:
         known = ", ".join(f"{name} takes {space}" for space, name in all_presets.ALGORITHM_FOR.items())
         raise ValueError(f"{env_id} has the actions {actions}, which no algorithm here takes; {known}")
-    return all_presets.ALGORITHM_FOR[kind]
+    is_vector = isinstance(observations, gym.spaces.Box) and len(observations.shape) == 1
+    return all_presets.FOR_LONG_RUNS if kind == "Box" and is_vector and is_long else all_presets.ALGORITHM_FOR[kind]
 
 
 def load(path: str | Path, env: Any = None, **changes: Any) -> Agent:

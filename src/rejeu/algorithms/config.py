@@ -118,8 +118,6 @@ class AlgorithmConfig:
     """The same where the observation is an image."""
     for_many: ClassVar[Mapping[str, Any]] = {}
     """Hyperparameters that ``rejeu train`` uses with 64 environments or more, without a preset."""
-    for_new: ClassVar[Mapping[str, Any]] = {}
-    """Those that it uses with fewer, without a preset and without images."""
     search_space: ClassVar[SearchSpace] = {}
     """Where ``rejeu tune`` searches, by the name of the hyperparameter."""
 

@@ -33,7 +33,7 @@ Unlike in the paper on dueling networks, the gradients of both streams enter the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, ClassVar, Literal, NamedTuple
@@ -79,17 +79,6 @@ MARGIN = 0.8
 """By how much a demonstrated action should be better than the others; that of arXiv 1704.03732."""
 HIDDEN_LAYERS = (64, 64)
 """Default widths of the network but on images, those of Stable-Baselines3."""
-FOR_NEW = {
-    "learning_rate": "lin_1e-3",
-    "batch_size": 128,
-    "buffer_size": 100_000,
-    "n_steps": 2,
-    "gradient_steps": 2,
-    "target_update_interval": 500,
-    "exploration_fraction": 0.3,
-    "policy_kwargs": {"net_arch": [128, 128]},
-}
-"""What ``rejeu train`` uses where there is no preset: the defaults are those for images, and learn vectors slowly."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -185,7 +174,6 @@ class Config(QLearningConfig):
     """Values from ``v_min`` to ``v_max``, at equal distances. A larger number describes the distribution more finely."""
 
     name: ClassVar[str] = "DQN"
-    for_new: ClassVar[Mapping[str, Any]] = FOR_NEW
 
     def __post_init__(self) -> None:
         QLearningConfig.__post_init__(self)

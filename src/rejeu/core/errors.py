@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from importlib import metadata
 from pathlib import Path
 
 
@@ -22,6 +23,13 @@ def requires(purpose: str, package: str, extra: str = "") -> Iterator[None]:
         yield
     except ImportError:
         raise MissingExtra(purpose, package, extra) from None
+
+
+def installed(package: str) -> str | None:
+    """Returns the version of a package, None if it is not installed."""
+    with suppress(metadata.PackageNotFoundError):
+        return metadata.version(package)
+    return None
 
 
 class CheckpointError(ValueError):

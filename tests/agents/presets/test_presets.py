@@ -54,7 +54,7 @@ def test_a_preset_with_a_name_is_for_any_environment():
     assert find_preset("CartPole-v1", None, "Rainbow") == presets.named("Rainbow", "CartPole-v1")
 
 
-def test_sizes_are_presets_of_each_algorithm_and_used_only_by_name():
+def test_sizes_are_presets_of_each_algorithm_with_a_name():
     widths = lambda found: found.hyperparameters["policy_kwargs"]["net_arch"]["qf"]  # noqa: E731
     found = {name: find_preset("Hopper-v5", name, "small") for name in ("FlashSAC", "XQC")}
     assert {name: widths(one) for name, one in found.items()} == {"FlashSAC": [64, 64], "XQC": [128, 128]}

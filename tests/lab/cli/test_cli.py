@@ -13,10 +13,10 @@ from types import SimpleNamespace
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.envs.registration import EnvSpec
 
 import rejeu
 from rejeu.agents import AGENTS
-from rejeu.algorithms.dqn import FOR_NEW
 from rejeu.callbacks import Evaluate
 from rejeu.checkpoints import run_folder as folder
 from rejeu.lab import cli
@@ -27,6 +27,7 @@ from rejeu.lab.cli.train import untuned
 from rejeu.lab.reporting.report.page import plotly_script
 from rejeu.lab.runs import config
 from rejeu.logs.logging import CsvFile
+from tests.environments import Counter, Reach
 from tests.full_disk import FullDisk
 from tests.helpers import assert_same_parameters
 from tests.tiers import exhaustive
@@ -296,10 +297,39 @@ def test_set_understands_pythons_false_and_leaves_the_preset_as_it_was():
     assert preset.hyperparameters["policy_kwargs"]["net_arch"] != [1]
 
 
+@pytest.mark.parametrize(
+    ("options", "algorithm"),
+    [
+        ([], "XQC"),
+        (["--steps", "100000"], "XQC"),
+        (["--minutes", "20"], "XQC"),
+        (["--steps", "99999"], "SAC"),
+        (["--minutes", "19"], "SAC"),
+        (["--set", "gamma=0.98"], "SAC"),
+        (["--envs", "64"], "SAC"),
+        (["--algo", "td3"], "TD3"),
+        (["--env-kwargs", "goals=true"], "SAC"),
+    ],
+)
+@pytest.mark.usefixtures("untrained")
+def test_long_runs_without_a_preset_and_without_settings_take_xqc_for_box_actions(
+    options, algorithm, tmp_path, monkeypatch
+):
+    slider = EnvSpec("Slider-v0", lambda goals=False: Reach() if goals else Counter(), max_episode_steps=10)
+    monkeypatch.setitem(gym.registry, slider.id, slider)
+    assert main(["train", slider.id, *options, "--out", str(tmp_path / "run")]) == 0
+    found = json.loads((tmp_path / "run" / "config.json").read_text())
+    assert found["algorithm"] == algorithm
+    assert not found["preset"]
+    if algorithm == "XQC":
+        assert found["steps"] == (None if "--minutes" in options else 100_000)
+        assert found["hyperparameters"]["policy_kwargs"]["qf"] == [128, 128]
+
+
 @pytest.mark.usefixtures("untrained")
 def test_without_a_preset_dqn_has_values_of_its_own_but_on_images(tmp_path):
     few, pixels = SimpleNamespace(n_envs=1, observation_space=CUBE), gym.spaces.Box(0, 255, (36, 36, 3), np.uint8)
-    assert untuned("DQN", few) == FOR_NEW
+    assert untuned("DQN", few) == rejeu.agents.presets.small("DQN") != {}
     assert untuned("DQN", SimpleNamespace(n_envs=1, observation_space=gym.spaces.Dict(eye=pixels, arm=CUBE))) == {}
     assert untuned("PQN", few) == {}
     assert (

@@ -197,6 +197,8 @@ ALGORITHM_FOR = {
     "Tuple": "PPO",
 }
 """The default algorithm of an environment without a preset, by the class of its action space."""
+FOR_LONG_RUNS = "XQC"
+"""The one for vectors and Box actions in runs of 100,000 steps or 20 minutes; see docs/choosing.md."""
 
 
 def register(algorithm: str, presets: tuple[Preset, ...]) -> None:
@@ -217,6 +219,11 @@ def named(name: str, env_id: str, algorithm: str | None = None) -> Preset | None
     """
     known = [preset for preset in every() if preset.name.lower() == name.lower() != ""]
     return max(known, key=lambda one: (one.algorithm == algorithm, one.env_id == env_id), default=None)
+
+
+def small(algorithm: str) -> Mapping[str, Any]:
+    """Returns the hyperparameters of an algorithm's preset ``small``, which is for any environment; empty if it has none."""
+    return next((one.hyperparameters for one in every() if (one.name, one.algorithm) == ("small", algorithm)), {})
 
 
 def default(env_id: str, algorithm: str, hyperparameters: Mapping[str, Any] = MappingProxyType({})) -> Preset:

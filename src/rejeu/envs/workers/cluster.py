@@ -14,10 +14,9 @@ import threading
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from importlib import metadata
 from typing import Any
 
-from rejeu.core.errors import ClusterError, MissingExtra
+from rejeu.core.errors import ClusterError, MissingExtra, installed
 
 LOOPBACK = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
 """Environment variable without which Ray listens on the address of a network card, also for processes of one machine."""
@@ -161,13 +160,8 @@ def versions(more: Iterable[str] = ()) -> dict[str, str]:
     Args:
         more: further packages.
     """
-    found = {"Python": ".".join(platform.python_version_tuple()[:2])}
-    for package in (*MATCHING, *more):
-        try:
-            found[package] = metadata.version(package)
-        except metadata.PackageNotFoundError:
-            found[package] = ""
-    return found
+    python = ".".join(platform.python_version_tuple()[:2])
+    return {"Python": python, **{package: installed(package) or "" for package in (*MATCHING, *more)}}
 
 
 def check_versions(there: Mapping[str, str], where: str, here: Mapping[str, str] | None = None) -> None:

@@ -41,7 +41,7 @@ class Stopwatch:
 
 def header(config: DecidedRun, environment: Environment, backend: str, folder: RunFolder) -> str:
     """Returns the first lines of a run; ``backend`` describes the backend."""
-    what = "preset" if config.preset else "default hyperparameters"
+    what = "preset" if config.preset else "no preset"
     length = f"{config.minutes:g} minutes" if config.steps is None else f"{config.steps:,} steps"
     every = f"evaluated on {counted(config.evaluate_episodes, 'episode')} every {config.evaluate_every:,} steps"
     return "\n".join(

@@ -78,7 +78,8 @@ def begin(arguments: Train, stack: ExitStack) -> Session:
     made = environment.from_arguments(arguments.env, arguments)
     preset = find_preset(made.env_id, algorithm, None if arguments.preset is None else str(arguments.preset))
     env = stack.enter_context(closing(make_env(arguments, made, preset, seed)))
-    algorithm = algorithm or choose_algorithm(preset, env.env_id, env.action_space)
+    is_long = arguments.is_long and not arguments.hyperparameters and env.n_envs < MANY
+    algorithm = algorithm or choose_algorithm(preset, env.env_id, env.observation_space, env.action_space, is_long)
     config = make_config(arguments, made, preset, algorithm, env, seed, logs)
     general: dict[str, Any] = {"seed": seed, "success_threshold": config.success_threshold, "device": config.device}
     agent = AGENTS[algorithm](config.policy, env, **general, **config.hyperparameters)
@@ -126,7 +127,7 @@ def untuned(algorithm: str, env: VectorEnv) -> Mapping[str, Any]:
     config = AGENTS[algorithm].algorithm.Config
     if env.n_envs >= MANY:
         return config.for_many
-    return {} if any(leaf.kind == "image" for leaf in leaves(env.observation_space)) else config.for_new
+    return {} if any(leaf.kind == "image" for leaf in leaves(env.observation_space)) else presets.small(algorithm)
 
 
 def make_config(

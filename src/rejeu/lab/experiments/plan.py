@@ -177,7 +177,10 @@ def expanded(
                 own = convert(setting.get(str(algorithm), {}), Kwargs)
                 path = None if environment.run.preset is None else str(environment.run.preset)
                 preset = find_preset(environment.run.env, algorithm, path)
-                chosen = algorithm or choose_algorithm(preset, environment.run.env, environment.action)
+                is_long = environment.run.is_long and not any(settings.values())
+                chosen = algorithm or choose_algorithm(
+                    preset, environment.run.env, environment.observation, environment.action, is_long
+                )
                 common = {key: value for key, value in setting.items() if key != "algorithms" and key not in AGENTS}
                 base = preset or presets.default(environment.run.env, chosen)
                 config = read_hyperparameters(chosen, base.hyperparameters, {**common, **own})

@@ -14,7 +14,6 @@ import platform
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
-from importlib import metadata
 from itertools import chain
 from pathlib import Path
 from types import UnionType
@@ -24,7 +23,7 @@ from msgspec import Meta
 
 from rejeu.checkpoints.run_folder import RunFolder, newest_inside
 from rejeu.core import atomic
-from rejeu.core.errors import CheckpointError
+from rejeu.core.errors import CheckpointError, installed
 from rejeu.core.records import (
     Count,
     Duration,
@@ -39,6 +38,9 @@ from rejeu.core.records import (
 )
 from rejeu.core.validation import with_value
 from rejeu.logs.formatting import LOGS, quoted
+
+PACKAGES = ("rejeu", "jax", "jaxlib", "numpy", "equinox", "optax", "gymnasium", "envpool", "highway-env")
+"""Those whose versions matter for a run."""
 
 
 def assigned(assignments: Iterable[str], option: str = "--set") -> dict[str, Any]:
@@ -266,6 +268,11 @@ class RunConfig(EnvironmentOptions):
             raise ValueError(f"steps={self.steps} and minutes={self.minutes:g} exclude each other; give one of them")
 
     @property
+    def is_long(self) -> bool:
+        """Whether it is to take 100,000 steps, which is the default, or 20 minutes; see :func:`choose_algorithm`."""
+        return (self.steps or 100_000) >= 100_000 if self.minutes is None else self.minutes >= 20
+
+    @property
     def typed(self) -> str:
         """The environment as it was named on the command line."""
         return self.env_argument or self.env
@@ -437,10 +444,4 @@ def read_task(path: Path) -> Task:
 
 def versions() -> dict[str, str | None]:
     """Returns the versions of Python and of the packages that matter for a run, None for those that are not installed."""
-    found: dict[str, str | None] = {"python": platform.python_version()}
-    for package in ("rejeu", "jax", "jaxlib", "numpy", "equinox", "optax", "gymnasium", "envpool", "highway-env"):
-        try:
-            found[package] = metadata.version(package)
-        except metadata.PackageNotFoundError:
-            found[package] = None
-    return found
+    return {"python": platform.python_version(), **{package: installed(package) for package in PACKAGES}}
