@@ -93,6 +93,8 @@ def test_the_files_are_written_to_a_folder_without_an_upload(server, run, tmp_pa
     assert b'src="video.mp4"' in written["README.md"]
     assert main(["push", str(run), "me/cart", "--out", str(tmp_path / "files")]) == 2
     assert "not an empty folder" in capsys.readouterr().err
+    assert main(["push", str(tmp_path / "files"), "me/cart", "--out", str(tmp_path / "again")]) == 0  # no run folder
+    assert {one.name for one in (tmp_path / "again").iterdir()} == {*written}
 
 
 def test_models_of_stable_baselines3_are_pulled(server, capsys):

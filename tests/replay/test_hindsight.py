@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from scipy import stats
 
-from rejeu.envs.goals import GoalFunctions
+from rejeu.envs.goals import GoalFunctions, over_batches
 from rejeu.replay.hindsight import (
     GoalSelectionStrategy,
     HerReplayBuffer,
@@ -41,18 +41,27 @@ def terminated(achieved, desired):
     return (achieved[..., 1] % 3 == desired[..., 1] % 3) & (achieved[..., 0] <= desired[..., 0])
 
 
-def filled(n_envs, rows, history, strategy="future", k=4, n_steps=1, ends=False, priorities=False):
-    config = HindsightConfig(n_sampled_goal=k, goal_selection_strategy=strategy)
+def by_info(function, other, dtype):
+    """The function of single goals; ``other`` with the info of another step, and an error without one."""
+    return over_batches(lambda a, d, info: function(a, d) if info["place"] == a[1] else other, dtype)
+
+
+def filled(n_envs, rows, history, strategy="future", k=4, n_steps=1, ends=False, priorities=False, infos=False):
+    config = HindsightConfig(n_sampled_goal=k, goal_selection_strategy=strategy, copy_info_dict=infos)
     ring = make_ring(rows * n_envs, n_envs, GOAL_OBSERVATION, counters(config))
+    goals = GoalFunctions(reward, terminated if ends else None)
+    if infos:
+        goals = GoalFunctions(by_info(reward, 1e6, np.float32), by_info(terminated, True, bool) if ends else None)
     replay = HerReplayBuffer(
         ring,
         GAMMA,
         config,
-        GoalFunctions(reward, terminated if ends else None),
+        goals,
         n_steps,
         Priorities(ring, PriorityConfig()) if priorities else None,
     )
     model = Model(n_envs, rows)
+    replay.last_infos = lambda: [{"place": len(frames)} for frames in model.frames]  # the place that a step leads to
     play(replay, model, history, observe_goal)
     return replay, model
 
@@ -100,10 +109,11 @@ def histories(draw):
     n_steps=st.integers(1, 4),
     ends=st.booleans(),
     priorities=st.booleans(),
+    infos=st.booleans(),
     seed=st.integers(0, 1000),
 )
-def test_samples_agree_with_a_brute_force_relabeller(case, strategy, k, n_steps, ends, priorities, seed):
-    replay, model = filled(*case, strategy, k, n_steps, ends, priorities)
+def test_samples_agree_with_a_brute_force_relabeller(case, strategy, k, n_steps, ends, priorities, infos, seed):
+    replay, model = filled(*case, strategy, k, n_steps, ends, priorities, infos)
     steps = set(model.steps())
     assert replay.size() == len(steps)
     if not steps:

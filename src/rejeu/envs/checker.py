@@ -31,7 +31,7 @@ from rejeu.envs import masks, validation
 from rejeu.envs.base import SEEDS_END
 from rejeu.envs.functional.gym_env import GymnasiumEnv
 from rejeu.envs.functional.protocol import FunctionalEnv
-from rejeu.envs.goals import attribute
+from rejeu.envs.goals import attribute, one_number
 
 MOST_STEPS = 2_000
 """Random steps after which episodes are assumed never to end, in an environment that declares no time limit."""
@@ -56,6 +56,8 @@ class Effort(NamedTuple):
     seconds: float = MOST_SECONDS
     is_patient: bool = True
     """Whether ``most_steps`` are taken, and not only those of ``seconds``, where no episode ends and none has to."""
+    keeps_infos: bool = False
+    """Whether functions of goals may depend on the info of the step."""
 
 
 QUICK = Effort(500, 20, 1.0, is_patient=False)
@@ -134,9 +136,9 @@ def findings(env: gym.Env | FunctionalEnv, skip_render_check: bool = True) -> li
     return [*found.values()]
 
 
-def quick_findings(env: gym.Env) -> list[Finding]:
-    """Returns the errors that :func:`findings` returns, and whether episodes never end, from few steps."""
-    found = _played(env, QUICK)
+def quick_findings(env: gym.Env, keeps_infos: bool = False) -> list[Finding]:
+    """Returns the errors that :func:`findings` returns, and whether episodes never end, from few steps (:class:`Effort`)."""
+    found = _played(env, QUICK._replace(keeps_infos=keeps_infos))
     return [finding for key, finding in found.items() if finding.level == "error" or key == "endless"]
 
 
@@ -157,7 +159,7 @@ def _played(env: gym.Env, effort: Effort) -> dict[str, Finding]:
     found: dict[str, Finding] = {}
     seen = _play(env, found, effort)
     if seen and isinstance(env.observation_space, spaces.Dict) and "desired_goal" in env.observation_space.spaces:
-        found |= {finding.text: finding for finding in goal_findings(env, seen)}
+        found |= {finding.text: finding for finding in goal_findings(env, seen, effort.keeps_infos)}
     return found
 
 
@@ -296,7 +298,7 @@ def _gymnasium_messages(env: gym.Env, skip_render_check: bool) -> list[str]:
     ]
 
 
-def goal_findings(env: gym.Env, seen: Sequence[SeenStep]) -> list[Finding]:
+def goal_findings(env: gym.Env, seen: Sequence[SeenStep], keeps_infos: bool = False) -> list[Finding]:
     """Returns the problems with the goals of an environment, from some of its steps: the first of each function."""
     try:
         check_goal_space(env.observation_space)
@@ -311,25 +313,28 @@ def goal_findings(env: gym.Env, seen: Sequence[SeenStep]) -> list[Finding]:
         return [Finding("error", text)]
     ended = [one for one in seen if one.terminated][: MOST_GOALS // 4]
     rows = [*seen[:MOST_GOALS], *ended]
-    first = [next(_goal_faults(name, one, rows), None) for name, one in functions.items() if one is not None]
+    first = [next(_goal_faults(name, f, rows, keeps_infos), None) for name, f in functions.items() if f is not None]
     return [Finding(*fault) for fault in first if fault is not None]
 
 
-def _goal_faults(name: str, function: Callable[..., Any], rows: Sequence[SeenStep]) -> Iterator[tuple[Level, str]]:
+def _goal_faults(
+    name: str, function: Callable[..., Any], rows: Sequence[SeenStep], keeps_infos: bool
+) -> Iterator[tuple[Level, str]]:
     """Yields the problems with ``compute_reward`` or ``compute_terminated``, the worst first."""
     for row in rows:
-        own = function(*_goals(row), row.info)
+        own = one_number(function(*_goals(row), row.info))
         if np.shape(own) != ():
             yield "error", f"{name} returned the shape {np.shape(own)} of one goal, expected one number; index it"
         yield from _against_step(name, own, row)
-        alone = _attempt(function, *_goals(row), {})
-        if isinstance(alone, Exception) or not _agree(own, alone):
+        alone = own if keeps_infos else _attempt(function, *_goals(row), {})
+        if isinstance(alone, Exception) or not _agree(own, one_number(alone)):
             yield (
                 "error",
-                f"{name} gave {own} with the info of the step, and {_describe_result(alone)} with an empty info; "
-                "hindsight replay keeps no infos: let it depend on the goals alone",
+                f"{name} gave {own} with the info of the step, and {_describe_result(alone)} with an empty info; let it "
+                "depend on the goals alone, or keep infos with replay_buffer_kwargs={'copy_info_dict': True}",
             )
-    yield from _against_batches(name, function, rows)
+    if not keeps_infos:
+        yield from _against_batches(name, function, rows)
 
 
 def _against_step(name: str, own: Any, row: SeenStep) -> Iterator[tuple[Level, str]]:
@@ -352,7 +357,7 @@ def _against_batches(name: str, function: Callable[..., Any], rows: Sequence[See
     """Yields the difference between the results for many goals at once and for each alone."""
     achieved, desired = (np.array([_goals(row)[k] for row in rows]) for k in range(2))
     achieved, desired = np.concatenate([achieved] * 2), np.concatenate([np.roll(desired, 1, axis=0), achieved])
-    single = [_attempt(function, a, d, {}) for a, d in zip(achieved, desired, strict=True)]
+    single = [one_number(_attempt(function, a, d, {})) for a, d in zip(achieved, desired, strict=True)]
     for one in single:
         if isinstance(one, Exception):
             yield (

@@ -22,15 +22,15 @@ class GoalFunctions(NamedTuple):
 
     reward: Callable[..., np.ndarray]
     """Returns the rewards; takes ``infos``, one dict for each row, as a third argument."""
-    terminated: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None
-    """Returns which steps are terminal. If this is None, relabeled steps keep their termination flags."""
+    terminated: Callable[..., np.ndarray] | None = None
+    """Returns which steps are terminal, with the same arguments. If it is None, relabeled steps keep their flags."""
 
 
-def parking_reward(achieved: np.ndarray, desired: np.ndarray) -> np.ndarray:
+def parking_reward(achieved: np.ndarray, desired: np.ndarray, infos: Any = None) -> np.ndarray:
     """Returns ``-sqrt(weights . |achieved - desired|)``, the reward of ``parking-v0`` without its collision penalty.
 
     Shapes ``(..., 6)`` to ``(...)``. It is equal to highway-env's ``compute_reward`` with the default configuration,
-    which does not include the -5 that ``step`` adds on a collision either.
+    which does not include the -5 that ``step`` adds on a collision either. Infos have no effect.
     """
     return -np.sqrt(np.abs(achieved - desired) @ PARKING_WEIGHTS.astype(achieved.dtype))
 

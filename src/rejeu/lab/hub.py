@@ -189,7 +189,7 @@ def card(agent: Agent, repo: str, source: Path, names: set[str]) -> str:
 
 def evaluated(source: Path) -> tuple[str, float] | None:
     """Returns a sentence about the best evaluation of a run, with a 95 % interval, and its mean return; None without any."""
-    if not source.is_dir():
+    if not (source / "config.json").is_file():  # a model, or a folder that was pulled
         return None
     table = run_list.read(source).evaluations
     if (row := runs.best_row(table)) is None:

@@ -198,8 +198,8 @@ class HindsightConfig:
     """``future``, ``final``, ``episode``, ``random``, ``closest``, ``next_future``, a ``GoalSelectionStrategy``, or a strategy
     of your own: a function ``(steps) -> times``, or its registered name (see ``rejeu.replay.hindsight.GoalStrategy``)."""
     copy_info_dict: bool = False
-    """Give ``compute_reward`` the info of each step, row by row, instead of an empty one. Files of the buffer and checkpoints
-    do not contain infos: after loading, those of earlier steps are empty."""
+    """Give ``compute_reward`` and ``compute_terminated`` the info of each step, row by row, instead of an empty one. Files of
+    the buffer and checkpoints do not contain infos: after loading, those of earlier steps are empty."""
 
     def __post_init__(self) -> None:
         coerce(self, "n_sampled_goal", whole, least=0)
@@ -291,12 +291,14 @@ class HerReplayBuffer(BaseReplayBuffer):
         which = relabeled_positions(shape, self.config.n_sampled_goal)
         index = self.goal_index(rng, rows.env[which], rows.time[which], read[0][which])
         goal = ring.read_leaf(self.achieved, index)
-        reward = self.goals.reward
+        reward, terminated = self.goals
         if self.infos is not None:
             times = rows.time[which, None] + np.arange(self.n_steps)
-            infos = [info or {} for info in self.infos[ring.index(rows.env[which, None], times)].ravel()]
-            reward = partial(reward, infos=infos)
-        goals = NewGoals(which, goal, self.achieved, reward, self.goals.terminated)
+            kept = self.infos[ring.index(rows.env[which, None], times)]
+            # After the end of an episode there is none, and what a function returns there does not count.
+            infos = [(info or row[0] or {}) for row in kept for info in row]
+            reward, terminated = partial(reward, infos=infos), terminated and partial(terminated, infos=infos)
+        goals = NewGoals(which, goal, self.achieved, reward, terminated)
         return self.batch(shape, rows, read, weight, goals), drawn
 
     def goal_index(self, rng: np.random.Generator, env: np.ndarray, time: np.ndarray, step: np.ndarray) -> np.ndarray:

@@ -27,6 +27,7 @@ from rejeu.lab.cli.train import untuned
 from rejeu.lab.reporting.report.page import plotly_script
 from rejeu.lab.runs import config
 from rejeu.logs.logging import CsvFile
+from tests.bad_environments import RewardReadsInfo
 from tests.environments import Counter, Reach
 from tests.full_disk import FullDisk
 from tests.helpers import assert_same_parameters
@@ -324,6 +325,16 @@ def test_long_runs_without_a_preset_and_without_settings_take_xqc_for_box_action
     if algorithm == "XQC":
         assert found["steps"] == (None if "--minutes" in options else 100_000)
         assert found["hyperparameters"]["policy_kwargs"]["qf"] == [128, 128]
+
+
+@pytest.mark.usefixtures("untrained")
+def test_rewards_of_goals_may_read_the_info_only_if_it_is_kept(tmp_path, monkeypatch, capsys):
+    spec = EnvSpec("ReadsInfo-v0", RewardReadsInfo, max_episode_steps=10)
+    monkeypatch.setitem(gym.registry, spec.id, spec)
+    argv = ["train", spec.id, "--algo", "sac", "--steps", "20", "--set", "replay_buffer_class=HerReplayBuffer"]
+    assert main([*argv, "--out", str(tmp_path / "refused")]) == 2
+    assert "keep infos with replay_buffer_kwargs={'copy_info_dict': True}" in capsys.readouterr().err
+    assert main([*argv, "replay_buffer_kwargs.copy_info_dict=true", "--out", str(tmp_path / "run")]) == 0
 
 
 @pytest.mark.usefixtures("untrained")

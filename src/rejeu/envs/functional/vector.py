@@ -268,6 +268,6 @@ def goal_functions(env: FunctionalEnv) -> GoalFunctions | None:
     goal = env.observation_space["achieved_goal"]  # type: ignore[index]
     is_judged = jax.eval_shape(env.compute_terminated, goal.sample(), goal.sample()) is not None
     return GoalFunctions(
-        lambda achieved, desired: np.asarray(reward(achieved, desired), np.float32),
-        (lambda achieved, desired: np.asarray(terminated(achieved, desired), bool)) if is_judged else None,
+        lambda achieved, desired, infos=None: np.asarray(reward(achieved, desired), np.float32),
+        (lambda achieved, desired, infos=None: np.asarray(terminated(achieved, desired), bool)) if is_judged else None,
     )

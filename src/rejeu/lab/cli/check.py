@@ -40,8 +40,8 @@ def run_check(arguments: Check) -> tuple[int, dict[str, Any]]:
     return int(n_errors > 0), {"env_id": arguments.env, **counts, "findings": findings}
 
 
-def before_training(made: Environment) -> None:
-    """Prints the errors of an environment of one's own, and warns of episodes that never end.
+def before_training(made: Environment, config: Any) -> None:
+    """Prints the errors of an environment of one's own, and warns of episodes that never end; ``config`` is the algorithm's.
 
     A new environment takes some steps; random numbers of NumPy and Python are as before.
 
@@ -54,7 +54,8 @@ def before_training(made: Environment) -> None:
 
     states = random.getstate(), np.random.get_state()  # noqa: NPY002 - of other code
     with closing(made.make()) as env:
-        found = sorted(checker.quick_findings(env))
+        hindsight = getattr(config, "hindsight", None)
+        found = sorted(checker.quick_findings(env, keeps_infos=hindsight is not None and hindsight.copy_info_dict))
     random.setstate(states[0])
     np.random.set_state(states[1])  # noqa: NPY002
     errors = [finding.text for finding in found if finding.level == "error"]

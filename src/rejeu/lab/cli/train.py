@@ -84,7 +84,7 @@ def begin(arguments: Train, stack: ExitStack) -> Session:
     general: dict[str, Any] = {"seed": seed, "success_threshold": config.success_threshold, "device": config.device}
     agent = AGENTS[algorithm](config.policy, env, **general, **config.hyperparameters)
     if env.backend not in ("envpool", "jax"):
-        check.before_training(made)
+        check.before_training(made, agent.config)
     return Session(
         agent,
         config,
