@@ -6,7 +6,8 @@
 It runs in an environment with Stable-Baselines3 and without rejeu, and plays 100 episodes with the last weights, as
 ``learning.py --zoo`` does. The seeds are added to those in ``benchmarks/results/zoo_original.json``. ``--goals`` takes the
 settings of rejeu's preset but for ``layer_norm`` and ``n_steps``, which Stable-Baselines3 does not have with hindsight, and
-records success rates and seconds in ``benchmarks/results/goals_original.json``.
+for ``learning_starts`` where no episode has ended by then; Gymnasium-Robotics 1.4 needs ``mujoco<3.12`` there. It records
+success rates and seconds in ``benchmarks/results/goals_original.json``.
 """
 
 from __future__ import annotations
@@ -54,6 +55,8 @@ def train(preset: dict[str, Any], seed: int) -> Any:
     if has_goals := "replay_buffer_class" in settings:
         policy.pop("layer_norm", None)
         settings.pop("n_steps", None)
+        length = env.get_attr("spec")[0].max_episode_steps or 0  # it samples from finished episodes only
+        settings["learning_starts"] = max(settings["learning_starts"], (length + 1) * preset["n_envs"])
         settings |= {"replay_buffer_class": stable_baselines3.HerReplayBuffer, "gradient_steps": -1}
     kind = "MultiInputPolicy" if has_goals else "MlpPolicy"
     model = algorithm(kind, env, seed=seed, device="cpu", **{**settings, "policy_kwargs": policy})

@@ -161,12 +161,21 @@ def test_vectors_of_goal_environments_offer_their_functions():
         np.testing.assert_array_equal(vector.goals().reward(achieved, desired), [0.0, 0.0, -1.0])
 
 
-def test_envpool_and_highway_env_reward_parking_alike():
+def test_envpool_and_highway_env_reward_parking_and_end_alike():
+    """highway-env has no ``compute_terminated``; its episodes end where ``_is_success`` says."""
     achieved, desired = goals(50, 6)
-    one, two = (
-        make_vector("parking-v0", backend=b).goals().reward(achieved, desired) for b in ("envpool", "gymnasium")
+    near = achieved + 0.01 * desired
+    own = gym.make("parking-v0").unwrapped
+    envpool, gymnasium, hard = (
+        make_vector(name, backend=b).goals()
+        for name, b in (("parking-v0", "envpool"), ("parking-v0", "gymnasium"), ("rejeu/ParkingHard-v0", "gymnasium"))
     )
-    np.testing.assert_allclose(one, two, rtol=1e-5)
+    for goal in (desired, near):
+        np.testing.assert_allclose(envpool.reward(achieved, goal), gymnasium.reward(achieved, goal), rtol=1e-5)
+        ends = [bool(own._is_success(*pair)) for pair in zip(achieved, goal, strict=True)]
+        assert any(ends) == (goal is near)
+        for functions in (envpool, gymnasium, hard):
+            np.testing.assert_array_equal(functions.terminated(achieved, goal), ends)
 
 
 class ReachNested(Reach):

@@ -15,7 +15,7 @@ from rejeu.core.validation import whole
 from rejeu.envs import goals as goals_module
 from rejeu.envs.action_log import MOST_IMAGE_STEPS, MOST_STEPS, ActionLog, replay
 from rejeu.envs.base import SEEDS_END, SUCCESS_KEYS, DivergedError, Seed, Step, VectorEnv, checked_seed, replaced
-from rejeu.envs.goals import GoalFunctions
+from rejeu.envs.goals import PARKED, GoalFunctions, parking_reward
 from rejeu.envs.registry import (
     import_envpool,
     in_envpool,
@@ -138,7 +138,7 @@ class EnvPool(VectorEnv):
         if "desired_goal" not in getattr(self.observation_space, "spaces", ()):
             return None
         if self.env_id == "parking-v0":
-            return GoalFunctions(goals_module.parking_reward)
+            return GoalFunctions(parking_reward, lambda *goals, infos=None: parking_reward(*goals) > PARKED)
         return goals_module.goal_functions(make_env(self.env_id))
 
     def close(self) -> None:

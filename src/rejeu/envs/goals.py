@@ -12,6 +12,8 @@ from rejeu.envs.validation import describe_value
 
 PARKING_WEIGHTS = np.array([1.0, 0.3, 0.0, 0.0, 0.02, 0.02])
 """Weights of x, y, vx, vy, cos h, sin h in highway-env's ``parking-v0`` (1.12, default configuration)."""
+PARKED = -0.12
+"""Reward above which a vehicle is parked there, and the episode ends."""
 
 NUMBERS = {bool, int, float, np.bool_, np.float32, np.float64}
 """Types of one number that functions of goals usually return."""
@@ -38,16 +40,16 @@ def parking_reward(achieved: np.ndarray, desired: np.ndarray, infos: Any = None)
 def goal_functions(env: Any) -> GoalFunctions | None:
     """Returns the goal functions of a Gymnasium environment, or None if it has no ``compute_reward``.
 
-    ``compute_terminated`` is included if the environment has it. Whether the functions accept batches is determined at
-    the first call, see :func:`over_batches`.
+    ``compute_terminated`` is included if the environment has it, or is one of highway-env's, which end at a reward that
+    their ``config`` has. Whether the functions accept batches is determined at the first call, see :func:`over_batches`.
     """
     reward = attribute(env, "compute_reward")
     if reward is None:
         return None
-    terminated = attribute(env, "compute_terminated")
-    return GoalFunctions(
-        over_batches(reward, np.float32), None if terminated is None else over_batches(terminated, np.bool_)
-    )
+    terminated, config = attribute(env, "compute_terminated"), attribute(env, "config")
+    if terminated is None and isinstance(config, dict) and "success_goal_reward" in config:
+        terminated = lambda *goals: reward(*goals) > -config["success_goal_reward"]  # noqa: E731
+    return GoalFunctions(over_batches(reward, np.float32), terminated and over_batches(terminated, np.bool_))
 
 
 def attribute(env: Any, name: str) -> Any:

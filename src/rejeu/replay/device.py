@@ -231,7 +231,7 @@ class DeviceReplay:
             n = self.n_relabeled
             goal_rows = self.goal_positions(ring, goals_key, jax.tree.map(lambda x: x[:n], rows))
             goal = ring.obs[self.achieved][goal_rows]
-            goals = NewGoals(slice(n), goal, self.achieved, reward, terminated)
+            goals = NewGoals(slice(n), goal, (self.achieved, self.desired), reward, terminated)
         return self.batch(ring, rows, goals)._replace(weight=weight), rows
 
     @property

@@ -13,8 +13,9 @@ drawn: the share ``k / (k + 1)`` of every batch gets, in place of its own goal, 
   2025, "Next-Future", arXiv 2504.11247),
 
 and the environment's reward for that goal. Of episodes that still run, or whose beginning was overwritten, the stored
-part is used. ``terminated`` is recomputed if the environment has ``compute_terminated``, and kept otherwise: a crash
-remains a crash. Each strategy is one definition for host and device.
+part is used. ``terminated`` is recomputed if the environment has ``compute_terminated``, and kept otherwise. An episode that
+ended where its own goal was not reached, as in a crash, ends there with any goal. Each strategy is one definition for host
+and device.
 """
 
 from __future__ import annotations
@@ -298,7 +299,7 @@ class HerReplayBuffer(BaseReplayBuffer):
             # After the end of an episode there is none, and what a function returns there does not count.
             infos = [(info or row[0] or {}) for row in kept for info in row]
             reward, terminated = partial(reward, infos=infos), terminated and partial(terminated, infos=infos)
-        goals = NewGoals(which, goal, self.achieved, reward, terminated)
+        goals = NewGoals(which, goal, (self.achieved, self.desired), reward, terminated)
         return self.batch(shape, rows, read, weight, goals), drawn
 
     def goal_index(self, rng: np.random.Generator, env: np.ndarray, time: np.ndarray, step: np.ndarray) -> np.ndarray:

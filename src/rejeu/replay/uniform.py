@@ -262,12 +262,22 @@ class NewGoals(NamedTuple):
     """Which transitions."""
     goal: Any
     """Their new goals, ``(n_goals, ...)``."""
-    achieved: int
-    """Index of the leaf of the achieved goal."""
+    leaves: tuple[int, int]
+    """Indices of the leaves of the achieved and of the desired goal."""
     reward: Callable[[Any, Any], Any]
     """The reward of achieved and desired goals."""
-    terminated: Callable[[Any, Any], Any] | None
-    """Whether they end the episode; None if the steps keep their own flags."""
+    terminated: Any
+    """Whether they end the episode, a function as ``reward``; None if the steps keep their own flags."""
+
+    def ends(self, reached: Any, goal: Any, own: Any, ended: Any) -> Any:
+        """Returns which steps end an episode: those that reach ``goal``, and those that ended otherwise, as in a crash.
+
+        ``ended`` says which of them ended with the goals ``own``.
+        """
+        ends = self.terminated(reached, goal).astype(bool)
+        if isinstance(ended, np.ndarray) and not ended.any():
+            return ends
+        return ends | (ended & ~self.terminated(reached, own).astype(bool))
 
 
 class Outcome(NamedTuple):
@@ -285,40 +295,30 @@ def outcome(
     xp: Any, ring: Any, index: Callable[..., Any], rows: Any, n_steps: int, goals: NewGoals | None = None
 ) -> Outcome:
     """Returns what ``rows`` lead to in up to ``n_steps`` steps, with new goals if there are any."""
-    if goals is not None and not len(goals.goal):
-        goals = None
+    goals = goals if goals is not None and len(goals.goal) else None
+    if goals is not None:
+        which, times = goals.which, rows.time[goals.which, None] + 1 + xp.arange(n_steps)[None]
+        position = index(rows.env[which, None], times).reshape(-1)
+        reached, own = (ring.obs[leaf][position] for leaf in goals.leaves)
     if n_steps == 1:
         rewards, terminated = ring.reward[rows.position], ring.kind[rows.position]  # which is STEP or TERMINATED
         if goals is not None:
-            reached = ring.obs[goals.achieved][index(rows.env[goals.which], rows.time[goals.which] + 1)]
-            rewards = replaced(rewards, goals.which, goals.reward(reached, goals.goal))
+            rewards = replaced(rewards, which, goals.reward(reached, goals.goal))
             if goals.terminated is not None:
-                terminated = replaced(terminated, goals.which, goals.terminated(reached, goals.goal))
+                ends = goals.ends(reached, goals.goal, own, terminated[which] == TERMINATED)
+                terminated = replaced(terminated, which, ends)
         return Outcome(rewards, 1, terminated)
-    window = look_ahead(xp, ring, index, rows, n_steps)
-    rewards = ring.reward[window.position]
+    position, valid, terminal = look_ahead(xp, ring, index, rows, n_steps)
+    rewards = ring.reward[position]
     if goals is not None:
-        times = rows.time[goals.which, None] + 1 + xp.arange(n_steps)[None]
-        reached = ring.obs[goals.achieved][index(rows.env[goals.which, None], times)]
-        rewards, window = with_new_goals(xp, rewards, window, reached, goals)
-    rewards = xp.where(window.valid, rewards, xp.float32(0))
-    return Outcome(rewards, window.valid.sum(axis=1), window.terminal.any(axis=1))
-
-
-def with_new_goals(xp: Any, rewards: Any, window: StepWindow, reached: Any, goals: NewGoals) -> tuple[Any, StepWindow]:
-    """Returns rewards ``(batch, n)`` and window of transitions some of which have new goals.
-
-    ``reached`` are the goals achieved by each of their steps, ``(n_goals, n, ...)``. Arrays of NumPy are mutated.
-    """
-    which, goal, valid, terminal, n = goals.which, goals.goal, window.valid, window.terminal, window.valid.shape[1]
-    reached, each = reached.reshape(-1, *goal.shape[1:]), xp.repeat(goal, n, axis=0)
-    rewards = replaced(rewards, which, goals.reward(reached, each).reshape(-1, n))
-    if goals.terminated is not None:
-        ends = goals.terminated(reached, each).astype(bool).reshape(-1, n) & valid[which]
-        goes_on = xp.cumsum(ends, axis=1)[:, :-1] == 0
-        valid = replaced(valid, (which, slice(1, None)), valid[which][:, 1:] & goes_on)
-        terminal = replaced(terminal, which, ends) & valid
-    return rewards, StepWindow(window.position, valid, terminal)
+        each = xp.repeat(goals.goal, n_steps, axis=0)
+        rewards = replaced(rewards, which, goals.reward(reached, each).reshape(-1, n_steps))
+        if goals.terminated is not None:
+            ends = goals.ends(reached, each, own, terminal[which].reshape(-1)).reshape(-1, n_steps) & valid[which]
+            goes_on = xp.cumsum(ends, axis=1)[:, :-1] == 0
+            valid = replaced(valid, (which, slice(1, None)), valid[which][:, 1:] & goes_on)
+            terminal = replaced(terminal, which, ends) & valid
+    return Outcome(xp.where(valid, rewards, xp.float32(0)), valid.sum(axis=1), terminal.any(axis=1))
 
 
 def replaced(array: Any, which: Any, values: Any) -> Any:

@@ -91,4 +91,8 @@ def test_rewards_of_goals_are_those_of_hindsight_on_the_host():
     rng = np.random.default_rng(0)
     achieved, desired = rng.normal(size=(2, 5, 3, 6)).astype(np.float32)
     np.testing.assert_allclose(ENV.compute_reward(achieved, desired), parking_reward(achieved, desired), rtol=1e-6)
-    assert ENV.compute_terminated(achieved, desired) is None
+    near = achieved + 0.01 * desired
+    for goal, some in ((desired, False), (near, True)):
+        ends = np.asarray(ENV.compute_terminated(achieved, goal))
+        np.testing.assert_array_equal(ends, parking_reward(achieved, goal) > -0.12)
+        assert ends.any() == some

@@ -17,6 +17,7 @@ from gymnasium import spaces
 from jax import Array
 
 from rejeu.envs.functional.protocol import GoalEnv, time_is_up
+from rejeu.envs.goals import PARKED, PARKING_WEIGHTS
 
 LENGTH, WIDTH = 5.0, 2.0
 """Of the vehicle, in m."""
@@ -26,9 +27,8 @@ N_FRAMES, TIME_STEP = 3, 1.0 / 15.0
 """Steps of simulation in a step of the environment, and the length of one in s."""
 SCALES = np.array([100.0, 100.0, 5.0, 5.0, 1.0, 1.0])
 """Divisors of x, y, vx, vy, cos h and sin h in observations."""
-REWARD_WEIGHTS = np.array([1.0, 0.3, 0.0, 0.0, 0.02, 0.02])
-SUCCESS_REWARD, COLLISION_REWARD = -0.12, -5.0
-"""The goal is reached at rewards above the former; the latter is added in a collision."""
+COLLISION_REWARD = -5.0
+"""What is added in a collision."""
 
 N_COLUMNS = 14
 """Parking spots in each of the two rows."""
@@ -69,8 +69,8 @@ class Parking(GoalEnv):
     """A vehicle must park in a given spot of a walled lot, as in highway-env's ``parking-v0``.
 
     Actions are acceleration and steering in [-1, 1]. The reward is ``-sqrt(w . |achieved - desired|)``, minus 5 in a
-    collision. The episode terminates at the goal (reward above -0.12) and in a collision. As in highway-env,
-    :meth:`compute_reward` does not contain collisions and relabeled steps keep their termination flags.
+    collision. The episode terminates at the goal (reward above -0.12) and in a collision, which :meth:`compute_reward` and
+    :meth:`compute_terminated` do not contain.
 
     In double precision a step differs from highway-env 1.12.1 by rounding only.
     """
@@ -105,16 +105,19 @@ class Parking(GoalEnv):
         obs = observe(state)
         closeness = self.compute_reward(obs["achieved_goal"], obs["desired_goal"])
         reward = closeness + jnp.where(state.crashed, COLLISION_REWARD, 0.0)
-        terminated = state.crashed | (closeness > SUCCESS_REWARD)
+        terminated = state.crashed | (closeness > PARKED)
         return state, obs, reward, terminated, time_is_up(state.time, self.max_episode_steps)
 
     def compute_reward(self, achieved_goal: Array, desired_goal: Array, info: object = None) -> Array:
         difference = jnp.abs(achieved_goal - desired_goal)
-        return -jnp.sqrt(difference @ jnp.asarray(REWARD_WEIGHTS, difference.dtype))
+        return -jnp.sqrt(difference @ jnp.asarray(PARKING_WEIGHTS, difference.dtype))
+
+    def compute_terminated(self, achieved_goal: Array, desired_goal: Array, info: object = None) -> Array:
+        return self.compute_reward(achieved_goal, desired_goal) > PARKED
 
     def success(self, state: State) -> Array:
         obs = observe(state)
-        return self.compute_reward(obs["achieved_goal"], obs["desired_goal"]) > SUCCESS_REWARD
+        return self.compute_terminated(obs["achieved_goal"], obs["desired_goal"])
 
 
 def observe(state: State) -> dict[str, Array]:

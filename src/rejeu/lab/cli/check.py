@@ -54,8 +54,8 @@ def before_training(made: Environment, config: Any) -> None:
 
     states = random.getstate(), np.random.get_state()  # noqa: NPY002 - of other code
     with closing(made.make()) as env:
-        hindsight = getattr(config, "hindsight", None)
-        found = sorted(checker.quick_findings(env, keeps_infos=hindsight is not None and hindsight.copy_info_dict))
+        keeps_infos = getattr(getattr(config, "hindsight", None), "copy_info_dict", False)
+        found = sorted(checker.quick_findings(env, keeps_infos))
     random.setstate(states[0])
     np.random.set_state(states[1])  # noqa: NPY002
     errors = [finding.text for finding in found if finding.level == "error"]

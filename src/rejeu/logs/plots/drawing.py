@@ -90,7 +90,7 @@ def draw(panel: Axes, chart: Chart, along: str = "x", unit: float = 1.0) -> None
         panel.set_ylim(*chart["range"])
     panel.set_ylabel(chart["y"])
     panel.xaxis.set_major_formatter(thousands)
-    panel.yaxis.set_major_formatter(percents if chart.get("percent") else thousands)
+    panel.yaxis.set_major_formatter("{x:.0%}" if chart.get("percent") else thousands)
     format_axes(panel)
 
 
@@ -165,8 +165,3 @@ def thousands(value: float, _: float | None = None) -> str:
     '12,500'
     """
     return f"{value:,.10g}".replace("-", "\N{MINUS SIGN}")
-
-
-def percents(share: float, _: float | None = None) -> str:
-    """Formats a share as a percentage."""
-    return f"{share:.0%}"
