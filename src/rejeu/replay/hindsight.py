@@ -294,8 +294,7 @@ class HerReplayBuffer(BaseReplayBuffer):
         goal = ring.read_leaf(self.achieved, index)
         reward, terminated = self.goals
         if self.infos is not None:
-            times = rows.time[which, None] + np.arange(self.n_steps)
-            kept = self.infos[ring.index(rows.env[which, None], times)]
+            kept = self.infos[ring.index(rows.env[which, None], rows.time[which, None] + np.arange(self.n_steps))]
             # After the end of an episode there is none, and what a function returns there does not count.
             infos = [(info or row[0] or {}) for row in kept for info in row]
             reward, terminated = partial(reward, infos=infos), terminated and partial(terminated, infos=infos)
