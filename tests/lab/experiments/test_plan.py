@@ -1,10 +1,13 @@
 """Plans: what they expand to, and where a mistake is said to be."""
 
+import gymnasium as gym
 import pytest
+from gymnasium.envs.registration import EnvSpec
 
 import rejeu
 from rejeu.lab.experiments.folder import MAX_JOBS
 from rejeu.lab.experiments.plan import PlanError, read_plan
+from tests.environments import Counter
 
 PLAN = """\
 # two algorithms
@@ -58,6 +61,22 @@ def test_a_dict_is_a_plan_too():
     assert [job.name for job in plan.jobs] == ["CartPole-v1-DQN-seed3", "CartPole-v1-DQN-seed5"]
     plan, _ = read_plan({"environments": "CartPole-v1", "seeds": 2, "first_seed": 3})
     assert [job.run.seed for job in plan.jobs] == [3, 4]
+
+
+@pytest.mark.parametrize(
+    ("options", "algorithms"),
+    [
+        ({}, ["XQC"]),
+        ({"minutes": 5}, ["SAC"]),
+        ({"steps": 100_000}, ["XQC"]),
+        ({"settings": {"default": {}, "far": {"gamma": 0.999}}}, ["SAC", "SAC"]),  # one for all that are compared
+    ],
+)
+def test_without_algorithms_and_settings_long_runs_take_that_of_rejeu_train(options, algorithms, monkeypatch):
+    spec = EnvSpec("Slider-v0", Counter, max_episode_steps=10)
+    monkeypatch.setitem(gym.registry, spec.id, spec)
+    plan, _ = read_plan({"environments": spec.id, **options})
+    assert [job.run.algorithm for job in plan.jobs] == algorithms
 
 
 def test_options_of_one_environment():
