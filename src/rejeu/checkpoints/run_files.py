@@ -209,8 +209,8 @@ def _remove(path: Path) -> None:
         path.unlink()
 
 
-UPDATES = 3
-"""Number of the arithmetic of updates; a change that rounds anything differently raises it."""
+UPDATES = 4
+"""Number of the arithmetic of updates and batches; a change that rounds anything differently raises it."""
 
 
 def versions() -> dict[str, Any]:
