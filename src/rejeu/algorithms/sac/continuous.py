@@ -73,7 +73,7 @@ class Config(EntropyConfig):
     """Least return, to which the targets of the critics are clipped: with a reward of -1 in every step until the goal it is
     ``-1 / (1 - gamma)`` (the clipped targets of hindsight experience replay). None for no bound."""
     v_max: float | None = None
-    """Largest return, likewise: 0 with such rewards."""
+    """Largest return, likewise: 0 with such rewards. With ``norm_reward`` both bound the returns of normalized rewards."""
     use_sde: bool = False
     """Explore by state-dependent noise (gSDE, arXiv 2005.05719), which is kept for many steps and gives smooth motion. Box
     actions only, without ``action_noise``."""
