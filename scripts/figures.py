@@ -427,16 +427,25 @@ def speed(length: str = "") -> str:
     return table(("training steps per second", "vs. Stable-Baselines3", "vs. SBX"), rows)
 
 
+EQUAL_TIME = {
+    "FlashSAC 64/32": "minutes/{}-FlashSAC.json",
+    "FlashSAC 128/64": "minutes/{}-FlashSAC-128-64.json",
+    "XQC 64/32": "minutes/{}-XQC-64-32.json",
+    "XQC 128/64": "minutes/{}-XQC.json",
+    "SAC": "minutes/{}-SAC.json",
+    "FlashSAC `full`, GPU": "h200/{}-FlashSAC.json",
+}
+"""Learners, with the widths of critics and actor, and their files below ``learning`` for an environment."""
+
+
 def equal_time() -> str:
     """Returns on MuJoCo after equal time and at full size on a GPU, and as shares of TD3's return after a million steps."""
-    names = ("FlashSAC", "XQC", "SAC", "FlashSAC `full`, GPU")
-    shares: dict[str, list[float]] = {name: [] for name in names}
+    shares: dict[str, list[float]] = {name: [] for name in EQUAL_TIME}
     rows: list[tuple[str, ...]] = []
     for env_id, (least, td3) in TD3_RETURNS.items():
         cells = [env_id]
         for name, found in shares.items():
-            folder = "h200" if name.endswith("GPU") else "minutes"
-            path = DATA / "learning" / folder / f"{env_id}-{name.split()[0]}.json"
+            path = DATA / "learning" / EQUAL_TIME[name].format(env_id)
             if not path.exists():
                 cells.append("")
                 continue
@@ -447,7 +456,7 @@ def equal_time() -> str:
         rows.append(tuple(cells))
     means = (f"({np.mean(found):.2f})" if len(found) == len(TD3_RETURNS) else "" for found in shares.values())
     rows.append(("mean", *means))
-    return table(("environment", *names), rows)
+    return table(("environment", *EQUAL_TIME), rows)
 
 
 def data(path: str, key: str, *columns: str) -> str:
