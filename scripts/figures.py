@@ -220,7 +220,7 @@ def other_goals() -> str:
     rows = []
 
     def add(env_id: str, learner: str, entry: dict[str, Any], minutes: float) -> None:
-        rates = ", ".join(f"{100 * rate:.0f} % at {step:,}" for step, rate in entry["success_curve"])
+        rates = ", ".join(f"{100 * rate:.0f} % at {step:,}" for step, rate in dict(entry["success_curve"]).items())
         rows.append([env_id, learner, rates, f"{minutes:.0f}"])
 
     for entry in load("published.json"):
