@@ -214,7 +214,7 @@ class RunConfig(EnvironmentOptions):
     env: Annotated[str, Shown("ENV", is_positional=True)]
     """Id of an environment, such as parking-v0; or my_env:MyEnv-v0 or my_env.py, which is imported."""
     algorithm: Annotated[str | None, Shown("NAME", "algo")] = None
-    """Algorithm; by default the preset's, else the one that fits the environment's actions."""
+    """Algorithm; by default the preset's, else one that fits the actions and the length of the run."""
     preset: Annotated[str | bool | None, Shown("FILE"), Topic.TRAINING] = None
     """Use the preset in this file, such as the preset.json of rejeu tune, in the place of rejeu's own."""
     steps: Annotated[Positive | None, Shown("N")] = None
