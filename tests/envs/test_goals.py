@@ -13,6 +13,7 @@ import rejeu
 from rejeu.envs import checker
 from rejeu.envs.goals import goal_functions, over_batches, parking_reward
 from rejeu.envs.make import GymnasiumVector, InProcess, make_vector
+from rejeu.envs.registry import make_env
 from tests.environments import Counter, Reach
 from tests.helpers import small_sac
 from tests.tiers import only
@@ -165,7 +166,7 @@ def test_envpool_and_highway_env_reward_parking_and_end_alike():
     """highway-env has no ``compute_terminated``; its episodes end where ``_is_success`` says."""
     achieved, desired = goals(50, 6)
     near = achieved + 0.01 * desired
-    own = gym.make("parking-v0").unwrapped
+    own = make_env("parking-v0").unwrapped
     envpool, gymnasium, hard = (
         make_vector(name, backend=b).goals()
         for name, b in (("parking-v0", "envpool"), ("parking-v0", "gymnasium"), ("rejeu/ParkingHard-v0", "gymnasium"))
