@@ -326,5 +326,5 @@ def test_the_check_before_training_draws_no_random_numbers_of_others(here):
     random.seed(1)
     np.random.seed(1)  # noqa: NPY002
     expected = random.getstate(), np.random.get_state()[1].tolist()  # noqa: NPY002
-    check.before_training(made)
+    check.before_training(made, None)
     assert (random.getstate(), np.random.get_state()[1].tolist()) == expected  # noqa: NPY002
