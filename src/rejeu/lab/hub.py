@@ -18,7 +18,7 @@ from typing import Any
 from rejeu.agents import load, zip_files
 from rejeu.agents.agent import Agent
 from rejeu.checkpoints import pickled
-from rejeu.checkpoints.run_folder import find_model
+from rejeu.checkpoints.run_folder import check_free, find_model
 from rejeu.core.errors import requires
 from rejeu.core.records import brief
 from rejeu.lab.reporting import run_list, runs
@@ -145,12 +145,6 @@ def pull(repo: str, out: str | Path | None = None) -> Path:
             out.rmdir()
         room.rename(out)
     return out
-
-
-def check_free(folder: Path) -> None:
-    """Raises ``FileExistsError`` unless a folder is new or empty."""
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise FileExistsError(f"{folder} exists and is not an empty folder; name another with --out")
 
 
 def is_wanted(name: str) -> bool:

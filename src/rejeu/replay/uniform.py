@@ -275,8 +275,8 @@ class NewGoals(NamedTuple):
         ``ended`` says which of them ended with the goals ``own``.
         """
         ends = self.terminated(reached, goal).astype(bool)
-        goes_on = isinstance(ended, np.ndarray) and not ended.any()  # functions of single goals take long
-        return ends if goes_on else ends | (ended & ~self.terminated(reached, own).astype(bool))
+        none_ended = isinstance(ended, np.ndarray) and not ended.any()  # functions of single goals take long
+        return ends if none_ended else ends | (ended & ~self.terminated(reached, own).astype(bool))
 
 
 class Outcome(NamedTuple):
@@ -294,7 +294,7 @@ def outcome(
     xp: Any, ring: Any, index: Callable[..., Any], rows: Any, n_steps: int, goals: NewGoals | None = None
 ) -> Outcome:
     """Returns what ``rows`` lead to in up to ``n_steps`` steps, with new goals if there are any."""
-    if goals := goals if goals is not None and len(goals.goal) else None:
+    if goals is not None:
         which, times = goals.which, rows.time[goals.which, None] + 1 + xp.arange(n_steps)[None]
         position = index(rows.env[which, None], times).reshape(-1)
         reached, own = (ring.obs[leaf][position] for leaf in goals.leaves)
