@@ -3,16 +3,17 @@
     python benchmarks/demonstrations.py offline --env Pendulum-v1 --seeds 0 1 2
     python benchmarks/demonstrations.py imitation --seeds 0 1 2
     python benchmarks/demonstrations.py share --env jax/PointMaze-v0 --seeds 0 1 2 3 4 5 6 7 8 9
+    python benchmarks/demonstrations.py record --env FetchPickAndPlace-v4 --shown FOLDER
 
 ``offline``: two datasets of 20,000 steps, of the final policy of a SAC expert and of its policy after a part of its training
 with random actions in a tenth of the steps; BC, TD3+BC, IQL and ReBRAC learn from each alone. ``imitation``: BC from 10
 episodes of Gymnasium's scripted expert on LunarLander-v3, and DAgger with it, for the same number of gradient steps in each
 round. ``share``: SAC with HER alone, with 20 episodes of an expert in half of each batch, after cloning them, and after the
-critics have also learned from them what the clone is worth. The expert is scripted for FetchPush, and elsewhere SAC with the
-same settings; ``--shown FOLDER`` keeps its episodes for the next call. All train for as many steps: recorded are the
-first step (0: before training) at which 90 % of 20 evaluation episodes succeeded, all steps if they never did, and the mean
-success rate of all evaluations. ``--continue`` keeps the runs of the result file. Each result is written when it is
-there, with command, commit and versions.
+critics have also learned from them what the clone is worth. The expert is scripted for FetchPush and FetchPickAndPlace, and
+elsewhere SAC with the same settings; ``--shown FOLDER`` keeps its episodes for the next call, and ``record`` only writes them.
+All train for as many steps: recorded are the first step (0: before training) at which 90 % of 20 evaluation episodes
+succeeded, all steps if they never did, and the mean success rate of all evaluations. ``--continue`` keeps the runs of the
+result file. Each result is written when it is there, with command, commit and versions.
 """
 
 from __future__ import annotations
@@ -163,6 +164,7 @@ SHARE: dict[str, tuple[int, str, dict[str, Any]]] = {
     ),
     "jax/Parking-v0": (16, "auto", hyperparameters("parking-v0")),
     "FetchPush-v4": (8, "envpool", {**hyperparameters("FetchPush-v4"), "priorities": None}),
+    "FetchPickAndPlace-v4": (8, "envpool", {**hyperparameters("FetchPickAndPlace-v4"), "priorities": None}),
 }
 """Number of environments, backend and hyperparameters of ``share``: those of presets without priorities, which cannot be
 combined with demonstrations."""
@@ -191,12 +193,34 @@ class Pusher:
         return np.array([*np.clip(10 * (target - gripper), -1, 1), 0], np.float32), None
 
 
+class Picker:
+    """Goes above the object, grasps it and carries it to the goal: a scripted expert of FetchPickAndPlace."""
+
+    def predict(self, obs: Any, deterministic: bool = True) -> tuple[Any, None]:
+        gripper, fingers = obs["observation"][:3], obs["observation"][9:11]
+        thing, goal = obs["achieved_goal"], obs["desired_goal"]
+        offset = thing - gripper
+        is_above = np.linalg.norm(offset[:2]) < 0.01
+        is_around = is_above and abs(offset[2]) < 0.01
+        if is_around and fingers.sum() < 0.055:
+            way = goal - thing
+        elif is_above:
+            way = offset
+        else:
+            way = np.array([*offset[:2], np.clip(0, offset[2] + 0.06, offset[2] + 0.1)])
+        return np.array([*np.clip(10 * way, -1, 1), -1 if is_around else 1], np.float32), None
+
+
+SCRIPTED: dict[str, Any] = {"FetchPush-v4": Pusher, "FetchPickAndPlace-v4": Picker}
+
+
 def shown_by_expert(arguments: argparse.Namespace, folder: Path) -> Demonstrations:
     """Returns 20 episodes of an expert, those in the folder if it holds some."""
     if folder.exists():
         return read(folder)
-    expert: Any = Pusher()
-    if not arguments.env.startswith("FetchPush"):
+    if arguments.env in SCRIPTED:
+        expert = SCRIPTED[arguments.env]()
+    else:
         expert = learner(arguments, 1000).learn(arguments.expert_steps, Evaluate(arguments.env, 2_000, 50))
         expert.restore_best()
     return record(expert, arguments.env, 20, folder, seed=0)
@@ -213,6 +237,8 @@ def share(arguments: argparse.Namespace) -> None:
     """Compares learning without demonstrations, with a share of them, and with a share after cloning them."""
     folder = arguments.shown or Path(tempfile.mkdtemp()) / "shown"
     shown = shown_by_expert(arguments, folder)
+    if arguments.what == "record":
+        return
     results = kept(arguments)
     for seed, way in itertools.product(arguments.seeds, arguments.ways):
         if any((one["seed"], one["demonstrations"]) == (seed, way) for one in results):
@@ -280,7 +306,7 @@ def summarized(results: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("offline", "imitation", "share"))
+    parser.add_argument("what", choices=("offline", "imitation", "share", "record"))
     parser.add_argument("--env", default="LunarLander-v3")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--updates", type=int, default=10_000)
@@ -292,7 +318,7 @@ def main() -> None:
     parser.add_argument("--continue", action="store_true", dest="goes_on", help="keep the runs of the file, of share")
     parser.add_argument("--out", type=Path)
     arguments = parser.parse_args()
-    {"offline": offline, "imitation": imitation, "share": share}[arguments.what](arguments)
+    {"offline": offline, "imitation": imitation, "share": share, "record": share}[arguments.what](arguments)
 
 
 if __name__ == "__main__":
