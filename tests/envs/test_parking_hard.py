@@ -10,6 +10,17 @@ import rejeu
 from tests.tiers import exhaustive
 
 pytest.importorskip("highway_env")
+from highway_env.envs.parking_env import ParkingEnv
+from highway_env.vehicle.kinematics import Vehicle
+
+from rejeu.envs.parking_hard import ParkingHard
+
+
+class Simulated(ParkingHard):
+    """The same with parked cars that are simulated like the agent's."""
+
+    def _create_vehicles(self) -> None:
+        ParkingEnv._create_vehicles(self)
 
 
 def test_the_slots_are_narrow_and_most_are_taken():
@@ -22,11 +33,29 @@ def test_the_slots_are_narrow_and_most_are_taken():
     middles = sorted({float(slot.start[0]) for slot in slots})
     np.testing.assert_allclose(np.diff(middles), 3.0)
     assert middles[0] == -middles[-1]
-    parked = [car for car in lot.road.vehicles if car is not lot.vehicle]
+    parked = [thing for thing in lot.road.objects if isinstance(thing, Vehicle)]
+    assert lot.road.vehicles == [lot.vehicle]
     assert len(parked) == 24
     assert len({tuple(car.position) for car in parked}) == 24
     goal = lot.vehicle.goal.position
     assert min(np.linalg.norm(car.position - goal) for car in parked) >= 3.0
+
+
+def test_parked_cars_are_hit_as_if_they_were_simulated():
+    actions, ends = np.random.default_rng(0).uniform([0, -1], [1, 1], (4, 25, 2)), 0
+    for seed, way in enumerate(actions):
+        fast, slow = ParkingHard(), Simulated()
+        fast.reset(seed=seed), slow.reset(seed=seed)
+        for action in way:
+            (one, reward, over, _, _), (two, expected, must_end, _, _) = fast.step(action), slow.step(action)
+            tolerance = 0.01 if over else 0.0  # the last step goes on for a moment after the crash
+            assert over == must_end
+            np.testing.assert_allclose(reward, expected, rtol=0, atol=tolerance)
+            np.testing.assert_allclose(one["observation"], two["observation"], rtol=0, atol=tolerance)
+            if over:
+                break
+        ends += fast.vehicle.crashed and any(car.crashed for car in fast.road.objects if isinstance(car, Vehicle))
+    assert ends >= 2
 
 
 def test_it_is_parking_otherwise_and_equal_for_equal_seeds():

@@ -27,3 +27,10 @@ class ParkingHard(ParkingEnv):
             x = (i + 0.5 - spots / 2) * WIDTH
             ends = [x, lane.start[1]], [x, lane.end[1]]
             network.graph[start][end][i] = StraightLane(*ends, width=WIDTH, line_types=lane.line_types)
+
+    def _create_vehicles(self) -> None:
+        """Parked cars never move: as objects of the road they are hit like walls, and cost no simulation."""
+        super()._create_vehicles()
+        parked = [car for car in self.road.vehicles if car not in self.controlled_vehicles]
+        self.road.vehicles = list(self.controlled_vehicles)
+        self.road.objects += parked
