@@ -90,15 +90,18 @@ def plot(path: Path, published: list[dict[str, Any]]) -> None:
     style.save(figure, PICTURES / f"{data['algorithm']}.png")
 
 
-def plot_goals(panel: Any, title: str, paths: list[Path]) -> None:
+def plot_goals(panel: Any, title: str, folders: list[Path]) -> None:
     """Plots the success rates of files of ``learning.py`` against steps: the mean of the seeds and their range."""
     style.format_axes(panel)
-    for (color, _), path in zip(style.GROUP_COLORS, paths, strict=False):
+    paths = [path for folder in folders for path in sorted(folder.glob("*.json")) if curved(path)]
+    for i, path in enumerate(paths):
+        color, _ = style.GROUP_COLORS[i % len(style.GROUP_COLORS)]
+        line = "-" if i < len(style.GROUP_COLORS) else "--"
         runs = json.loads(path.read_text(encoding="utf-8"))["runs"]
         steps = [step for step, _ in runs[0]["success_curve"]]
         rates = np.array([[rate for _, rate in run["success_curve"]] for run in runs])
-        label = path.stem.removeprefix("choice-").removesuffix("-SAC")
-        panel.plot(steps, rates.mean(axis=0), color=color, label=f"{label} ({len(runs)})", marker=".")
+        label = path.stem.removesuffix("-SAC")
+        panel.plot(steps, rates.mean(axis=0), line, color=color, label=f"{label} ({len(runs)})", marker=".")
         panel.fill_between(steps, rates.min(axis=0), rates.max(axis=0), color=color, alpha=0.15, linewidth=0)
     panel.set(xlabel="environment steps", ylabel="success rate", ylim=(0, 1.02))
     panel.xaxis.set_major_formatter("{x:,.0f}")
@@ -117,12 +120,11 @@ def main() -> None:
     published = json.loads((RESULTS / "published.json").read_text(encoding="utf-8"))
     for path in sorted((RESULTS / "curves").glob("*.json")):
         plot(path, published)
-    files = [path for path in sorted((RESULTS / "learning" / "goals").glob("*.json")) if curved(path)]
     figure = style.make_figure("success in goal environments", height=7.2)
     above, below = figure.subplots(2, 1)
-    chosen = [path for path in files if path.stem.startswith("choice-")]
-    plot_goals(above, "Presets (number of seeds)", [path for path in files if path not in chosen])
-    plot_goals(below, "What was compared (number of seeds)", chosen)
+    folder = RESULTS / "learning" / "goals"
+    plot_goals(above, "Presets (number of seeds)", [folder])
+    plot_goals(below, "What was compared (number of seeds)", [folder / "choice", folder / "demonstrations"])
     style.save(figure, PICTURES / "goals.png")
 
 

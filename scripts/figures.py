@@ -60,14 +60,17 @@ SHARED = (
 )
 """Configurations from which others are derived, and where their hyperparameters are explained: by whom, and the page."""
 JUDGED_BY_SUCCESS = (
+    "AntMaze_UMaze-v5",
     "FetchPickAndPlace-v4",
     "FetchPush-v4",
     "FetchReach-v4",
+    "FetchSlide-v4",
     "PointMaze_Large-v3",
     "PointMaze_Medium-v3",
     "PointMaze_UMaze-v3",
     "parking-v0",
     "rejeu/Ball-v0",
+    "rejeu/ParkingHard-v0",
 )
 """Environments whose result is the success rate."""
 TD3_RETURNS = {
@@ -93,8 +96,7 @@ def measured() -> list[PresetResult]:
     Those in goal environments are in ``goals``, unless there is a file of the same name with another budget.
     """
     files = [*(DATA / "learning" / "goals").glob("*.json"), *(DATA / "learning").glob("*.json")]
-    paths = {path.name: path for path in files if not path.name.startswith("choice-")}
-    found = [result_of(load(path.name, path.parent)) for path in paths.values()]
+    found = [result_of(load(path.name, path.parent)) for path in {path.name: path for path in files}.values()]
     return sorted(found, key=lambda result: (result.env_id, result.algorithm, result.setting))
 
 
@@ -187,15 +189,13 @@ def learned(folder: str, length: str = "") -> str:
     return table([header[i] for i in kept], [[row[i] for i in kept] for row in rows])
 
 
-def goals(choice: str = "") -> str:
-    """Success in goal environments after so many steps; with ``choice`` of the runs by which settings were chosen."""
+def goals(folder: str = "") -> str:
+    """Success in goal environments after so many steps: of presets, or of a folder of other runs in ``learning/goals``."""
     marks = (50_000, 100_000, 300_000)
     rows = []
-    for path in sorted((DATA / "learning" / "goals").glob("*.json")):
+    for path in sorted((DATA / "learning" / "goals" / folder).glob("*.json")):
         content = load(path.name, path.parent)
         words, runs = shlex.split(content["command"]), content["runs"]
-        if path.name.startswith("choice-") != bool(choice):
-            continue
         curves = [dict(run.get("success_curve", [])) for run in runs]
         minutes = [run["seconds"] / 60 for run in runs]
         options = " ".join(words[4:]).replace("--continue", "")
