@@ -79,12 +79,6 @@ def test_whether_a_function_is_vectorized_is_found_out_once():
     assert function.shapes == [(2,)] * 5
 
 
-def test_the_whole_batch_is_tried_only_once():
-    function = counted(distance)
-    over_batches(function, np.float32)(*goals(20))
-    assert function.shapes.count((20, 2)) == 1
-
-
 def test_a_function_that_answers_batches_with_one_number_is_called_by_row():
     """A norm over all axes, and a comparison of whole arrays: both forget the batch."""
     achieved, desired = goals(6)

@@ -72,9 +72,8 @@ def info_fault(name: str, error: KeyError) -> BadEnvironmentError:
 def over_batches(function: Callable[..., Any], dtype: Any) -> Callable[..., np.ndarray]:
     """Returns ``function(achieved, desired, info)`` as a function of batches of goals, and of their infos if they are given.
 
-    The first call with at least two rows evaluates ``function`` once with the whole batch and once for each of the
-    first eight rows. If the results agree, it is treated as vectorized from then on. Otherwise, and with infos, it is called
-    row by row.
+    The first call with at least two rows compares the results for the whole batch with those for each of the first eight
+    rows. If they agree, it is treated as vectorized from then on. Otherwise, and with infos, it is called row by row.
 
     Raises:
         BadEnvironmentError: by the returned function, if ``function`` returns neither a number nor an array of one for a
@@ -101,16 +100,11 @@ def over_batches(function: Callable[..., Any], dtype: Any) -> Callable[..., np.n
 
     def call(achieved: np.ndarray, desired: np.ndarray, infos: Sequence[Any] | None = None) -> np.ndarray:
         nonlocal vectorized
-        if infos is not None:
-            return by_row(achieved, desired, infos)
-        if vectorized:
+        if infos is None and vectorized is None and len(achieved) > 1:
+            vectorized = is_vectorized(function, by_row, achieved, desired)
+        if infos is None and vectorized:
             return np.asarray(function(achieved, desired, {})).astype(dtype, copy=False)
-        if vectorized is None and len(achieved) > 1:
-            whole = _whole(function, by_row, achieved, desired)
-            vectorized = whole is not None
-            if whole is not None:
-                return whole.astype(dtype, copy=False)
-        return by_row(achieved, desired)
+        return by_row(achieved, desired, infos)
 
     return call
 
@@ -120,17 +114,15 @@ def one_number(value: Any) -> Any:
     return np.asarray(value).reshape(()) if np.shape(value) == (1,) else value
 
 
-def _whole(
+def is_vectorized(
     function: Callable[..., Any], by_row: Callable[..., np.ndarray], achieved: np.ndarray, desired: np.ndarray
-) -> np.ndarray | None:
-    """Returns the result of ``function`` for the whole batch, or None if it differs from the results of single rows."""
-    n = min(len(achieved), 8)
+) -> bool:
+    """Returns whether ``function`` takes the whole batch, with the results of its first rows one by one."""
     try:
         whole = np.asarray(function(achieved, desired, {}))
     except Exception:  # a function of one row can raise anything for a batch; it is then called row by row
-        return None
+        return False
     if whole.shape != (len(achieved),):
-        return None
-    rows = by_row(achieved[:n], desired[:n])
-    agrees = np.allclose(whole[:n].astype(np.float64), rows.astype(np.float64), rtol=1e-4, atol=1e-5)
-    return whole if agrees else None
+        return False
+    rows = by_row(achieved[:8], desired[:8])
+    return np.allclose(whole[:8].astype(np.float64), rows.astype(np.float64), rtol=1e-4, atol=1e-5)

@@ -31,6 +31,5 @@ class ParkingHard(ParkingEnv):
     def _create_vehicles(self) -> None:
         """Parked cars never move: as objects of the road they are hit like walls, and cost no simulation."""
         super()._create_vehicles()
-        parked = [car for car in self.road.vehicles if car not in self.controlled_vehicles]
+        self.road.objects += self.road.vehicles[len(self.controlled_vehicles) :]
         self.road.vehicles = list(self.controlled_vehicles)
-        self.road.objects += parked
