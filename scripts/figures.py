@@ -242,7 +242,7 @@ def success(rates: list[float]) -> str:
         return ""
     mean = 100 * float(np.mean(rates))
     if len(rates) < 3:
-        return f"{mean:.0f} %"
+        return f"{mean:.3g} %"
     half = 100 * float(stats.t.ppf(0.975, len(rates) - 1) * stats.sem(rates))
     return f"{mean:.1f} % ({max(mean - half, 0):.0f} to {min(mean + half, 100):.0f})"
 
