@@ -100,7 +100,7 @@ def plot_goals(panel: Any, title: str, folders: list[Path]) -> None:
         runs = json.loads(path.read_text(encoding="utf-8"))["runs"]
         steps = [step for step, _ in runs[0]["success_curve"]]
         rates = np.array([[rate for _, rate in run["success_curve"]] for run in runs])
-        label = path.stem.removesuffix("-SAC")
+        label = path.stem.removesuffix("-SAC") + " with demonstrations" * (path.parent.name == "demonstrations")
         panel.plot(steps, rates.mean(axis=0), line, color=color, label=f"{label} ({len(runs)})", marker=".")
         panel.fill_between(steps, rates.min(axis=0), rates.max(axis=0), color=color, alpha=0.15, linewidth=0)
     panel.set(xlabel="environment steps", ylabel="success rate", ylim=(0, 1.02))
