@@ -237,8 +237,6 @@ def share(arguments: argparse.Namespace) -> None:
     """Compares learning without demonstrations, with a share of them, and with a share after cloning them."""
     folder = arguments.shown or Path(tempfile.mkdtemp()) / "shown"
     shown = shown_by_expert(arguments, folder)
-    if arguments.what == "record":
-        return
     results = kept(arguments)
     for seed, way in itertools.product(arguments.seeds, arguments.ways):
         if any((one["seed"], one["demonstrations"]) == (seed, way) for one in results):
@@ -318,7 +316,10 @@ def main() -> None:
     parser.add_argument("--continue", action="store_true", dest="goes_on", help="keep the runs of the file, of share")
     parser.add_argument("--out", type=Path)
     arguments = parser.parse_args()
-    {"offline": offline, "imitation": imitation, "share": share, "record": share}[arguments.what](arguments)
+    if arguments.what == "record":
+        shown_by_expert(arguments, arguments.shown or Path("shown"))
+    else:
+        {"offline": offline, "imitation": imitation, "share": share}[arguments.what](arguments)
 
 
 if __name__ == "__main__":

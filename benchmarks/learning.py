@@ -193,14 +193,14 @@ def zoo(env_id: str, algorithm: str) -> presets.Preset | None:
 def described(preset: presets.Preset, arguments: argparse.Namespace, runs: list[dict]) -> dict[str, Any]:
     """Returns the runs with their origin and their summary."""
     config = validation.build(rejeu.AGENTS[arguments.algorithm].algorithm.Config, settings_of(preset, arguments))
-    folder = {"demonstrations": arguments.set["demonstrations"]} if "demonstrations" in arguments.set else {}
+    as_given = {name: arguments.set[name] for name in ("demonstrations",) if name in arguments.set}  # and no full path
     installed = {dist.name for dist in importlib.metadata.distributions()}
     versions = {name: importlib.metadata.version(name) for name in ("jax", "gymnasium", "envpool") if name in installed}
     return {
         **provenance({str(arguments.out): "FOLDER", str(arguments.keep): "FOLDER"}),
         "machine": {**machine(), "device": jax.devices()[0].device_kind},
         "versions": {"rejeu": rejeu.__version__, **versions},
-        "hyperparameters": {**configs.to_json(config), **folder},
+        "hyperparameters": {**configs.to_json(config), **as_given},
         "n_envs": preset.n_envs,
         "backend": arguments.backend or preset.backend,
         "runs": runs,
