@@ -131,9 +131,14 @@ def partly_shown(env_id: str, shown: list[int]) -> gym.Env:
 
 
 def settings_of(preset: presets.Preset, arguments: argparse.Namespace) -> dict[str, Any]:
-    """Returns the hyperparameters of a preset with others set; of those that are dicts, only the given parts change."""
+    """Returns the hyperparameters of a preset with others set; of those that are dicts, only the given parts change.
+
+    None leaves out what the preset has for another algorithm and this one does not know.
+    """
     before = preset.hyperparameters
-    return {**before, **{k: {**before.get(k, {}), **v} if isinstance(v, dict) else v for k, v in arguments.set.items()}}
+    given = {k: {**before.get(k, {}), **v} if isinstance(v, dict) else v for k, v in arguments.set.items()}
+    known = {field.name for field in dataclasses.fields(rejeu.AGENTS[arguments.algorithm].algorithm.Config)}
+    return {name: value for name, value in {**before, **given}.items() if value is not None or name in known}
 
 
 def main() -> None:
