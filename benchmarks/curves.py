@@ -1,7 +1,7 @@
 """Records the learning curves of the pages on algorithms, and plots them.
 
     python benchmarks/curves.py record SAC     # trains three seeds; writes benchmarks/results/curves/SAC.json
-    python benchmarks/curves.py plot           # writes docs/images/curves/ALGORITHM.png for each of these files, and goals.png
+    python benchmarks/curves.py plot           # writes docs/images/curves: a picture for each, goals, equal-time
 
 A curve is the mean return of the latest 20 training episodes, exploration included, at 100 equally spaced steps. The dashed
 line is the published return of ``benchmarks/results/published.json``.
@@ -27,6 +27,7 @@ from rejeu.logs.plots import drawing as style
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks import learning
+from scripts import figures
 from trials.provenance import provenance
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -93,11 +94,10 @@ def plot(path: Path, published: list[dict[str, Any]]) -> None:
 def plot_goals(panel: Any, title: str, folders: list[Path]) -> None:
     """Plots the success rates of files of ``learning.py`` against steps: the mean of the seeds and their range."""
     style.format_axes(panel)
-    paths = [path for folder in folders for path in sorted(folder.glob("*.json")) if curved(path)]
-    for i, path in enumerate(paths):
+    found = {path: curved(path) for folder in folders for path in sorted(folder.glob("*.json"))}
+    for i, (path, runs) in enumerate((path, runs) for path, runs in found.items() if runs):
         color, _ = style.GROUP_COLORS[i % len(style.GROUP_COLORS)]
         line = "-" if i < len(style.GROUP_COLORS) else "--"
-        runs = json.loads(path.read_text(encoding="utf-8"))["runs"]
         steps = [step for step, _ in runs[0]["success_curve"]]
         rates = np.array([[rate for _, rate in run["success_curve"]] for run in runs])
         label = path.stem.removesuffix("-SAC") + " with demonstrations" * (path.parent.name == "demonstrations")
@@ -106,6 +106,20 @@ def plot_goals(panel: Any, title: str, folders: list[Path]) -> None:
     panel.set(xlabel="environment steps", ylabel="success rate", ylim=(0, 1.02))
     panel.xaxis.set_major_formatter("{x:,.0f}")
     style.add_title_and_legend(panel, title)
+
+
+def plot_equal_time(panel: Any, env_id: str, options: str = "") -> None:
+    """Plots the returns of the runs of equal time against minutes: a line for each seed, whose end is the last evaluation."""
+    style.format_axes(panel)
+    found = figures.equal_time_runs(env_id, options)
+    for name, (color, _) in zip(figures.EQUAL_TIME, style.GROUP_COLORS, strict=False):
+        for run in found.get(name, []) if "GPU" not in name else []:
+            points = [*run.get("curve", []), (run["steps"], run["mean_return"])]
+            minutes = [step / run["steps"] * run["seconds"] / 60 for step, _ in points]
+            panel.plot(minutes, [value for _, value in points], color=color, label=name, marker=".")
+    panel.set(xlabel="minutes", ylabel="return", xlim=(0, 21))
+    panel.yaxis.set_major_formatter("{x:,.0f}")
+    panel.set_title(env_id + options.replace("-", " "), loc="left", color=style.INK, fontsize=12, fontweight="bold")
 
 
 def main() -> None:
@@ -126,11 +140,18 @@ def main() -> None:
     plot_goals(above, "Presets (number of seeds)", [folder])
     plot_goals(below, "What was compared (number of seeds)", [folder / "choice", folder / "demonstrations"])
     style.save(figure, PICTURES / "goals.png")
+    figure = style.make_figure("returns after equal time", height=7.2)
+    shown = [("HalfCheetah-v5",), ("Hopper-v5",), ("Walker2d-v5",), ("Ant-v5", "-without-contact-forces")]
+    for panel, one in zip(figure.subplots(2, 2).flat, shown, strict=True):
+        plot_equal_time(panel, *one)
+    named = {name: line for panel in figure.axes for line, name in zip(*panel.get_legend_handles_labels(), strict=True)}
+    figure.legend([*named.values()], [*named], loc="outside lower left", ncols=len(named), frameon=False)
+    style.save(figure, PICTURES / "equal-time.png")
 
 
-def curved(path: Path) -> bool:
-    """Returns whether a file of ``learning.py`` has success rates on the way."""
-    return all("success_curve" in run for run in json.loads(path.read_text(encoding="utf-8"))["runs"])
+def curved(path: Path) -> list[dict[str, Any]]:
+    """Returns the runs of a file of ``learning.py`` that have success rates on the way."""
+    return [run for run in json.loads(path.read_text(encoding="utf-8"))["runs"] if "success_curve" in run]
 
 
 if __name__ == "__main__":

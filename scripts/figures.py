@@ -428,34 +428,39 @@ def speed(length: str = "") -> str:
 
 
 EQUAL_TIME = {
-    "FlashSAC 64/32": "minutes/{}-FlashSAC.json",
-    "FlashSAC 128/64": "minutes/{}-FlashSAC-128-64.json",
-    "XQC 64/32": "minutes/{}-XQC-64-32.json",
-    "XQC 128/64": "minutes/{}-XQC.json",
-    "SAC": "minutes/{}-SAC.json",
-    "FlashSAC `full`, GPU": "h200/{}-FlashSAC.json",
+    "FlashSAC 64/32": "minutes/{}-FlashSAC{}.json",
+    "FlashSAC 128/64": "minutes/{}-FlashSAC-128-64{}.json",
+    "XQC 64/32": "minutes/{}-XQC-64-32{}.json",
+    "XQC 128/64": "minutes/{}-XQC{}.json",
+    "SAC": "minutes/{}-SAC{}.json",
+    "FlashSAC `full`, GPU": "h200/{}-FlashSAC{}.json",
 }
-"""Learners, with the widths of critics and actor, and their files below ``learning`` for an environment."""
+"""Learners, with the widths of critics and actor, and their files below ``learning`` for an environment and its options."""
+
+
+def equal_time_runs(env_id: str, options: str = "") -> dict[str, list[dict[str, Any]]]:
+    """Returns the runs of the learners of :data:`EQUAL_TIME` that have any, with a row for each seed."""
+    paths = {name: DATA / "learning" / file.format(env_id, options) for name, file in EQUAL_TIME.items()}
+    return {name: load(path.name, path.parent)["runs"] for name, path in paths.items() if path.exists()}
 
 
 def equal_time() -> str:
     """Returns on MuJoCo after equal time and at full size on a GPU, and as shares of TD3's return after a million steps."""
     shares: dict[str, list[float]] = {name: [] for name in EQUAL_TIME}
     rows: list[tuple[str, ...]] = []
-    for env_id, (least, td3) in TD3_RETURNS.items():
-        cells = [env_id]
-        for name, found in shares.items():
-            path = DATA / "learning" / EQUAL_TIME[name].format(env_id)
-            if not path.exists():
-                cells.append("")
-                continue
-            runs = load(path.name, path.parent)["runs"]
-            mean, steps = (np.mean([run[key] for run in runs]) for key in ("mean_return", "steps"))
-            found.append(float((mean - least) / (td3 - least)))
-            cells.append(f"{mean:,.0f} ({found[-1]:.2f}), {steps:,.0f} steps")
-        rows.append(tuple(cells))
+    for env_id, options in [*((env_id, "") for env_id in TD3_RETURNS), ("Ant-v5", "-without-contact-forces")]:
+        found, (least, td3) = equal_time_runs(env_id, options), TD3_RETURNS[env_id]
+        cells = dict.fromkeys(EQUAL_TIME, "")
+        for name, runs in found.items():
+            returns = [run["mean_return"] for run in runs]
+            share = float((np.mean(returns) - least) / (td3 - least))
+            shares[name] += [] if options else [share]
+            seeds = f"; {' and '.join(f'{one:,.0f}' for one in returns)}" if len(runs) > 1 else ""
+            steps = np.mean([run["steps"] for run in runs])
+            cells[name] = f"{np.mean(returns):,.0f} ({share:.2f}{seeds}), {steps:,.0f} steps"
+        rows.append((env_id + options.replace("-", " "), *cells.values()))
     means = (f"({np.mean(found):.2f})" if len(found) == len(TD3_RETURNS) else "" for found in shares.values())
-    rows.append(("mean", *means))
+    rows.append(("mean of the five", *means))
     return table(("environment", *EQUAL_TIME), rows)
 
 
