@@ -74,7 +74,7 @@ def test_a_replay_buffer_is_given_by_class_or_name(given):
         ({"gradient_steps": -2}, "gradient_steps=-2 must be a whole number of at least -1"),
         (
             {"replay_buffer_class": "HerBuffer"},
-            "replay_buffer_class='HerBuffer' is unknown; choose one of ReplayBuffer",
+            "replay_buffer_class='HerBuffer' must be one of ReplayBuffer",
         ),
         (
             {"replay_buffer_kwargs": {"n_sampled_goal": 4}},

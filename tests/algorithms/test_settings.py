@@ -74,7 +74,7 @@ REFUSED = [
     ("RecurrentPPO", {"use_sde": True}, "state-dependent noise is not available for policies with memory"),
     ("RecurrentPPO", {"n_episodes": 1}, "give n_steps and leave it out"),
     ("RecurrentPPO", {"critic_learning_rate": 1e-3}, "leave it out"),
-    ("RecurrentPPO", {"policy_kwargs": {"cell": "rnn"}}, "must be 'lstm' or 'gru'"),
+    ("RecurrentPPO", {"policy_kwargs": {"cell": "rnn"}}, "must be one of lstm, gru"),
     ("RecurrentPPO", {"policy_kwargs": SHARED}, "needs shared_lstm=True"),
     ("RecurrentPPO", {"policy_kwargs": {"shared_lstm": True, "share_features_extractor": False}}, "leave out one"),
     ("RecurrentPPO", {"policy_kwargs": {"lstm_size": 4}}, "lstm_hidden_size"),

@@ -133,7 +133,7 @@ def test_what_cannot_be_rated_is_refused_in_one_line():
         (lambda: agent.q_values(OBS, np.full((7, 1), np.nan)), "not finite"),
         (
             lambda: agent.q_values(OBS, np.zeros((7, 1)), critics="least"),
-            "critics='least' must be one of 'min', 'mean', 'all'",
+            "critics='least' must be one of min, mean, all",
         ),
         (lambda: dqn.q_values(OBS, [99] * N), "expected Discrete"),
         (lambda: agent.q_values(np.zeros((2, 5)), np.zeros((2, 1))), "the observation has shape"),

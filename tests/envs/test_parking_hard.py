@@ -17,7 +17,10 @@ from rejeu.envs.parking_hard import ParkingHard
 
 
 class Simulated(ParkingHard):
-    """The same with parked cars that are simulated like the agent's."""
+    """The same with parked cars that are simulated like the agent's, and with the observations of highway-env."""
+
+    def define_spaces(self) -> None:
+        ParkingEnv.define_spaces(self)
 
     def _create_vehicles(self) -> None:
         ParkingEnv._create_vehicles(self)
@@ -51,7 +54,9 @@ def test_parked_cars_are_hit_as_if_they_were_simulated():
             tolerance = 0.01 if over else 0.0  # the last step goes on for a moment after the crash
             assert over == must_end
             np.testing.assert_allclose(reward, expected, rtol=0, atol=tolerance)
-            np.testing.assert_allclose(one["observation"], two["observation"], rtol=0, atol=tolerance)
+            assert fast.observation_space.contains(one)
+            for key in ("observation", "achieved_goal", "desired_goal"):
+                np.testing.assert_allclose(one[key], two[key], rtol=0, atol=tolerance)
             if over:
                 break
         ends += fast.vehicle.crashed and any(car.crashed for car in fast.road.objects if isinstance(car, Vehicle))

@@ -12,6 +12,7 @@ import numpy as np
 
 from rejeu.agents.base import BaseAgent
 from rejeu.core import devices, spaces
+from rejeu.core.validation import choice
 from rejeu.envs.envpool import envpool_knows
 from rejeu.envs.make import VectorEnv
 from rejeu.envs.masks import split
@@ -86,8 +87,7 @@ def q_values(
     >>> agent.q_values(np.zeros((50, 4), np.float32)).shape
     (50, 2)
     """
-    if critics not in CRITICS:
-        raise ValueError(f"critics={critics!r} must be one of {', '.join(map(repr, CRITICS))}")
+    choice("critics", critics, CRITICS)
     if agent.learner.algorithm.action_values is None:
         raise ValueError(
             f"{agent.name}.q_values has no critics, or their values depend on a memory of observations before, or the actions "

@@ -373,10 +373,7 @@ def buffer_name(key: str, value: Any) -> str | type:
         return "ReplayBuffer"
     if isinstance(value, type) and value.__name__ not in REPLAY_BUFFERS:
         return value
-    name = value if isinstance(value, str) else getattr(value, "__name__", repr(value))
-    if name not in REPLAY_BUFFERS:
-        raise ValueError(f"{key}={name!r} is unknown; choose one of {', '.join(REPLAY_BUFFERS)}")
-    return name
+    return choice(key, value if isinstance(value, str) else getattr(value, "__name__", repr(value)), REPLAY_BUFFERS)
 
 
 def buffer_settings(key: str, value: Any, buffer: str | type) -> Any:

@@ -8,6 +8,8 @@ from functools import cache
 from importlib import resources
 from typing import Any, Literal, get_args
 
+from rejeu.core.validation import choice
+
 Language = Literal["en", "fr"]
 LANGUAGES: tuple[Language, ...] = get_args(Language)
 SETTING = "REJEU_LANGUAGE"
@@ -20,10 +22,7 @@ def chosen(language: str | None = None) -> Language:
     Raises:
         ValueError: for an unknown one.
     """
-    language = language or os.environ.get(SETTING) or "en"
-    if language not in LANGUAGES:
-        raise ValueError(f"language {language!r} must be one of {', '.join(LANGUAGES)}")
-    return language
+    return choice("language", language or os.environ.get(SETTING) or "en", LANGUAGES)
 
 
 @cache

@@ -10,6 +10,8 @@ from typing import Any, Literal
 import numpy as np
 from gymnasium import spaces
 
+from rejeu.core.validation import choice
+
 POLICIES = ("MlpPolicy", "MultiInputPolicy", "CnnPolicy")
 """Names of policies; each is for some observations."""
 GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
@@ -174,8 +176,7 @@ def check_policy(policy: str, space: spaces.Space, normalize_images: bool = True
 
     Without ``normalize_images`` arrays of three axes are images, whatever their type.
     """
-    if policy not in POLICIES:
-        raise ValueError(f"policy={policy!r} must be one of {', '.join(POLICIES)}")
+    choice("policy", policy, POLICIES)
     if policy == "MlpPolicy" and isinstance(space, spaces.Dict):
         raise ValueError("policy='MlpPolicy' does not fit a Dict observation; use 'MultiInputPolicy'")
     if policy == "MultiInputPolicy" and not isinstance(space, spaces.Dict | spaces.Tuple):

@@ -11,7 +11,7 @@ import math
 import numbers
 import sys
 import textwrap
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import cache
 from typing import Any, TypeVar
 
@@ -99,14 +99,14 @@ def assign(config: Any, **values: Any) -> None:
         object.__setattr__(config, key, value)
 
 
-def choice(key: str, value: Any, among: tuple[str, ...]) -> str:
+def choice(key: str, value: Any, among: Collection[str]) -> Any:
     """Returns ``value`` if it is one of the texts ``among``.
 
     Raises:
         ValueError: if it is not.
     """
-    if value not in among:
-        raise ValueError(f"{key}={value!r} must be {' or '.join(map(repr, among))}")
+    if value not in tuple(among):
+        raise ValueError(f"{key}={value!r} must be one of {', '.join(among)}")
     return value
 
 

@@ -109,8 +109,7 @@ def make_vector(
     >>> make_vector("Pendulum-v1", n_envs=4, backend="gymnasium").n_envs
     4
     """
-    if backend not in BACKENDS:
-        raise ValueError(f"backend={backend!r} must be one of {', '.join(BACKENDS)}")
+    validation.choice("backend", backend, BACKENDS)
     n_envs = validation.whole("n_envs", n_envs, least=1)
     workers = WorkerOptions(worker_timeout, restart_workers, wait_for, ray)
     check_workers(env, n_envs, backend, workers)

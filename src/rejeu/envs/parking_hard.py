@@ -4,11 +4,23 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+from highway_env.envs.common.observation import KinematicsGoalObservation
 from highway_env.envs.parking_env import ParkingEnv
 from highway_env.road.lane import StraightLane
 
 SLOTS, WIDTH = 18, 3.0
 """Slots of each of the two rows, and their width in meters; 14 of 4 m in parking-v0. A car is 2 m wide and 5 m long."""
+
+
+class GoalObservation(KinematicsGoalObservation):
+    """Observations with the numbers of highway-env's, without two data frames for each: they took two thirds of a step."""
+
+    def observe(self) -> dict[str, np.ndarray]:
+        car = self.observer_vehicle
+        found = [[one.to_dict()[feature] for feature in self.features] for one in (car, car.goal)]
+        achieved, desired = np.array(found) / self.scales
+        return {"observation": achieved, "achieved_goal": achieved.copy(), "desired_goal": desired}
 
 
 class ParkingHard(ParkingEnv):
@@ -19,6 +31,12 @@ class ParkingHard(ParkingEnv):
 
     def __init__(self, config: dict[str, Any] | None = None, render_mode: str | None = None) -> None:
         super().__init__({"vehicles_count": 24, **(config or {})}, render_mode)
+
+    def define_spaces(self) -> None:
+        super().define_spaces()
+        self.observation_type_parking = GoalObservation(self, **self.PARKING_OBS["observation"])
+        if self.config["observation"]["type"] == "KinematicsGoal":
+            self.observation_type = GoalObservation(self, **self.config["observation"])
 
     def _create_road(self, spots: int = SLOTS) -> None:
         super()._create_road(spots)

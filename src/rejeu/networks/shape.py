@@ -167,9 +167,7 @@ def split_net_arch(config: Any, fields: Mapping[str, str]) -> None:
 def activation_name(key: str, value: Any) -> str:
     """Returns the name of an activation function, from the name or from a function or class of that name."""
     name = value if isinstance(value, str) else getattr(value, "__name__", repr(value))
-    if name.lower() not in ACTIVATIONS:
-        raise ValueError(f"{key}={name!r} is unknown; choose one of {', '.join(ACTIVATIONS)}")
-    return name.lower()
+    return choice(key, name.lower(), ACTIVATIONS)
 
 
 def layer_widths(key: str, value: Any) -> tuple[int, ...]:

@@ -95,7 +95,7 @@ def test_a_mistake_is_found_before_anything_starts(tmp_path, capsys):
     assert cli.main(["train", "CartPole-v1", "--jobs", "2"]) == 2
     assert "--jobs is for several seeds" in capsys.readouterr().err
     mistakes = {
-        "--backend": "--backend='typo' must be 'auto' or 'envpool'",
+        "--backend": "--backend='typo' must be one of auto, envpool",
         "--device": "--device='typo' must be",
         "--log": "--log contains 'typo', expected",
         "--algo": "no algorithm is called 'typo'",

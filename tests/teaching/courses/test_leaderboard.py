@@ -137,7 +137,7 @@ def test_a_leaderboard_in_french_which_the_setting_asks_for(folder, tmp_path, mo
     )
     monkeypatch.setenv("REJEU_LANGUAGE", "de")
     assert main(["class", str(folder)]) == 2
-    assert "language 'de' must be one of en, fr" in capsys.readouterr().err
+    assert "language='de' must be one of en, fr" in capsys.readouterr().err
 
 
 def test_names_are_escaped_in_markdown(folder, tmp_path):

@@ -33,7 +33,7 @@ class Hill(FunctionalEnv):
 
     goal_position: eqx.AbstractClassVar[float]
     """Position from which on the car is at the goal."""
-    goal_velocity: eqx.AbstractVar[float]
+    goal_velocity: float = eqx.field(static=True, default=0.0)
     """Velocity that the car must have at the goal."""
 
     @property
@@ -58,7 +58,6 @@ class MountainCar(Hill):
     """
 
     goal_position: ClassVar[float] = 0.5
-    goal_velocity: float = eqx.field(static=True, default=0.0)
     max_episode_steps: int | None = eqx.field(static=True, default=200)
 
     @property
@@ -81,7 +80,6 @@ class MountainCarContinuous(Hill):
     """
 
     goal_position: ClassVar[float] = 0.45
-    goal_velocity: float = eqx.field(static=True, default=0.0)
     max_episode_steps: int | None = eqx.field(static=True, default=999)
 
     @property

@@ -12,6 +12,7 @@ import numpy as np
 from gymnasium import spaces
 from jax import Array
 
+from rejeu.core.validation import choice
 from rejeu.envs.functional.protocol import GoalEnv, time_is_up
 
 LAYOUTS = {
@@ -94,8 +95,7 @@ class PointMaze(GoalEnv):
     max_episode_steps: int | None = eqx.field(static=True, default=200)
 
     def __check_init__(self) -> None:
-        if self.layout not in LAYOUTS:
-            raise ValueError(f"layout={self.layout!r} must be one of {', '.join(LAYOUTS)}")
+        choice("layout", self.layout, LAYOUTS)
 
     @property
     def observation_space(self) -> spaces.Dict:

@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import msgspec
 import numpy as np
@@ -291,15 +291,13 @@ def compare(
         ValueError: if there is nothing to compare, or an argument is invalid.
         FileNotFoundError: if a path holds no run.
     """
-    if by not in (None, "algorithm", "setting", "env") or x not in ("steps", "time"):
-        raise ValueError(f"by={by!r} must be 'algorithm', 'setting' or 'env', and x={x!r} 'steps' or 'time'")
+    validation.choice("by", by or "algorithm", get_args(By))
+    validation.choice("x", x, get_args(Axis))
+    validation.choice("score", score, get_args(Score))
+    validation.choice("statistic", statistic, statistics.STATISTICS)
     if threshold is not None:
         threshold = validation.number("threshold", threshold)
     samples, seed = validation.whole("samples", samples, 1), validation.whole("seed", seed, 0)
-    if score not in ("training", "evaluation") or statistic not in statistics.STATISTICS:
-        raise ValueError(
-            f"score={score!r} must be 'training' or 'evaluation', and statistic={statistic!r} 'iqm', 'mean' or 'median'"
-        )
     found, notes = read_all(runs)
     curves = comparable(found, x, score, notes)
     kind, labels = group_labels([one.run for one in curves], by)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rejeu.core.validation import whole
+from rejeu.core.validation import choice, whole
 from rejeu.logs import charts
 from rejeu.logs.plots import drawing
 from rejeu.logs.tables import Table, evaluation_table
@@ -56,8 +56,7 @@ def learning_curve(
         MissingExtra: if matplotlib is not installed.
         ValueError: for another axis, or a ``window`` below 1.
     """
-    if against not in AXES:
-        raise ValueError(f"against={against!r} must be one of {', '.join(AXES)}")
+    choice("against", against, AXES)
     window = None if window is None else whole("window", window, least=1)
     along, unit, x_title = AXES[against]
     episodes = Table(history.to_dict())
