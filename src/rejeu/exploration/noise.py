@@ -301,20 +301,20 @@ def read(text: str, n: int) -> Noise:
         raise TypeError(f"action_noise={text!r} must be one of {', '.join(f'{name}(0.1)' for name in kinds)}")
     kind = kinds[found[1]]
     first = "initial_sigma" if kind is ParameterNoise else "sigma"
-    settings: dict[str, Any] = {} if kind is ParameterNoise else {"mean": [0.0] * n, first: 0.1}
+    given: dict[str, Any] = {}
     known = [field.name for field in dataclasses.fields(kind) if field.name != "mean"]
     for i, part in enumerate(filter(None, (part.strip() for part in found[2].split(",")))):
         name, equals, value = part.partition("=")
         name, value = (name.strip(), value) if equals else (first, name)
-        if name not in known or (not equals and i > 0):
-            raise TypeError(f"action_noise={text!r} has no setting {part!r}; {found[1]} has {', '.join(known)}")
+        if name not in known or name in given or (not equals and i > 0):
+            raise TypeError(f"action_noise={text!r} has no setting {part!r}; {found[1]} has one {', one '.join(known)}")
         try:
-            settings[name] = float(value)
+            given[name] = float(value)
         except ValueError:
             raise ValueError(f"action_noise={text!r}: {value.strip()!r} is not a number") from None
         if name == "adaptation_interval":
-            settings[name] = int(settings[name])
-    return kind(**settings)
+            given[name] = int(given[name])
+    return kind(**given) if kind is ParameterNoise else kind(**{"mean": [0.0] * n, first: 0.1, **given})
 
 
 def for_actions(noise: Noise | float | str | None, action_space: spaces.Space) -> Noise | None:
