@@ -132,7 +132,7 @@ MISTAKES = [
     ("[settings.fast]", "[settings.default]", "", "line 10"),
     ("evaluate_every = 500", "minutes = 3", "", "exclude each other"),
     ("evaluate_every = 500", "log = ['jsn']", "", "expected any of"),
-    ("evaluate_every = 500", "backend = 'envpol'", "", "must be 'auto'"),
+    ("evaluate_every = 500", "backend = 'envpol'", "", "must be one of auto"),
     ("evaluate_every = 500", "ray = 'HOST:6379'", "", "ray='HOST:6379' must be 'auto'"),
     ("evaluate_every = 500", "preset = true", "", "preset=True must be the path of a file"),
     ("evaluate_every = 500", "env_kwargs = {render_mode = 'human'}", "environments.CartPole-v1", "render_mode=human"),
