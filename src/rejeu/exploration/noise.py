@@ -307,7 +307,7 @@ def read(text: str, n: int) -> Noise:
         name, equals, value = part.partition("=")
         name, value = (name.strip(), value) if equals else (first, name)
         if name not in known or name in given or (not equals and i > 0):
-            raise TypeError(f"action_noise={text!r} has no setting {part!r}; {found[1]} has one {', one '.join(known)}")
+            raise TypeError(f"action_noise={text!r} takes no {part!r}; {found[1]} takes {', '.join(known)}, each once")
         try:
             given[name] = float(value)
         except ValueError:

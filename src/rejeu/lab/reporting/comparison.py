@@ -291,7 +291,7 @@ def compare(
         ValueError: if there is nothing to compare, or an argument is invalid.
         FileNotFoundError: if a path holds no run.
     """
-    validation.choice("by", by or "algorithm", get_args(By))
+    validation.choice("by", "algorithm" if by is None else by, get_args(By))
     validation.choice("x", x, get_args(Axis))
     validation.choice("score", score, get_args(Score))
     validation.choice("statistic", statistic, statistics.STATISTICS)
