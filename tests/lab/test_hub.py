@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import rejeu
 from rejeu.core.errors import CheckpointError
+from rejeu.demonstrations import record
 from rejeu.lab import hub
 from rejeu.lab.cli import main
 from tests.lab import hub_server
@@ -95,6 +97,29 @@ def test_the_files_are_written_to_a_folder_without_an_upload(server, run, tmp_pa
     assert "not an empty folder" in capsys.readouterr().err
     assert main(["push", str(tmp_path / "files"), "me/cart", "--out", str(tmp_path / "again")]) == 0  # no run folder
     assert {one.name for one in (tmp_path / "again").iterdir()} == {*written}
+
+
+def test_the_address_of_a_dataset_stays_on_this_machine(run, tmp_path):
+    """Only the name of the folder of the demonstrations is written; the model is the same otherwise."""
+    network = {"policy_kwargs": {"net_arch": [8]}, "seed": 0, "learning_starts": 20}
+    record(rejeu.DDPG("MlpPolicy", "Pendulum-v1", **network), "Pendulum-v1", 1, tmp_path / "shown", seed=0)
+    agent = rejeu.DDPG("MlpPolicy", "Pendulum-v1", **network, demonstrations=tmp_path / "shown")
+    agent.learn(40)
+    agent.save(run / "best")
+    (run / "agent.safetensors").unlink()
+    values = {"hyperparameters": {"demonstrations": str(tmp_path / "shown"), "gamma": 0.99}}
+    (run / "config.json").write_text(json.dumps(values))
+    (run / "evaluations.csv").unlink()
+    hub.lay_out(run, tmp_path / "files", "me/pendulum")
+    for path in (tmp_path / "files").iterdir():
+        assert str(tmp_path).encode() not in path.read_bytes(), path
+    written = json.loads((tmp_path / "files" / "config.json").read_text())
+    assert written == {"hyperparameters": {"demonstrations": "shown", "gamma": 0.99}}
+    pushed = rejeu.load(tmp_path / "files" / "agent.safetensors")
+    assert Path(pushed.config.demonstrations) == Path("shown").absolute()
+    assert pushed.num_timesteps == 40
+    for name, array in agent.get_parameters().items():
+        np.testing.assert_array_equal(pushed.get_parameters()[name], array)
 
 
 def test_models_of_stable_baselines3_are_pulled(server, capsys):

@@ -271,9 +271,7 @@ def make_masked(
         )
     if isinstance(env, VectorEnv):
         if env.wait_for is not None:
-            raise ValueError(
-                f"wait_for={env.wait_for} is not available with action masks; make the environments without it"
-            )
+            raise ValueError(f"wait_for={env.wait_for} is not available with action masks; leave it out")
         return MaskedVector(env, asks=True)
     made_from: tuple[str, dict[str, Any]] | None = (env, {}) if isinstance(env, str) else None
     if isinstance(env, str):

@@ -21,6 +21,7 @@ from rejeu.checkpoints import pickled
 from rejeu.checkpoints.run_folder import check_free, find_model
 from rejeu.core.errors import requires
 from rejeu.core.records import brief
+from rejeu.core.validation import assign
 from rejeu.lab.reporting import run_list, runs
 from rejeu.logs import statistics
 from rejeu.logs.formatting import counted
@@ -99,6 +100,12 @@ def lay_out(source: str | Path, folder: Path, repo: str, note: Callable[[str], A
     files = [source / name for name in FILES] if source.is_dir() else [source.with_suffix(".mp4")]
     for path in filter(runs.is_file, files):
         shutil.copyfile(path, folder / (path.name if source.is_dir() else VIDEO))
+    if dataset := getattr(agent.config, "demonstrations", None):  # where it lies on this machine concerns nobody else
+        assign(agent.config, demonstrations=Path(dataset).name)
+        agent.save(folder / MODEL)
+        for path in folder.glob("config.json"):
+            text = path.read_text("utf-8").replace(json.dumps(dataset), json.dumps(Path(dataset).name))
+            path.write_text(text, "utf-8")
     try:
         agent.export(folder / ONNX)
     except (ImportError, OSError, RuntimeError, ValueError) as error:

@@ -134,11 +134,9 @@ class History:
         """Returns the mean of each value and up to ``window - 1`` values before it, ignoring NaN, ``(n_episodes,)``."""
         values = self[column]
         known = np.isfinite(values)
-        sums = np.cumsum(np.where(known, values, 0.0))
-        counts = np.cumsum(known)
-        sums[window:] = sums[window:] - sums[:-window]
-        counts[window:] = counts[window:] - counts[:-window]
-        return sums / np.where(counts, counts, np.nan)
+        totals = np.cumsum([np.where(known, values, 0.0), known], axis=1)
+        totals[:, window:] -= totals[:, :-window].copy()
+        return totals[0] / np.where(totals[1], totals[1], np.nan)
 
     def write_csv(self, path: str | Path) -> None:
         """Writes the table with a header line, atomically."""
