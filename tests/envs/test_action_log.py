@@ -11,9 +11,9 @@ import pytest
 
 import rejeu
 from rejeu.callbacks import Checkpoint
+from rejeu.core.errors import DivergedError
 from rejeu.envs import action_log
 from rejeu.envs.action_log import ActionLog
-from rejeu.envs.base import DivergedError
 from rejeu.envs.make import make_vector
 from tests.tiers import only
 

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import re
 import warnings
 from contextlib import closing
+from functools import partial
 
 import gymnasium as gym
 import numpy as np
 import pytest
 
 import rejeu
+from rejeu.callbacks import Checkpoint
 from rejeu.core import records
+from rejeu.core.errors import DivergedError
 from rejeu.envs.make import make_vector
 from rejeu.envs.snapshot import restore, state_of
 
@@ -138,6 +142,89 @@ def test_an_heir_of_a_known_environment_is_not_taken_for_it():
     assert state_of(env) is None
 
 
+class Array(gym.Wrapper):
+    def get_state(self):
+        return np.zeros(3)
+
+    def set_state(self, state):
+        raise AssertionError
+
+
+class Asking(Array):
+    def get_state(self, full):
+        return {"full": full}
+
+
+class Holding(Array):
+    def get_state(self):
+        return {"pieces": {1, 2}}
+
+
+class Missing(Array):
+    def get_state(self):
+        raise NotImplementedError
+
+
+class Own(gym.Wrapper):
+    def get_wrapper_state(self):
+        return {"env": self.env}
+
+    def set_wrapper_state(self, state):
+        raise AssertionError
+
+
+@pytest.mark.parametrize(
+    ("wrapper", "why"),
+    [
+        (Array, "Array.get_state: the state is of type ndarray, expected a dict"),
+        (Asking, "missing 1 required positional argument: 'full'"),
+        (Holding, "the state.pieces is a set"),
+        (Missing, "Missing.get_state: NotImplementedError"),
+        (Own, "Own.get_wrapper_state: the state.env is a "),
+    ],
+)
+def test_methods_of_that_name_for_other_purposes_are_not_taken(wrapper, why):
+    env = wrapper(gym.make("Pendulum-v1"))
+    env.reset(seed=0)
+    with pytest.warns(UserWarning, match=re.escape(why)):
+        assert state_of(env) is None
+
+
+class Inner(gym.Wrapper):
+    """Its state has that of the environment inside, which may be unknown."""
+
+    def get_state(self):
+        return {"inside": state_of(self.env)}
+
+    def set_state(self, state):
+        restore(self.env, state["inside"])
+
+
+class Two(gym.Wrapper):
+    def get_state(self):
+        return {"board": np.zeros(9)}
+
+    def set_state(self, board, player):
+        raise AssertionError
+
+
+@pytest.mark.parametrize("backend", ["gymnasium", "gymnasium-async"])
+@pytest.mark.parametrize("wrapper", [Inner, Two])
+def test_an_environment_that_cannot_put_its_state_back_begins_new_episodes(wrapper, backend, tmp_path):
+    with closing(make_vector(partial(wrapped, wrapper), 2, backend, seed=0)) as env:
+        agent = rejeu.DQN("MlpPolicy", env, seed=0, policy_kwargs={"net_arch": [8]}, learning_starts=10)
+        agent.learn(40, callback=Checkpoint(tmp_path, every=20))
+    with closing(make_vector(partial(wrapped, wrapper), 2, backend, seed=0)) as env:
+        with pytest.warns(UserWarning, match=f"{wrapper.__name__}.set_state"):
+            agent = rejeu.DQN.resume(tmp_path, env)
+        assert (agent.resumed.step, agent.resumed.exact) == (40, False)
+        assert agent.learn(20).run.step == 60
+
+
+def wrapped(wrapper):
+    return wrapper(gym.make("FrozenLake-v1"))
+
+
 def test_the_state_of_another_environment_is_refused():
     pendulum, cart = gym.make("Pendulum-v1"), gym.make("CartPole-v1")
     pendulum.reset(seed=0)
@@ -210,7 +297,7 @@ def test_a_snapshot_of_another_number_of_environments_is_refused():
 def test_worker_processes_refuse_a_snapshot_of_another_environment():
     with closing(make_vector("CartPole-v1", 1, "gymnasium-async", seed=2)) as one:
         one.reset()
-        with pytest.raises(ValueError, match="environment 0 cannot be restored"):
+        with pytest.raises(DivergedError, match="environment 0 cannot be restored"):
             one.restore([[{}]], None)
 
 

@@ -88,7 +88,7 @@ def test_settings_of_the_loop_and_of_the_buffer_can_be_set(dqn):
     [
         ("gamma", 2, ValueError, "gamma=2 must be"),
         ("policy_kwargs", {"net_arch": [5]}, ValueError, "policy_kwargs cannot be set on a DQN whose networks"),
-        ("action_masks", True, ValueError, "constructor or to load"),
+        ("action_masks", True, ValueError, "constructor or load"),
         ("exploration_schedule", lambda _: 0.1, ValueError, "must be one of linear"),
         ("q_net", None, AttributeError, "use set_parameters"),
         ("_n_updates", 3, AttributeError, "cannot be set"),

@@ -275,9 +275,7 @@ class BaseAgent(ABC):
             ValueError: for a hyperparameter that networks or buffer depend on.
         """
         if name in READ_ONCE:
-            raise AttributeError(
-                f"{name} of {self.name} is read when it is made; give it to the constructor or to load"
-            )
+            raise AttributeError(f"{name} of {self.name} is read when it is made; give it to the constructor or load")
         if name in validation.field_names(self.algorithm.Config):
             self.change(dataclasses.replace(self.config, **self.converted({name: value})))
         elif type(self).__module__.startswith("rejeu."):
@@ -322,7 +320,7 @@ class BaseAgent(ABC):
                 run.replay, run.obs, run.action = self.make_buffer(run.env), None, None
         except ValueError as error:
             self.config, self.learner = old, learner
-            raise ValueError(f"{error}; give it to the constructor or to load") from None
+            raise ValueError(f"{error}; give it to the constructor or load") from None
         if "gamma" in changed and run.replay is not None:
             run.replay.set_gamma(self.config.gamma)
         if "action_noise" in changed:

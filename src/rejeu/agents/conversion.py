@@ -373,9 +373,7 @@ def converted(
 
     def weight(name: str) -> np.ndarray:
         if name not in policy.weights:
-            raise Malformed(
-                f"policy.pth has no {name}: the policy is of another structure than Stable-Baselines3's own"
-            )
+            raise Malformed(f"policy.pth has no {name}: the policy is of another structure than Stable-Baselines3's")
         return policy.weights[name]
 
     arrays: dict[str, np.ndarray] = {}

@@ -20,10 +20,10 @@ from rejeu.checkpoints.run_files import PER_ENV, SCALARS, RowFiles, RunHeader, S
 from rejeu.checkpoints.run_folder import checkpoint_files
 from rejeu.core import checkpoint, devices, records, spaces, xla
 from rejeu.core.algorithm import PyTree
-from rejeu.core.errors import CheckpointError
+from rejeu.core.errors import CheckpointError, DivergedError
 from rejeu.core.records import MAX_ENVS, WRONG, brief, convert
 from rejeu.core.validation import number, whole_seed
-from rejeu.envs.base import DivergedError, seed_of_run
+from rejeu.envs.base import seed_of_run
 from rejeu.envs.make import BACKENDS, Backend, VectorEnv
 from rejeu.replay import ring_io
 from rejeu.replay.prioritized import Draw, Priorities

@@ -44,6 +44,10 @@ class BadEnvironmentError(RuntimeError):
     """An environment returned invalid values, such as NaN or an observation of another shape."""
 
 
+class DivergedError(RuntimeError):
+    """Environments did not return to recorded episodes, so a run cannot be resumed in the middle of them."""
+
+
 class NonFiniteError(RuntimeError):
     """Training stopped at a NaN or infinite value. The message states what, where and what to try."""
 

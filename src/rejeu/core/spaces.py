@@ -63,9 +63,7 @@ def leaves(space: spaces.Space, path: str = "") -> tuple[Leaf, ...]:
     """
     if isinstance(space, spaces.Dict | spaces.Tuple) and not len(space.spaces):
         where = f" at {path!r}" if path else ""
-        raise TypeError(
-            f"the observation space{where} is {space}, which holds nothing; give it a part, or leave it out"
-        )
+        raise TypeError(f"the observation space{where} is {space}, which holds nothing; give it a part or leave it out")
     if isinstance(space, spaces.Dict):
         return tuple(
             leaf for key in sorted(space.spaces) for leaf in leaves(space.spaces[key], f"{path}.{key}".lstrip("."))

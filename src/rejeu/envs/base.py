@@ -68,10 +68,6 @@ SUCCESS_KEYS = ("is_success", "success")
 """Keys of an info that say whether the goal was reached, in order of precedence."""
 
 
-class DivergedError(RuntimeError):
-    """Environments did not reproduce recorded episodes, so a run cannot be resumed in the middle of them."""
-
-
 class Step(NamedTuple):
     """The result of one step of all environments."""
 
@@ -244,7 +240,7 @@ class VectorEnv(ABC):
 
         Raises:
             ValueError: if the snapshot is damaged or of other environments.
-            DivergedError: if the environments do not repeat what was recorded.
+            DivergedError: if the environments do not repeat what was recorded, or cannot put their state back.
         """
         raise ValueError(f"there is no snapshot of environments of the {self.backend} backend")
 

@@ -10,11 +10,12 @@ import gymnasium as gym
 import jax
 import numpy as np
 
+from rejeu.core.errors import DivergedError
 from rejeu.core.spaces import cast, leaves
 from rejeu.core.validation import whole
 from rejeu.envs import goals as goals_module
 from rejeu.envs.action_log import MOST_IMAGE_STEPS, MOST_STEPS, ActionLog, replay
-from rejeu.envs.base import SEEDS_END, SUCCESS_KEYS, DivergedError, Seed, Step, VectorEnv, checked_seed, replaced
+from rejeu.envs.base import SEEDS_END, SUCCESS_KEYS, Seed, Step, VectorEnv, checked_seed, replaced
 from rejeu.envs.goals import PARKED, GoalFunctions, parking_reward
 from rejeu.envs.registry import (
     import_envpool,

@@ -14,7 +14,8 @@ not supported, because their state is not plain data.
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Mapping
+import warnings
+from collections.abc import Callable, Iterator, Mapping
 from typing import Annotated, Any, Literal
 
 import gymnasium as gym
@@ -23,6 +24,9 @@ import numpy as np
 from gymnasium import wrappers
 from gymnasium.envs import classic_control
 from msgspec import Meta
+
+from rejeu.core.errors import DivergedError
+from rejeu.core.records import brief, encode
 
 ABSENT = "absent"
 """Value of an attribute that does not exist yet, such as ``last_u`` before the first step."""
@@ -100,18 +104,34 @@ def layers_of(env: gym.Env) -> Iterator[Any]:
 def _state(layer: Any) -> Any:
     """Returns the state of a layer without its random numbers, None if it is not supported."""
     if answers_for_itself(layer):
-        return layer.get_state()
+        return _answer(layer.get_state)
     if saves_itself(layer):
-        return layer.get_wrapper_state()
+        return _answer(layer.get_wrapper_state)
     if type(layer) in REMEMBERED:
         return {name: getattr(layer, name, ABSENT) for name in REMEMBERED[type(layer)]}
     return _mujoco_state(layer) if is_mujoco(layer) else None
+
+
+def _answer(get: Callable[[], Any]) -> dict[str, Any] | None:
+    """Returns what a method of the environment says of its state; None, with a warning, if it is no dict of plain data.
+
+    Some environments have a method of that name for other purposes.
+    """
+    try:
+        encode(state := get(), {}, "the state")
+        if not isinstance(state, dict):
+            raise TypeError(f"the state is of type {type(state).__name__}, expected a dict")
+    except Exception as error:  # the environment can raise anything
+        warnings.warn(f"{get.__qualname__}: {brief(error)}; a resumed run begins new episodes", stacklevel=2)
+        return None
+    return state
 
 
 def restore(env: gym.Env, layers: list[Any]) -> None:
     """Restores the state that :func:`state_of` returned.
 
     Raises:
+        DivergedError: if the environment's own method fails.
         ValueError: if the environment has other layers, or the state is invalid.
     """
     own = [*layers_of(env)]
@@ -125,10 +145,12 @@ def restore(env: gym.Env, layers: list[Any]) -> None:
 
 def _restore(layer: Any, state: dict[str, Any]) -> None:
     """Restores the state of a layer without its random numbers."""
-    if answers_for_itself(layer):
-        layer.set_state(state)
-    elif saves_itself(layer):
-        layer.set_wrapper_state(state)
+    if answers_for_itself(layer) or saves_itself(layer):
+        put = layer.set_state if answers_for_itself(layer) else layer.set_wrapper_state
+        try:
+            put(state)
+        except Exception as error:  # the environment can raise anything
+            raise DivergedError(f"{put.__qualname__}: {brief(error)}") from error
     elif type(layer) in REMEMBERED:
         types = REMEMBERED[type(layer)]
         check_types(layer, state, types if isinstance(layer, gym.Wrapper) else {**types, "rng": Any})
@@ -174,17 +196,10 @@ def check_types(layer: gym.Env, state: Mapping[str, Any], types: Mapping[str, An
         raise ValueError(f"the state of {type(layer).__name__} has {sorted(state)}, expected {sorted(types)}")
     for name, kind in types.items():
         try:
-            msgspec.convert(_builtin(state[name]), kind)
+            msgspec.convert(np.asarray(state[name]).tolist(), kind)
         except msgspec.ValidationError as error:
             value = str(state[name])[:40]
             raise ValueError(f"{name} of {type(layer).__name__} cannot be {value!r}: {error}") from None
-
-
-def _builtin(value: Any) -> Any:
-    """Converts arrays and NumPy scalars to Python lists and numbers."""
-    if isinstance(value, np.ndarray | np.generic):
-        return value.tolist()
-    return [_builtin(part) for part in value] if isinstance(value, list | tuple) else value
 
 
 def answers_for_itself(layer: gym.Env) -> bool:

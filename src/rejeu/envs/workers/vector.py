@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from rejeu.core.errors import BadEnvironmentError, WorkerError
+from rejeu.core.errors import BadEnvironmentError, DivergedError, WorkerError
 from rejeu.core.records import Count, convert
 from rejeu.core.spaces import Leaf, leaves, rows, structure
 from rejeu.envs import goals as goals_module, snapshot, validation
@@ -363,7 +363,7 @@ class InWorkers(VectorEnv):
         for i, answer in replies.items():
             if not isinstance(answer, bool):
                 why = answer.message if isinstance(answer, WorkerFailure) else answer.why
-                raise ValueError(f"environment {i} cannot be restored: {why}")
+                raise DivergedError(f"environment {i} cannot be restored: {why}")
         for store, leaf in zip(self._stores, jax.tree.leaves(obs), strict=True):
             store[...] = leaf
         self._seed = None

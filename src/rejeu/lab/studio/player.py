@@ -190,9 +190,7 @@ class LivePlayer:
         for path in chosen.get(self.model, named):
             if path.is_file():
                 return path
-        raise FileNotFoundError(
-            "there is no model yet; the first is written within seconds, or at the first evaluation"
-        )
+        raise FileNotFoundError("there is no model yet; the first is written within seconds or at the first evaluation")
 
 
 def value_of(agent: Agent, obs: Any, memory: Any, action: Any) -> list[float]:
