@@ -184,6 +184,20 @@ def test_goal_environments_are_trained_with_hindsight(tmp_path):
     assert (config["n_envs"], config["backend"]) == (2, "envpool")
 
 
+def test_an_environment_that_fails_to_render_has_no_video(tmp_path, capsys):
+    """The run is complete all the same: what ``render`` raises can be of any kind."""
+    (tmp_path / "unseen.py").write_text(
+        "import gymnasium as gym\n"
+        "class Unseen(gym.envs.classic_control.CartPoleEnv):\n"
+        "    def render(self):\n"
+        "        raise KeyError('palette')\n"
+        "gym.register('Unseen-v0', Unseen, max_episode_steps=50)\n"
+    )
+    assert train(tmp_path / "run", "--import", str(tmp_path / "unseen.py"), env="Unseen-v0", steps=60) == 0
+    assert "no video: KeyError('palette')" in capsys.readouterr().out
+    assert {path.name for path in (tmp_path / "run").iterdir()} - {"warnings.txt"} == FILES - {"video.mp4"}
+
+
 def test_without_the_video_extra_the_run_goes_on_and_says_so(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)

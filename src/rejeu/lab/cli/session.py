@@ -10,7 +10,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import gymnasium
 import numpy as np
 
 from rejeu.agents import Agent, load
@@ -20,6 +19,7 @@ from rejeu.callbacks.base import restore
 from rejeu.checkpoints.run_folder import RunFolder, create
 from rejeu.core import errors, xla
 from rejeu.core.interrupt import Interrupt, leaving
+from rejeu.core.records import brief
 from rejeu.envs.make import VectorEnv
 from rejeu.lab.cli.commands import Train
 from rejeu.lab.cli.environment import Environment
@@ -241,7 +241,7 @@ class Session(NamedTuple):
     def record_video(self, learning: Learning) -> None:
         """Records a video of the best model and adds it to the outputs, or prints why not."""
         agent, folder, make = self.agent, self.folder, self.environment.rendering
-        with optional("video", ValueError, gymnasium.error.Error):
+        with optional("video", Exception):  # the environment can raise anything
             video.record_video(load(folder.best), folder.video, make, VIDEO_EPISODES, VIDEO_STEPS, self.config.seed)
             for output in learning.sinks:
                 output.write_video(agent.num_timesteps, folder.video)
@@ -260,7 +260,7 @@ def optional(what: str, *kinds: type[Exception]) -> Iterator[None]:
     try:
         yield
     except expected as error:
-        echo(f"no {what}: {' '.join(str(error).split())}")
+        echo(f"no {what}: {brief(error) if isinstance(error, ImportError | OSError | ValueError) else repr(error)}")
 
 
 def make_evaluation_env(config: DecidedRun, environment: Environment) -> VectorEnv:
