@@ -105,6 +105,19 @@ def test_what_cannot_be_shown_is_said_in_one_line(folder, monkeypatch):
         assert "\n" not in one.problem
 
 
+@pytest.mark.parametrize("error", [KeyError("palette"), RuntimeError("no display"), AttributeError("no screen")])
+def test_an_environment_that_fails_to_render_is_said_in_one_line(folder, monkeypatch, error):
+    def fail(env):
+        raise error
+
+    monkeypatch.setattr(player, "RENEW", 0.01)
+    monkeypatch.setattr(player, "rgb_frame", fail)
+    one = LivePlayer(folder.path, RunOptions(), lambda *_: None)
+    until(lambda: one.problem)
+    one.close()
+    assert str(error) in one.problem
+
+
 def test_an_environment_that_was_typed_may_be_imported(tmp_path):
     write(tmp_path / "run", {**CONFIG, "env": "Walk-v0", "env_argument": "walk.py"})
     studio = Studio(tmp_path)

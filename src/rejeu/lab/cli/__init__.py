@@ -118,12 +118,13 @@ def place_of(error: Exception) -> str:
 
 
 def one_line(error: Exception | Warning | str) -> str:
-    r"""Returns an error's or a warning's message on one line and without colors, or the name of its class if it has none.
+    r"""Returns an error's or a warning's message on one line and without colors, with its class if it has none or is a key.
 
-    >>> one_line(ValueError("two\n  lines")), one_line(MemoryError())
-    ('two lines', 'MemoryError')
+    >>> one_line(ValueError("two\n  lines")), one_line(MemoryError()), one_line(KeyError("at"))
+    ('two lines', 'MemoryError', "KeyError('at')")
     """
-    return " ".join(re.sub(r"\x1b\[[\d;]*m", "", str(error)).split()) or type(error).__name__
+    text = repr(error) if isinstance(error, KeyError) else str(error)
+    return " ".join(re.sub(r"\x1b\[[\d;]*m", "", text).split()) or type(error).__name__
 
 
 @contextmanager

@@ -19,8 +19,8 @@ from rejeu.callbacks.base import restore
 from rejeu.checkpoints.run_folder import RunFolder, create
 from rejeu.core import errors, xla
 from rejeu.core.interrupt import Interrupt, leaving
-from rejeu.core.records import brief
 from rejeu.envs.make import VectorEnv
+from rejeu.lab.cli import one_line
 from rejeu.lab.cli.commands import Train
 from rejeu.lab.cli.environment import Environment
 from rejeu.lab.cli.output import Stopwatch, as_dict, echo, noted_in, reporter, summary
@@ -241,7 +241,7 @@ class Session(NamedTuple):
     def record_video(self, learning: Learning) -> None:
         """Records a video of the best model and adds it to the outputs, or prints why not."""
         agent, folder, make = self.agent, self.folder, self.environment.rendering
-        with optional("video", Exception):  # the environment can raise anything
+        with optional("video", (Exception,)):  # the environment can raise anything
             video.record_video(load(folder.best), folder.video, make, VIDEO_EPISODES, VIDEO_STEPS, self.config.seed)
             for output in learning.sinks:
                 output.write_video(agent.num_timesteps, folder.video)
@@ -254,13 +254,12 @@ class Session(NamedTuple):
 
 
 @contextmanager
-def optional(what: str, *kinds: type[Exception]) -> Iterator[None]:
-    """Context whose failure to write something is one line; ``kinds`` are further errors that are expected."""
-    expected: tuple[type[Exception], ...] = (ImportError, OSError, *kinds)
+def optional(what: str, kinds: tuple[type[Exception], ...] = (ImportError, OSError)) -> Iterator[None]:
+    """Context whose failure to write something is one line; ``kinds`` are the errors that are expected."""
     try:
         yield
-    except expected as error:
-        echo(f"no {what}: {brief(error) if isinstance(error, ImportError | OSError | ValueError) else repr(error)}")
+    except kinds as error:
+        echo(f"no {what}: {one_line(error)}")
 
 
 def make_evaluation_env(config: DecidedRun, environment: Environment) -> VectorEnv:

@@ -24,7 +24,7 @@ from rejeu.core.records import convert
 from rejeu.envs.base import success_of
 from rejeu.envs.masks import for_agent
 from rejeu.envs.rendering import rgb_frame
-from rejeu.lab.cli import expected_errors, one_line
+from rejeu.lab.cli import one_line
 from rejeu.lab.cli.commands import RunOptions
 from rejeu.lab.cli.environment import from_run
 from rejeu.lab.reporting.runs import has_process
@@ -112,7 +112,7 @@ class LivePlayer:
                 made = from_run(read_folder(self.folder), self.folder.path, self.given)
                 with closing(made.rendering()) as env:
                     self._act(env)
-            except expected_errors() as error:
+            except Exception as error:  # the environment can raise anything
                 self.problem = one_line(error)
                 self._changed.wait(RENEW)
         with suppress(OSError):
