@@ -424,7 +424,7 @@ def self_seeding():
         ("Pendulum-v1", {"n_envs": True}, "n_envs=True must be"),
         (Counter(), {"n_envs": 2}, "n_envs=2 needs an id or a function"),
         (3, {}, "env must be an id, a Gymnasium environment, .* got int"),
-        (lambda: SAME, {"n_envs": 2}, "same environment was given more than once"),
+        (lambda: SAME, {"n_envs": 2}, "one environment was given more than once"),
         ("Pendulum-v1", {"backend": "envpool", "g": 9.0}, "envpool backend takes no environment arguments"),
         ("Pendulun-v1", {}, "no environment is called 'Pendulun-v1'; did you mean .*Pendulum-v1"),
         ("parkin-v0", {}, "no environment is called 'parkin-v0'; did you mean .*parking-v0"),

@@ -64,6 +64,13 @@ def test_a_return_is_judged_by_what_is_asked_else_by_what_is_declared(declared, 
         ({"is_success": False, "success": True}, 0.0),
         ({"is_success": np.array([True, False])}, 0.0),
         ({"success": None}, math.nan),
+        ({"is_success": math.nan}, math.nan),
+        ({"is_success": np.array([1.0, math.nan])}, math.nan),
+        ({"is_success": "no"}, math.nan),
+        ({"success": {"door": True}}, math.nan),
+        ({"success": 0.3}, 0.0),
+        ({"success": -1}, 0.0),
+        ({"success": 2}, 1.0),
     ],
 )
 def test_an_info_says_success_by_one_of_two_keys(info, expected):

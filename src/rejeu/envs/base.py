@@ -294,17 +294,20 @@ def success_by(own: float, episode_return: float, threshold: float | None) -> fl
 
 
 def success_of(info: dict[str, Any]) -> float:
-    """Returns the value of ``is_success`` or ``success`` in an info as 1.0 or 0.0, NaN without either.
+    """Returns whether ``is_success`` or ``success`` in an info is true, or all its numbers are at least 1: 1.0 or 0.0.
+
+    NaN without either, and where it is no number: then nothing is known.
 
     Raises:
         BadEnvironmentError: if the info is not a dict.
     """
     if not isinstance(info, dict):
-        raise BadEnvironmentError(
-            f"step returned the info {info!r:.80}, expected a dict; return {{}} if it says nothing"
-        )
-    value = info.get("is_success", info.get("success"))
-    return float("nan") if value is None else float(np.all(value))
+        raise BadEnvironmentError(f"step returned the info {info!r:.80}, expected a dict; return {{}} to say nothing")
+    try:
+        value = np.asarray(info.get("is_success", info.get("success")), float)
+    except (TypeError, ValueError):
+        return math.nan
+    return math.nan if np.isnan(value).any() else float((value >= 1).all())
 
 
 def step_whole(step_all: Callable[[np.ndarray], Step], before: Any, action: np.ndarray, active: np.ndarray) -> Step:

@@ -15,7 +15,7 @@ from rejeu.core.spaces import cast, leaves
 from rejeu.core.validation import whole
 from rejeu.envs import goals as goals_module
 from rejeu.envs.action_log import MOST_IMAGE_STEPS, MOST_STEPS, ActionLog, replay
-from rejeu.envs.base import SEEDS_END, SUCCESS_KEYS, Seed, Step, VectorEnv, checked_seed, replaced
+from rejeu.envs.base import SEEDS_END, SUCCESS_KEYS, Seed, Step, VectorEnv, checked_seed, replaced, success_of
 from rejeu.envs.goals import PARKED, GoalFunctions, parking_reward
 from rejeu.envs.registry import (
     import_envpool,
@@ -132,8 +132,7 @@ class EnvPool(VectorEnv):
         return []
 
     def success(self, step: Step, env: int) -> float:
-        value = step.info.get("is_success", step.info.get("success"))
-        return float("nan") if value is None else float(value[env])
+        return success_of({key: value[env] for key, value in step.info.items() if key in SUCCESS_KEYS})
 
     def goals(self) -> GoalFunctions | None:
         if "desired_goal" not in getattr(self.observation_space, "spaces", ()):

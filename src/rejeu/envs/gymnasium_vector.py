@@ -14,8 +14,8 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 
 from rejeu.core.errors import BadEnvironmentError, WorkerError
 from rejeu.core.spaces import leaves, plain
-from rejeu.envs import goals as goals_module, validation
-from rejeu.envs.base import SUCCESS_KEYS, Seed, Step, VectorEnv, describe_spec, each_info, each_seed, step_whole
+from rejeu.envs import base, goals as goals_module, validation
+from rejeu.envs.base import Seed, Step, VectorEnv, describe_spec, each_info, each_seed, step_whole
 from rejeu.envs.goals import GoalFunctions
 
 SAME_ARRAY = (
@@ -183,10 +183,8 @@ class GymnasiumVector(VectorEnv):
 
     def success(self, step: Step, env: int) -> float:
         info = step.info.get("final_info", step.info) if self._same_step else step.info
-        for key in SUCCESS_KEYS:
-            if key in info and info.get(f"_{key}", np.ones(self.n_envs, bool))[env]:
-                return float(info[key][env])
-        return float("nan")
+        known = [key for key in base.SUCCESS_KEYS if key in info and info.get(f"_{key}", np.ones(self.n_envs))[env]]
+        return base.success_of({key: info[key][env] for key in known})
 
     def goals(self) -> GoalFunctions | None:
         unwrapped = self.env.unwrapped

@@ -35,9 +35,7 @@ class InProcess(VectorEnv):
         for fault in filter(None, map(validation.environment_fault, envs)):
             raise TypeError(fault)
         if len({id(env) for env in envs}) < len(envs):
-            raise ValueError(
-                "the same environment was given more than once; the function must make a new one each time"
-            )
+            raise ValueError("one environment was given more than once; the function must make a new one each time")
         self.envs = list(envs)
         self.venv = venv
         self.n_envs = len(envs)
