@@ -422,7 +422,7 @@ MEMORY: dict[str, Any] = {"seed": 0, "policy_kwargs": {"lstm_hidden_size": 8, "n
         ),
         (
             lambda env, known: rejeu.SAC("MlpPolicy", env, demonstrations="shown", priorities={}),
-            "have no priorities",
+            "cannot be combined",
         ),
     ],
 )
@@ -489,7 +489,7 @@ def test_an_agent_with_masks_is_recorded_with_them() -> None:
 
 def test_demonstrations_are_found_from_another_folder() -> None:
     assert rejeu.SAC.algorithm.Config(demonstrations="shown").demonstrations == str(Path.cwd() / "shown")
-    with pytest.raises(TypeError, match="must be a folder"):
+    with pytest.raises(TypeError, match="must be the folder"):
         rejeu.SAC.algorithm.Config(demonstrations=shown("Box", 1)[1])
 
 

@@ -80,7 +80,7 @@ def test_a_log_larger_than_any_is_not_read(tmp_path, log, monkeypatch):
     path = tmp_path / "metrics"
     path.touch()
     os.truncate(path, 2**40)
-    with pytest.raises(OSError, match="metrics has more than 0 GiB; move it, and a new one begins"):
+    with pytest.raises(OSError, match="metrics has more than 0 GiB; move it away, and a new one begins"):
         log(path, up_to=10)
     assert path.stat().st_size == 2**40
 

@@ -217,11 +217,11 @@ class OffPolicyConfig(AlgorithmConfig):
         coerce(self, "demonstration_share", number, least=0, most=1)
         coerce(self, "offline", flag)
         if not isinstance(self.demonstrations, str | Path | None):
-            raise TypeError(f"demonstrations={self.demonstrations!r} must be a folder, of record(..., path=FOLDER)")
+            raise TypeError(f"demonstrations={self.demonstrations!r} must be the folder of record(..., path=FOLDER)")
         if self.demonstrations is not None:  # a run may be resumed from another folder
             assign(self, demonstrations=str(Path(self.demonstrations).absolute()))
         if self.demonstrations is not None and self.priorities is not None:
-            raise ValueError("demonstrations have no priorities: their share is drawn uniformly; leave one of them out")
+            raise ValueError("demonstrations are drawn uniformly and cannot be combined with priorities; leave one out")
         if self.offline and self.demonstrations is None:
             raise ValueError("offline=True learns from demonstrations alone; give demonstrations=FOLDER too")
         if self.action_noise is not None:

@@ -304,8 +304,7 @@ def success_of(info: dict[str, Any]) -> float:
     if not isinstance(info, dict):
         raise BadEnvironmentError(f"step returned the info {info!r:.80}, expected a dict; return {{}} to say nothing")
     value = np.asarray(info.get("is_success", info.get("success")))
-    is_known = value.dtype.kind in "biuf" and not np.isnan(value).any()
-    return float((value >= 1).all()) if is_known else math.nan
+    return float((value >= 1).all()) if value.dtype.kind in "biuf" and not np.isnan(value).any() else math.nan
 
 
 def step_whole(step_all: Callable[[np.ndarray], Step], before: Any, action: np.ndarray, active: np.ndarray) -> Step:

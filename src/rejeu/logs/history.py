@@ -135,7 +135,7 @@ class History:
         values = self[column]
         known = np.isfinite(values)
         totals = np.cumsum([np.where(known, values, 0.0), known], axis=1)
-        totals[:, window:] -= totals[:, :-window].copy()
+        totals[:, window:] -= totals[:, :-window]
         return totals[0] / np.where(totals[1], totals[1], np.nan)
 
     def write_csv(self, path: str | Path) -> None:

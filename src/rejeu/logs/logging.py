@@ -217,7 +217,7 @@ def read_log(path: Path) -> bytes:
     """
     content = read_bytes(path, MAX_LOG_BYTES + 1)
     if len(content) > MAX_LOG_BYTES:
-        raise OSError(f"{path} has more than {MAX_LOG_BYTES >> 30} GiB; move it, and a new one begins")
+        raise OSError(f"{path} has more than {MAX_LOG_BYTES >> 30} GiB; move it away, and a new one begins")
     return content
 
 
