@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import json
 import pickle
 import shutil
@@ -12,6 +13,10 @@ from pathlib import Path
 import pytest
 
 import rejeu
+import rejeu.lab.cli
+from rejeu.envs.registry import is_plain_id
+from rejeu.teaching.courses import leaderboard
+from tests import hostile_files
 from tests.core.test_schemas import FILES
 
 ROOT = Path(__file__).parents[2]
@@ -129,3 +134,53 @@ def is_generated(name: str) -> bool:
 def test_the_watch_sees_a_pickle_that_runs_code(seen):
     """Else the test above could not fail."""
     assert ["pickle.find_class", "builtins"] in seen["pickle"]["events"]
+
+
+TYPED = {"arguments.env", "given.env", "full_name(arguments.env)"}
+"""Where a person has typed the id of an environment: the arguments of a command."""
+
+
+def test_only_what_a_person_has_typed_reaches_the_functions_that_import_an_environment():
+    """Ids from elsewhere go through ``from_run``, which asks ``is_plain_id``."""
+    calls = [
+        (path.name, getattr(scope, "name", ""), ast.unparse(call.args[0]))
+        for path in SOURCE.rglob("*.py")
+        for scope in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(scope, ast.FunctionDef)
+        for call in ast.walk(scope)
+        if isinstance(call, ast.Call) and ast.unparse(call.func).endswith(("from_arguments", "find_id"))
+    ]
+    assert len(calls) > 8
+    untyped = {call for call in calls if call[2] not in TYPED}
+    assert untyped == {("environment.py", "from_arguments", "env")}  # its own argument, which is one of these
+
+
+@pytest.mark.parametrize(
+    "env_id",
+    [
+        "evil.py", "models/evil.py", "models/evil.PY", "models/evil.py.", "models/evil.py ", "models\\evil.py", "evil.py\0",
+        "evil.py\n", "/evil", "//host/share/evil", "a//b", "../evil", "a/b/c", "C:evil.py", "file:///evil.py", "evil:Walk-v0",
+        "evil.py:Walk-v0", "evil.Py", "evil:", ":evil", "", ".", "a" * 201, 3, None, ["evil.py"],
+    ],
+)  # fmt: skip
+def test_a_file_may_not_name_an_environment_that_is_imported(env_id):
+    assert not is_plain_id(env_id)
+
+
+@pytest.mark.parametrize("env_id", ["CartPole-v1", "ALE/Pong-v5", "rejeu/Ball-v0", "Walk.2d-v0", "happy", "Ünï-v0"])
+def test_a_file_may_name_an_environment_that_is_looked_up(env_id):
+    assert is_plain_id(env_id)
+
+
+def test_a_leaderboard_imports_no_file_that_a_model_names(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "models").mkdir()
+    (tmp_path / "models" / "evil.py").write_text("open('ran', 'w')", encoding="utf-8")
+    content = hostile_files.changed(
+        (FILES / "sac.safetensors").read_bytes(), lambda h, a: h.update(env_id="models/evil.py")
+    )
+    (tmp_path / "models" / "student.safetensors").write_bytes(content)
+    with pytest.raises(ValueError, match="no model says which environment"):
+        leaderboard.usual_env_id(leaderboard.models(tmp_path / "models"))
+    assert rejeu.lab.cli.main(["class", "models"]) == 2
+    assert not (tmp_path / "ran").exists()

@@ -19,8 +19,8 @@ from gymnasium.envs.registration import EnvSpec
 
 from rejeu.core.errors import MissingExtra, requires
 
-PLAIN_ID = re.compile(r"[\w./-]{1,200}")
-"""Pattern of ids that are looked up. An id with a colon makes Gymnasium import a module."""
+PLAIN_ID = re.compile(r"(?=.{1,200}$)([\w-]+/)?[\w.-]*(?<!\.py)(?<!\.)", re.IGNORECASE)
+"""Pattern of ids that are looked up: a name, after a namespace or none. An id with a colon makes Gymnasium import a module."""
 PLAIN_WORD = re.compile(r"[\w-]{0,60}")
 """Pattern of strings that are neither paths nor importable."""
 LARGEST = 1e6
@@ -109,7 +109,11 @@ def _without_notice(module: str) -> None:
 
 
 def is_plain_id(env_id: object) -> bool:
-    """Returns whether this is an id without a module to import, which is allowed in a file."""
+    """Returns whether a file may name this environment: it is an id that is looked up, and no module or file to import.
+
+    >>> is_plain_id("rejeu/Ball-v0"), is_plain_id("my_env:Walk-v0"), is_plain_id("models/evil.py"), is_plain_id("//host/x")
+    (True, False, False, False)
+    """
     return isinstance(env_id, str) and PLAIN_ID.fullmatch(env_id) is not None
 
 

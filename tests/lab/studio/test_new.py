@@ -7,9 +7,11 @@ import pytest
 
 pytest.importorskip("nicegui", reason="needs nicegui, which is in the extra studio")
 
+from fastapi import Request
+
 from rejeu.lab.cli.commands import Train
 from rejeu.lab.runs.config import options
-from rejeu.lab.studio.new import LEFT_OUT, command, problem_of, require_known
+from rejeu.lab.studio.new import LEFT_OUT, command, prefilled, problem_of, require_known
 
 OPTIONS = {one.field: one for one in options(Train)}
 
@@ -60,6 +62,20 @@ def test_an_unknown_environment_is_refused_at_once_with_similar_ones():
         require_known(Train(env="CartPoole-v1"))
     for known in ({"env": "Acrobot-v1"}, {"env": "my_env:Any-v0"}, {"env": "Any-v0", "imports": ("my_env",)}):
         require_known(Train(**known))
+
+
+@pytest.mark.parametrize(
+    ("query", "env_id"),
+    [
+        ("env=CartPole-v1", "CartPole-v1"),
+        ("env=evil.py", None),
+        ("env=evil:Walk-v0", None),
+        ("env=//host/evil", None),
+        ("", None),
+    ],
+)
+def test_an_address_puts_no_environment_into_the_form_that_a_click_would_import(query, env_id):
+    assert prefilled(Request({"type": "http", "query_string": query.encode()})) == env_id
 
 
 def test_a_field_says_what_is_wrong_while_it_is_filled():

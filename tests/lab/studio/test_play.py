@@ -73,8 +73,8 @@ def test_an_error_is_one_line_on_the_page(browser, common):
 @pytest.mark.parametrize(
     ("wanted", "message"),
     [
-        (Wanted("evil:Env-v0", (), True, None, False), "'evil:Env-v0' would be imported"),
-        (Wanted("evil.py", (), True, None, False), "'evil.py' would be imported"),
+        (Wanted("evil:Env-v0", (), True, None, False), "names the environment 'evil:Env-v0', and no file may name"),
+        (Wanted("evil.py", (), True, None, False), "names the environment 'evil.py', and no file may name"),
         (Wanted("", ("../anna.safetensors",), True, None, False), "is not in the folder of the studio"),
         (Wanted("", ("/etc/passwd",), True, None, False), "is not in the folder of the studio"),
         (Wanted("Pendulum-v1", ("anna.safetensors",), True, None, False), "plays CartPole-v1, not Pendulum-v1"),

@@ -422,8 +422,8 @@ class Studio(RunOptions):
     """Print the address, and do not open it in the web browser."""
 
 
-@dataclass(frozen=True)
-class Class(EnvironmentOptions):
+@dataclass(frozen=True, kw_only=True)
+class Class(RunOptions):
     """Evaluates the models in a folder, such as those of a class, and prints a leaderboard with confidence intervals.
 
     Every model plays the same episodes. A file that is damaged or of another environment gets one line. The page Class of

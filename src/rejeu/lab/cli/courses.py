@@ -12,6 +12,7 @@ from rejeu.core.validation import whole
 from rejeu.lab.cli import dumps, environment
 from rejeu.lab.cli.commands import Class, Course
 from rejeu.lab.cli.output import echo
+from rejeu.lab.runs.config import RunConfig
 from rejeu.logs.formatting import quoted, show_table
 from rejeu.teaching.courses import grading, leaderboard, write
 
@@ -58,7 +59,8 @@ def run_class(arguments: Class) -> tuple[int, dict[str, Any]]:
             f"--out {out} must end in {' or '.join(formats)}; the page is that of rejeu studio {arguments.folder}"
         )
     paths, language = leaderboard.models(arguments.folder), chosen(arguments.language)
-    made = environment.from_arguments(arguments.env or leaderboard.usual_env_id(paths), arguments)
+    env_id = "" if arguments.env is not None else leaderboard.usual_env_id(paths)
+    made = environment.from_run(RunConfig(env=env_id), arguments.folder, arguments)
     echo(said("{}, {} episodes of each of {} models", made, episodes, len(paths), language=language))
     board = leaderboard.build(
         arguments.folder,

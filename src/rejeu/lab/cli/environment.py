@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import importlib
 import os
-import re
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -28,11 +27,6 @@ from rejeu.envs.registry import are_plain, is_plain_id, maker
 from rejeu.envs.rendering import make_rendering_env
 from rejeu.lab.cli.commands import RunOptions
 from rejeu.lab.runs.config import EnvironmentOptions, RunConfig, merged, read_folder
-
-
-def imports(typed: str) -> bool:
-    """Returns whether naming an environment like this imports code."""
-    return not is_plain_id(typed) or typed.endswith(".py")
 
 
 def find_id(name: str) -> str:
@@ -229,12 +223,12 @@ def from_arguments(env: str, given: EnvironmentOptions) -> Environment:
     return Environment(find_id(env), run, wrappers)
 
 
-def from_run(run: RunConfig, where: Path, given: RunOptions) -> Environment:
+def from_run(run: RunConfig, where: object, given: RunOptions) -> Environment:
     """Returns the environment of a run: what the command line says, else what its folder says.
 
     Args:
         run: as the folder or the model has it.
-        where: the folder or file, for messages.
+        where: the folder or file that names it, for messages.
         given: the command line; ``--env`` replaces everything, keyword arguments alone replace those of the same name.
 
     Raises:
@@ -243,14 +237,14 @@ def from_run(run: RunConfig, where: Path, given: RunOptions) -> Environment:
     """
     if given.env is not None:
         return from_arguments(given.env, given)
-    if not isinstance(run.env, str) or imports(run.env) or not re.fullmatch(r"[\w./-]{1,200}", run.env):
+    if not is_plain_id(run.env):
         raise CheckpointError(
-            f"{where} names the environment {str(run.env)[:60]!r}, and no file may name what is imported; name it yourself: "
-            "--env ID"
+            f"{where} names the environment {str(run.env)[:60]!r}, and no file may name what is imported; name it "
+            "yourself on the command line: --env ID"
         )
     own = merged(given.env_kwargs, {}, "--env-kwargs")
     kept = {key: value for key, value in run.env_kwargs.items() if key not in own}
-    if imports(run.typed) or (run.wrappers and not given.wrappers) or not are_plain(kept):
+    if not is_plain_id(run.typed) or (run.wrappers and not given.wrappers) or not are_plain(kept):
         wrappers = given.wrappers or run.wrappers
         again = RunConfig(env=run.typed, env_kwargs={**kept, **own}, wrappers=wrappers).again()
         raise CheckpointError(

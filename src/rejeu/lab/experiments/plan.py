@@ -246,7 +246,7 @@ def read_environments(content: Content, common: Kwargs, plan: str) -> Iterator[E
             own = {key: value for key, value in table.items() if key in OPTIONS}
             about = convert({key: value for key, value in table.items() if key not in own}, Environments)
             env_id = about.id or label
-            if not is_plain_id(env_id) or env_id.endswith(".py"):
+            if not is_plain_id(env_id):
                 raise ValueError(
                     f"{shown(env_id)} is not the id of an environment, and no file may name a module; import it on the "
                     "command line, rejeu sweep PLAN --import MODULE, and write its id here"

@@ -282,8 +282,7 @@ class RunConfig(EnvironmentOptions):
         """Whether its environment is imported, or made with more than numbers and words, which no file may ask for."""
         from rejeu.envs.registry import are_plain, is_plain_id  # Gymnasium takes longer than all that --help needs
 
-        is_imported = not is_plain_id(self.typed) or self.typed.endswith(".py")
-        return is_imported or bool(self.wrappers) or not are_plain(self.env_kwargs)
+        return not is_plain_id(self.typed) or bool(self.wrappers) or not are_plain(self.env_kwargs)
 
     def environment_words(self, option: bool = False) -> list[str]:
         """Returns the words of a command line that make the environment.

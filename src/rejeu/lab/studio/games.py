@@ -15,6 +15,7 @@ from rejeu.checkpoints.run_folder import dated, find_model
 from rejeu.core.language import said
 from rejeu.lab.cli import environment, one_line
 from rejeu.lab.cli.environment import Environment
+from rejeu.lab.runs.config import RunConfig
 from rejeu.lab.studio.state import Studio
 from rejeu.teaching.play import Opened, opened
 from rejeu.teaching.play.game import Event, Game, Player
@@ -48,12 +49,7 @@ class Wanted(NamedTuple):
         players = {name: find_agent(studio, name) for name in self.agents}
         made = next((one for _, one in players.values()), None)
         if made is None:
-            env_id, typed = full_name(self.env), studio.typed(self.env)
-            if typed.env is None and environment.imports(env_id):  # an address may not name code
-                raise ValueError(
-                    f"{env_id!r} would be imported; name it on the command line: rejeu studio --env {env_id}"
-                )
-            made = environment.from_arguments(env_id, typed)
+            made = environment.from_run(RunConfig(env=full_name(self.env)), "the address", studio.typed(self.env))
         for name, (_, own) in players.items():
             if own.env_id != (self.env or made.env_id):
                 raise ValueError(f"{name} plays {own.env_id}, not {self.env or made.env_id}")

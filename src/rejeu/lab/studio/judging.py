@@ -10,8 +10,9 @@ from typing import Any
 
 from rejeu.core.language import Language
 from rejeu.lab.cli import environment, one_line
+from rejeu.lab.cli.commands import RunOptions
 from rejeu.lab.reporting.rows import time_of
-from rejeu.lab.runs.config import EnvironmentOptions
+from rejeu.lab.runs.config import RunConfig
 from rejeu.teaching.courses import leaderboard
 from rejeu.teaching.courses.leaderboard import Entrant, Leaderboard, Unranked
 
@@ -79,7 +80,7 @@ class Judging:
         if not due:
             return
         self._env_id = leaderboard.usual_env_id(paths)
-        made = environment.from_arguments(self._env_id, EnvironmentOptions())
+        made = environment.from_run(RunConfig(env=self._env_id), self.folder, RunOptions())
         with closing(made.vector(EPISODES, "gymnasium", SEED)) as env:
             for path in due:
                 if time.monotonic() >= self._until:

@@ -17,10 +17,9 @@ from nicegui import ui
 from rejeu.agents import AGENTS, presets
 from rejeu.checkpoints.run_folder import dated
 from rejeu.core.validation import field_docs
-from rejeu.envs.registry import in_envpool, register, unknown_environment
+from rejeu.envs.registry import in_envpool, is_plain_id, register, unknown_environment
 from rejeu.lab.cli import parsing
 from rejeu.lab.cli.commands import COMMANDS, TASKS, Train, check_options
-from rejeu.lab.cli.environment import imports
 from rejeu.lab.runs.config import Option, Topic, options
 from rejeu.lab.studio import processes
 from rejeu.lab.studio.layout import address
@@ -47,7 +46,7 @@ def build(studio: Studio, request: Request) -> None:
         place = ui.element("div") if topic is Topic.FIRST else ui.expansion(topic.capitalize()).classes("w-full")
         with place.classes("w-full"), ui.element("div").classes("charts w-full"):
             fields |= {one.field: make_field(one, docs.get(one.field, one.shown.help)) for one in listed}
-    fields["env"].value = request.query_params.get("env") or None
+    fields["env"].value = prefilled(request)
     with ui.row().classes("items-center"):
         button = ui.button("Start", icon="play_arrow").props("no-caps")
         spinner = ui.spinner()
@@ -67,6 +66,12 @@ def build(studio: Studio, request: Request) -> None:
         spinner.set_visibility(False)
 
     button.on_click(begin)
+
+
+def prefilled(request: Request) -> str | None:
+    """Returns the environment that an address names, which may not be one that is imported."""
+    env_id = request.query_params.get("env")
+    return env_id if is_plain_id(env_id) else None
 
 
 def make_field(option: Option, about: str) -> Any:
@@ -176,7 +181,7 @@ def require_known(arguments: Train) -> None:
         ValueError: with similar ids.
     """
     env_id = arguments.env
-    if not (imports(env_id) or arguments.imports or register(env_id) or in_envpool(env_id)):
+    if not (not is_plain_id(env_id) or arguments.imports or register(env_id) or in_envpool(env_id)):
         raise ValueError(unknown_environment(env_id))
 
 
