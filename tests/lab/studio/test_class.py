@@ -42,7 +42,7 @@ def test_models_are_evaluated_again_when_they_change_while_somebody_looks(tmp_pa
     monkeypatch.setattr(module, "AGAIN", 0.0)
     monkeypatch.setattr(module, "EPISODES", 2)
     agent = rejeu.DQN("MlpPolicy", "CartPole-v1", policy_kwargs={"net_arch": [8]}, seed=0)
-    judging, studio = Judging(tmp_path), Studio(tmp_path)
+    judging = Judging(studio := Studio(tmp_path))
 
     def until(condition):
         judging.look()

@@ -12,11 +12,9 @@ pytest.importorskip("nicegui", reason="needs nicegui, which is in the extra stud
 import rejeu
 from rejeu.checkpoints.run_folder import RunFolder
 from rejeu.lab.cli.commands import RunOptions
-from rejeu.lab.runs.config import RunConfig
 from rejeu.lab.studio import player
 from rejeu.lab.studio.player import BEST, LiveEpisode, LivePlayer
-from rejeu.lab.studio.state import Studio
-from tests.lab.reporting.report.folders import CONFIG, write
+from tests.lab.reporting.report.folders import write
 
 
 @pytest.fixture(scope="module")
@@ -116,16 +114,6 @@ def test_an_environment_that_fails_to_render_is_said_in_one_line(folder, monkeyp
     until(lambda: one.problem)
     one.close()
     assert str(error) in one.problem
-
-
-def test_an_environment_that_was_typed_may_be_imported(tmp_path):
-    write(tmp_path / "run", {**CONFIG, "env": "Walk-v0", "env_argument": "walk.py"})
-    studio = Studio(tmp_path)
-    with studio:
-        until(lambda: studio.version)
-    assert studio.given("run") == RunOptions()
-    studio.trust(RunConfig(env="walk.py", env_kwargs={"g": 2}, imports=("a.py",)))
-    assert studio.given("run") == RunOptions(env="walk.py", env_kwargs={"g": 2}, imports=("a.py",))
 
 
 def test_the_return_that_follows_a_step_is_discounted():

@@ -7,6 +7,7 @@ import pytest
 pytest.importorskip("nicegui", reason="needs nicegui, which is in the extra studio")
 
 from rejeu.lab.studio import processes, run
+from rejeu.lab.studio.state import Studio
 
 
 def test_a_command_that_is_under_way_is_not_started_again(tmp_path):
@@ -31,7 +32,8 @@ def test_a_command_that_fails_says_why_and_its_button_can_be_pressed_again(tmp_p
     monkeypatch.setattr(processes, "start", lambda words, path: process)
     processes.log_of(tmp_path / "mine").parent.mkdir()
     processes.log_of(tmp_path / "mine").write_text("loading\nrejeu: error: no checkpoint\n", encoding="utf-8")
-    run.command(button, ["resume", "mine"], tmp_path / "mine", "It continues.")
+    page = SimpleNamespace(path=tmp_path / "mine", name="mine", studio=Studio(tmp_path))
+    run.command(button, "resume", page, "It continues.")
     looks[0]()
     assert (presses, said) == (["off"], ["It continues."])
     process.returncode = 2

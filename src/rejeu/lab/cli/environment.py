@@ -217,6 +217,8 @@ def from_arguments(env: str, given: EnvironmentOptions) -> Environment:
         ValueError: if there is none, with the nearest; or for an invalid wrapper or keyword argument.
         ImportError: if a module cannot be imported.
     """
+    for name in given.imports:
+        import_source(name)
     kwargs = merged(given.env_kwargs, {}, "--env-kwargs")
     wrappers = tuple(find_wrapper(name) for name in given.wrappers)
     run = RunConfig(env=env, env_kwargs=kwargs, wrappers=given.wrappers, imports=given.imports)

@@ -112,9 +112,8 @@ def watch_together(arguments: Watch) -> tuple[int, None]:
         for run, model in zip(arguments.runs, models, strict=True)
     }
     seed = [] if arguments.seed is None else [("seed", str(arguments.seed))]
-    open_studio(
-        Path("runs"), guests=guests, page=("/play", [*(("agent", name) for name in guests), ("watch", "1"), *seed])
-    )
+    page = "/play", [*(("agent", name) for name in guests), ("watch", "1"), *seed]
+    open_studio(Path("runs"), guests=guests, page=page, given=arguments)
     return 0, None
 
 

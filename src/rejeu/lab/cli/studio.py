@@ -9,9 +9,11 @@ from pathlib import Path
 
 from rejeu.core import devices
 from rejeu.core.errors import requires
-from rejeu.lab.cli.commands import PORT, Studio
-from rejeu.lab.cli.environment import Environment
+from rejeu.lab.cli.commands import PORT, RunOptions, Studio
+from rejeu.lab.cli.environment import Environment, from_arguments
 from rejeu.lab.runs.config import EnvironmentOptions, RunConfig
+
+NOTHING = RunOptions()
 
 
 def run_studio(arguments: Studio) -> tuple[int, None]:
@@ -22,9 +24,7 @@ def run_studio(arguments: Studio) -> tuple[int, None]:
     """
     if arguments.folder.exists() and not arguments.folder.is_dir():
         raise NotADirectoryError(f"{arguments.folder} is no folder; expected one of runs, such as runs")
-    given = {one.name: getattr(arguments, one.name) for one in fields(EnvironmentOptions)}
-    typed = None if arguments.env is None else RunConfig(env=arguments.env, **given)
-    open_studio(arguments.folder, arguments.port, not arguments.no_browser, typed=typed)
+    open_studio(arguments.folder, arguments.port, not arguments.no_browser, given=arguments)
     return 0, None
 
 
@@ -34,7 +34,7 @@ def open_studio(
     has_browser: bool = True,
     guests: Mapping[str, tuple[Path, Environment]] | None = None,
     page: tuple[str, Sequence[tuple[str, str]]] = ("/", ()),
-    typed: RunConfig | None = None,
+    given: RunOptions = NOTHING,
 ) -> None:
     """Serves the studio until Ctrl-C.
 
@@ -44,7 +44,7 @@ def open_studio(
         has_browser: whether the page is opened in the web browser.
         guests: models that may be elsewhere, with their environments, by their names.
         page: that is opened, and its query.
-        typed: the environment that the command line names, and which runs may therefore import.
+        given: the environment and the modules that the command line names, and which runs may therefore import.
 
     Raises:
         MissingExtra: if NiceGUI is not installed.
@@ -60,7 +60,7 @@ def open_studio(
         if has_browser:
             webbrowser.open(address)
 
-    studio = state.Studio(folder, guests)
-    if typed is not None:
-        studio.trust(typed)
-    server.serve(studio, port, ready, page)
+    env_id = "" if given.env is None else from_arguments(given.env, given).env_id
+    options = {one.name: getattr(given, one.name) for one in fields(EnvironmentOptions)}
+    typed = RunConfig(env=env_id, env_argument=given.env or "", **options)
+    server.serve(state.Studio(folder, guests, typed), port, ready, page)

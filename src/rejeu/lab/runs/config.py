@@ -186,6 +186,16 @@ class EnvironmentOptions:
     imports: Annotated[tuple[str, ...], Shown("MODULE", "import"), Topic.ENVIRONMENT] = ()
     """Import this module or Python file first: one that registers algorithms or environments; repeat for several."""
 
+    def as_words(self, *env: str) -> list[str]:
+        """Returns them as words of a command line after ``env``, the words that name the environment.
+
+        Without these only modules are imported.
+        """
+        words = [*env, *assignment_words("--env-kwargs", self.env_kwargs)]
+        words += chain.from_iterable(("--wrapper", name) for name in self.wrappers)
+        imports = chain.from_iterable(("--import", name) for name in self.imports)
+        return [*(words if env else ()), *imports]
+
 
 @dataclass(frozen=True, kw_only=True)
 class Origin:
@@ -294,10 +304,7 @@ class RunConfig(EnvironmentOptions):
         ['--env', 'my_env.py', '--env-kwargs', 'g=9.8']
         """
         named = ["--env", self.typed] if option else [self.typed]
-        named += assignment_words("--env-kwargs", self.env_kwargs)
-        named += chain.from_iterable(("--wrapper", name) for name in self.wrappers)
-        imports = chain.from_iterable(("--import", name) for name in self.imports)
-        return [*(named if self.names_code or not option else ()), *imports]
+        return self.as_words(*(named if self.names_code or not option else ()))
 
     def again(self) -> str:
         """Returns the options with which ``rejeu evaluate RUN`` and the like make the environment, a space before each.

@@ -29,7 +29,7 @@ def open_form(studio: Studio, name: str, path: Path) -> None:
             button.disable()
             try:
                 out = below(studio.folder, folder.value or "")
-                words = ["branch", str(path), "--at", str(step.value), "--out", str(out)]
+                words = ["branch", str(path), "--at", str(step.value), "--out", str(out), *studio.words(name)]
                 words += ["--steps", more.value] if more.value else []
                 words += ["--set", *shlex.split(settings.value)] if settings.value else []
                 parsing.parse(words, COMMANDS, TASKS, "")

@@ -50,7 +50,7 @@ SLOTS = {
 @cache
 def judging_of(studio: Studio) -> Judging:
     """Returns the results of a studio's folder, the same for all pages."""
-    return Judging(studio.folder)
+    return Judging(studio)
 
 
 def build(studio: Studio, request: Request) -> None:

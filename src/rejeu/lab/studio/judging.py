@@ -10,9 +10,9 @@ from typing import Any
 
 from rejeu.core.language import Language
 from rejeu.lab.cli import environment, one_line
-from rejeu.lab.cli.commands import RunOptions
 from rejeu.lab.reporting.rows import time_of
 from rejeu.lab.runs.config import RunConfig
+from rejeu.lab.studio.state import Studio
 from rejeu.teaching.courses import leaderboard
 from rejeu.teaching.courses.leaderboard import Entrant, Leaderboard, Unranked
 
@@ -27,8 +27,8 @@ AGAIN = 20.0
 class Judging:
     """The results of the models below a folder. Mutable; a thread adds them while :meth:`look` is called."""
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    def __init__(self, studio: Studio) -> None:
+        self.studio, self.folder = studio, studio.folder
         self.now = ""
         """Name of the model that is evaluated; empty for none."""
         self.problem = ""
@@ -80,7 +80,7 @@ class Judging:
         if not due:
             return
         self._env_id = leaderboard.usual_env_id(paths)
-        made = environment.from_run(RunConfig(env=self._env_id), self.folder, RunOptions())
+        made = environment.from_run(RunConfig(env=self._env_id), self.folder, self.studio.typed(self._env_id))
         with closing(made.vector(EPISODES, "gymnasium", SEED)) as env:
             for path in due:
                 if time.monotonic() >= self._until:

@@ -130,8 +130,8 @@ def words_of(option: Option, given: Any) -> list[str]:
     return [part for word in words for part in (*name, word)]
 
 
-def command(texts: Texts, folder: Path) -> tuple[list[str], Train]:
-    """Returns the words of the command that starts a run below a folder, and its arguments.
+def command(texts: Texts, folder: Path, imports: Sequence[str] = ()) -> tuple[list[str], Train]:
+    """Returns the words of the command that starts a run below a folder, and its arguments; it imports some modules too.
 
     Raises:
         ValueError: for a mistake, as the command line says it, or a folder elsewhere.
@@ -141,6 +141,7 @@ def command(texts: Texts, folder: Path) -> tuple[list[str], Train]:
     named = str(texts.get("out") or dated(texts["env"], texts.get("algorithm")).name)
     given = {**texts, "out": str(below(folder, named))}
     words = [word for one in options(Train) for word in words_of(one, given.get(one.field))]
+    words += [word for name in imports for word in ("--import", name)]
     _, arguments = parsing.parse(["train", *words], COMMANDS, TASKS, "")
     check_options(arguments)
     return ["train", *words], arguments
@@ -162,7 +163,7 @@ async def start(studio: Studio, texts: Texts, say: Callable[[str], object]) -> s
 
     An environment with a preset is not checked: the tests of rejeu do that.
     """
-    words, arguments = command(texts, studio.folder)
+    words, arguments = command(texts, studio.folder, studio.imports)
     if presets.find(arguments.env, None) is None:
         await asyncio.to_thread(require_known, arguments)
         say("rejeu check tries the environment for a few seconds ...")

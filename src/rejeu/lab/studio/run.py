@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -162,8 +162,8 @@ def show_actions(page: RunPage, row: Row) -> None:
     if row["state"] == "running" and page.is_ours and is_alone:
         action("Stop", "stop", lambda event: stop(event.sender, folder))
     if row["state"] in ("paused", "interrupted", "crashed") and page.is_ours:
-        words, text = ["resume", str(page.path)], "The run continues from its newest checkpoint."
-        action("Resume", "play_arrow", lambda event: command(event.sender, words, page.path, text))
+        text = "The run continues from its newest checkpoint."
+        action("Resume", "play_arrow", lambda event: command(event.sender, "resume", page, text))
     if page.is_ours:
         play = address("/play", agent=page.name)
         action("Play", "sports_esports", lambda: ui.navigate.to(play))
@@ -181,16 +181,16 @@ def stop(button: Any, folder: RunFolder) -> None:
         disable_while(button, folder.stop.exists)
 
 
-def command(button: Any, words: Sequence[str], run: Path, text: str) -> None:
+def command(button: Any, name: str, page: RunPage, text: str, *words: str) -> None:
     """Starts a command about a run in a process of its own, and says so or why not, also when it has ended with an error."""
 
     def is_under_way() -> bool:
         if process.poll():
-            ui.notify(processes.read_log(run).strip().rpartition("\n")[2], type="negative")
+            ui.notify(processes.read_log(page.path).strip().rpartition("\n")[2], type="negative")
         return process.returncode is None
 
     try:
-        process = processes.start(words, run)
+        process = processes.start([name, str(page.path), *words, *page.studio.words(page.name)], page.path)
     except (OSError, ValueError) as error:
         ui.notify(brief(error), type="negative")
     else:
@@ -377,6 +377,5 @@ class Episodes:
 
     def replay(self, button: Any) -> None:
         """Lets the best policy play episodes from known seeds, in a process of its own."""
-        path = self.page.path
         text = f"The best policy plays {REPLAYS} episodes; they are listed here when it has finished."
-        command(button, ["report", str(path), "--replay", str(REPLAYS)], path, text)
+        command(button, "report", self.page, text, "--replay", str(REPLAYS))

@@ -4,25 +4,34 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 
+from rejeu.envs.registry import are_plain, is_plain_id
 from rejeu.lab.cli.commands import RunOptions
 from rejeu.lab.cli.environment import Environment
 from rejeu.lab.reporting.rows import Row, Rows
 from rejeu.lab.reporting.runs import RunSummary, is_file
-from rejeu.lab.runs.config import EnvironmentOptions, RunConfig
+from rejeu.lab.runs.config import RunConfig, written
 
 EVERY = 1.0
 """Seconds between two looks at the folder, and longest look, after which rows are shown though some runs are not read yet."""
+
+NOTHING = RunConfig(env="")
+"""What the command line names if it names no environment and no module."""
 
 
 class Studio:
     """The folder of a studio, and the rows of its runs; a thread reads them while the context is entered."""
 
-    def __init__(self, folder: Path, guests: Mapping[str, tuple[Path, Environment]] | None = None) -> None:
-        self.folder = folder
+    def __init__(
+        self,
+        folder: Path,
+        guests: Mapping[str, tuple[Path, Environment]] | None = None,
+        typed: RunConfig = NOTHING,
+    ) -> None:
+        self.folder, self.imports = folder, typed.imports
         self.guests = dict(guests or {})
         """Models that the command line named, with their environments; they may be elsewhere."""
         self.rows: list[Row] = []
@@ -32,7 +41,7 @@ class Studio:
         self.version = 0
         """Rises when the rows change."""
         self._reader = Rows(folder)
-        self._trusted: dict[str, RunOptions] = {}
+        self._trusted = [typed]
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._follow, daemon=True)
 
@@ -48,18 +57,39 @@ class Studio:
         return next((row for row in self.rows if row["run"] == run), None)
 
     def given(self, run: str) -> RunOptions:
-        """Returns what people have typed about the environment of a run, which no file may let import code."""
-        known = self.summaries.get(run)
-        return self.typed("" if known is None else known.config.typed)
+        """Returns how the environment of a run is made, as far as people have typed what no file may name.
+
+        All that makes the environment of a run gets this: threads that show it, and commands, by :meth:`words`. The numbers
+        and words that the environment takes are those of the run.
+        """
+        config = NOTHING if (known := self.summaries.get(run)) is None else known.config
+        closest = sorted(self._trusted, key=lambda typed: written(typed.env_kwargs) != written(config.env_kwargs))
+        options = (allowed(typed, config) for typed in closest)
+        return self._with_imports(next(filter(None, options), RunOptions()))
+
+    def words(self, run: str) -> list[str]:
+        """Returns the same as words of a command line."""
+        given = self.given(run)
+        return given.as_words(*(() if given.env is None else ("--env", given.env)))
 
     def typed(self, env: str) -> RunOptions:
-        """Returns what people have typed about an environment that they named like this."""
-        return self._trusted.get(env, RunOptions())
+        """Returns what people have typed about an environment that they named like this, or on the command line by its id."""
+        options = (
+            RunOptions(env=one.typed, env_kwargs=one.env_kwargs, wrappers=one.wrappers, imports=one.imports)
+            for one in self._trusted
+            if env
+            and (
+                (env == one.typed and not is_plain_id(env)) or (one is self._trusted[0] and env in (one.env, one.typed))
+            )
+        )
+        return self._with_imports(next(options, RunOptions()))
 
     def trust(self, run: RunConfig) -> None:
-        """Lets runs on an environment that somebody has typed be shown, though it is imported."""
-        made = {one.name: getattr(run, one.name) for one in fields(EnvironmentOptions)}
-        self._trusted[run.typed] = RunOptions(env=run.typed, **made)
+        """Lets runs be shown and go on whose environment is imported as that of this run, which somebody has typed."""
+        self._trusted.append(run)
+
+    def _with_imports(self, options: RunOptions) -> RunOptions:
+        return replace(options, imports=(*dict.fromkeys((*self.imports, *options.imports)),))
 
     def holds(self, run: str) -> bool:
         """Returns whether a run has begun, by its path below the folder."""
@@ -78,3 +108,17 @@ class Studio:
                 self.rows, self.summaries = rows, self._reader.summaries()
                 self.version += 1
             self._ended.wait(EVERY)
+
+
+def allowed(typed: RunConfig, run: RunConfig) -> RunOptions | None:
+    """Returns how the environment of a run is made, None unless somebody has typed all of it that no file may name."""
+    is_same = run.env and (
+        run.typed == typed.typed or run.env == typed.env or (not typed.env and is_plain_id(run.typed))
+    )
+    plain = {name: value for name, value in run.env_kwargs.items() if are_plain({name: value})}
+    kwargs = {name: plain.get(name, typed.env_kwargs.get(name)) for name in run.env_kwargs}
+    is_typed = {*run.wrappers} <= {*typed.wrappers} and run.env_kwargs.keys() - plain.keys() <= typed.env_kwargs.keys()
+    if not (is_same and is_typed and are_plain(plain)):
+        return None
+    env = typed.typed or run.typed
+    return RunOptions(env=env, env_kwargs=kwargs, wrappers=run.wrappers, imports=typed.imports)
