@@ -13,7 +13,7 @@ from rejeu.algorithms.sac import Config
 from rejeu.core import validation
 from rejeu.core.errors import MissingObjectError
 from rejeu.core.schedules import Linear
-from rejeu.replay.hindsight import HindsightConfig
+from rejeu.replay.hindsight import GoalSelectionStrategy, HindsightConfig
 
 
 @pytest.mark.parametrize(
@@ -121,6 +121,18 @@ def test_a_strategy_of_a_file_that_nobody_registered_is_named_with_the_way_to_gi
     saved = {"replay_buffer_class": "HerReplayBuffer", "replay_buffer_kwargs": {"goal_selection_strategy": "mine"}}
     with pytest.raises(MissingObjectError, match=r"goal_selection_strategy is your own, 'mine'.*--import MODULE"):
         configs.rebuild(Config, saved, {})
-    for name in ("random", "future"):
+    for name in ("random", "future", "desired"):
         saved["replay_buffer_kwargs"]["goal_selection_strategy"] = name
         assert configs.rebuild(Config, saved, {}).replay_buffer_kwargs.goal_selection_strategy == name
+    saved["replay_buffer_kwargs"]["goal_selection_strategy"] = {"future": 1, "mine": 1}
+    with pytest.raises(MissingObjectError, match=r"goal_selection_strategy is your own, 'mine'.*--import MODULE"):
+        configs.rebuild(Config, saved, {})
+
+
+def test_a_mix_of_strategies_is_written_by_names_and_read_again():
+    her = {"goal_selection_strategy": {"future": 2, GoalSelectionStrategy.DESIRED: 2}}
+    config = Config(replay_buffer_class="HerReplayBuffer", replay_buffer_kwargs=her)
+    saved = json.loads(json.dumps(configs.to_json(config)))
+    assert saved["replay_buffer_kwargs"]["goal_selection_strategy"] == {"future": 2, "desired": 2}
+    assert configs.rebuild(Config, saved, {}) == config
+    assert hash(config.hindsight) == hash(configs.rebuild(Config, saved, {}).hindsight)

@@ -30,6 +30,7 @@ GAMMA = 0.9
 OWN_GOAL = np.array([-1.0, -1.0], np.float32)
 """What every environment asks for."""
 STRATEGIES = [strategy.value for strategy in GoalSelectionStrategy]
+MIXES = [{"future": 2, "desired": 2}, {"episode": 1, "random": 2, "desired": 1}, {"desired": 1}]
 EVEN = ["future", "final", "episode", "random"]
 """Strategies by which all allowed goals are equally likely."""
 
@@ -76,8 +77,12 @@ def allowed_goals(model, strategy, env, place):
         return {(env, later) for later in episode if later > place}
     if strategy == "final":
         return {(env, episode[-1])}
+    if isinstance(strategy, dict):
+        return set().union(*(allowed_goals(model, name, env, place) for name in strategy))
     if strategy == "episode":  # any moment that a kept step led to
         return {(env, other) for other in episode[1:]}
+    if strategy == "desired":
+        return {tuple(OWN_GOAL)}
     return {(other_env, other + 1) for other_env, other in model.steps()}
 
 
@@ -110,7 +115,7 @@ def histories(draw):
 @settings(max_examples=60)
 @given(
     case=histories(),
-    strategy=st.sampled_from(STRATEGIES),
+    strategy=st.sampled_from([*STRATEGIES, *MIXES]),
     k=st.integers(0, 5),
     n_steps=st.integers(1, 4),
     ends=st.booleans(),
@@ -214,7 +219,37 @@ def test_rewards_that_are_infinite_beyond_the_episode_do_not_leak_into_it():
     assert np.isfinite(batch.reward).all()
 
 
-@pytest.mark.parametrize("strategy", STRATEGIES)
+@pytest.mark.parametrize(
+    ("strategy", "shares"),
+    [("desired", {"desired": 4}), ({"future": 2, "desired": 2}, {"future": 2, "desired": 2}), (MIXES[1], MIXES[1])],
+)
+def test_strategies_have_their_shares_of_every_batch_and_desired_takes_that_of_any_step(strategy, shares):
+    """The desired goals of the stored steps are (100 + environment, place), as in no achieved goal."""
+    replay, model = filled(2, 16, [turn("no", "no")] * 5 + [turn("truncated", "no")] + [turn("no", "no")] * 6, strategy)
+    ring, n_envs = replay.ring, 2
+    for env in range(n_envs):
+        times = np.arange(ring.oldest()[env], ring.head[env] + 1)
+        ring.obs[replay.desired][ring.index(np.full(len(times), env), times)] = np.stack(
+            [np.full(len(times), 100 + env), times], axis=1
+        )
+    batches, size = 50, 500
+    goals = replay.sample(np.random.default_rng(0), (batches, size)).obs["desired_goal"][:, : size * 4 // 5]
+    is_desired = goals[..., 0] >= 100
+    expected = size * 4 / 5 * shares["desired"] / sum(shares.values())
+    assert (np.abs(is_desired.sum(axis=1) - expected) <= 2).all()
+    steps = list(model.steps())
+    stored = {(100 + env, int(ring.oldest()[env]) + place) for env, place in steps}
+    drawn, counts = np.unique(goals[is_desired], axis=0, return_counts=True)
+    assert {tuple(int(x) for x in goal) for goal in drawn} == stored
+    assert stats.chisquare(counts).pvalue > 1e-3
+
+
+def test_a_mix_reads_the_counters_that_any_of_its_strategies_needs():
+    for strategy, expected in zip(MIXES, [("until_end",), ("since_start", "until_end"), ()], strict=True):
+        assert counters(HindsightConfig(goal_selection_strategy=strategy)) == expected
+
+
+@pytest.mark.parametrize("strategy", [*STRATEGIES, *MIXES])
 def test_a_restored_buffer_relabels_like_the_original(strategy):
     replay, _ = filled(1, 16, RUNNING_AND_WRAPPED, strategy)
     ring = make_ring(16, 1, GOAL_OBSERVATION, counters(replay.config))
@@ -253,6 +288,13 @@ def test_a_row_takes_what_the_strategy_needs(strategy, n_counters):
             {"goal_selection_strategy": "furture"},
             "'furture' must be one of future, final, episode, random, closest, next_future",
         ),
+        ({"goal_selection_strategy": {"furture": 1}}, "'furture' must be one of future, final"),
+        (
+            {"goal_selection_strategy": {"future": 0}},
+            "goal_selection_strategy future=0 must be a whole number of at least 1",
+        ),
+        ({"goal_selection_strategy": {}}, "must have names of strategies as keys, such as"),
+        ({"goal_selection_strategy": {reward: 1}}, "register_goal_strategy gives a function a name"),
         ({"n_sampled_goal": -1}, "n_sampled_goal=-1 must be a whole number of at least 0"),
         ({"n_sampled_goal": 1.5}, "n_sampled_goal=1.5 must be a whole number"),
         ({"n_sampled_goal": True}, "n_sampled_goal=True must be a whole number"),

@@ -27,7 +27,7 @@ from rejeu.core.validation import C, assign, build, choice, coerce, flag, nested
 from rejeu.exploration import noise as action_noises
 from rejeu.exploration.parameter_space import ParameterNoise
 from rejeu.networks import ENCODERS, MemoryConfig, PolicyConfig, Widths, reads_image, settled
-from rejeu.replay.hindsight import STRATEGIES, HerReplayBuffer, HindsightConfig
+from rejeu.replay.hindsight import ANY_STEP, STRATEGIES, HerReplayBuffer, HindsightConfig, MixedStrategies
 from rejeu.replay.prioritized import PriorityConfig
 
 REPLAY_BUFFERS = {"ReplayBuffer": None, "HerReplayBuffer": HindsightConfig}
@@ -296,8 +296,9 @@ def own_names(saved: Mapping[str, Any]) -> Iterator[tuple[tuple[str, ...], str]]
     for key, value in saved.items():
         if isinstance(value, Mapping) and set(value) == {OWN}:
             yield (key,), str(value[OWN])[:40]
-        elif isinstance(value, str) and key in NAMED and value not in ("random", *NAMED[key]):
-            yield (key,), value[:40]
+        elif key in NAMED and isinstance(value, str | Mapping):
+            names = [value] if isinstance(value, str) else value
+            yield from (((key,), name[:40]) for name in names if name not in (*ANY_STEP, *NAMED[key]))
         elif isinstance(value, Mapping):
             yield from (((key, *keys), name) for keys, name in own_names(value))
 
@@ -356,6 +357,8 @@ def value_to_json(value: Any) -> Any:
         return action_noises.to_json(value)
     if isinstance(value, optimizers.Named):
         return {"name": value.name, **dict(value.settings)}
+    if isinstance(value, MixedStrategies):
+        return dict(value.shares)
     if is_own(value):
         return {OWN: optimizers.name(value)}
     if dataclasses.is_dataclass(value):

@@ -26,7 +26,7 @@ from rejeu.core.algorithm import PyTree, Transition
 from rejeu.core.prng import below
 from rejeu.replay import device_priorities
 from rejeu.replay.device_priorities import DevicePriorities
-from rejeu.replay.hindsight import GoalStrategy, HindsightSteps
+from rejeu.replay.hindsight import GoalStrategy, HindsightSteps, MixedStrategies, mixed
 from rejeu.replay.prioritized import PriorityConfig
 from rejeu.replay.ring import LAST, STEP, TERMINATED, Ring, episode_counters
 from rejeu.replay.uniform import NewGoals, discounts_of, outcome, replaced
@@ -82,7 +82,7 @@ class DeviceReplay:
     n_steps: int = 1
     each_reward: bool = False
     """Whether transitions of several steps have :attr:`Transition.rewards`."""
-    strategy: str | GoalStrategy | None = None
+    strategy: str | GoalStrategy | MixedStrategies | None = None
     """The goal strategy, None without hindsight."""
     n_sampled_goal: int = 4
     achieved: int = 0
@@ -230,7 +230,8 @@ class DeviceReplay:
             assert reward is not None
             n = self.n_relabeled
             goal_rows = self.goal_positions(ring, goals_key, jax.tree.map(lambda x: x[:n], rows))
-            goal = ring.obs[self.achieved][goal_rows]
+            leaves = (ring.obs[leaf].__getitem__ for leaf in (self.achieved, self.desired))
+            goal = mixed(self.strategy).goals(goal_rows, *leaves)
             goals = NewGoals(slice(n), goal, (self.achieved, self.desired), reward, terminated)
         return self.batch(ring, rows, goals)._replace(weight=weight), rows
 
@@ -255,7 +256,19 @@ class DeviceReplay:
         return Transition(tree(obs), action, rewards, tree(next_obs), discount, None, each)
 
     def goal_positions(self, ring: DeviceRing, key: Array, rows: DeviceRows) -> Array:
-        """Returns the positions of the rows whose achieved goals become the new goals of ``rows``, by the strategy."""
+        """Returns the positions of the rows whose goals become the new goals of ``rows``; see :class:`HerReplayBuffer`."""
+        assert self.strategy is not None
+        strategies = mixed(self.strategy)
+
+        def choose(strategy: str | GoalStrategy, number: int, turn: Any) -> Array:
+            own_key = key if len(strategies.shares) == 1 else jax.random.fold_in(key, number)
+            return self.positions_by(strategy, ring, own_key, jax.tree.map(lambda leaf: leaf[turn], rows))
+
+        positions: Array = strategies.joined(jnp, len(rows.time), choose)
+        return positions
+
+    def positions_by(self, strategy: str | GoalStrategy, ring: DeviceRing, key: Array, rows: DeviceRows) -> Array:
+        """Returns the positions that one strategy chooses."""
         newest, numbers = ring.head[rows.env], count()
 
         def episode(times: Array) -> Array:
@@ -278,7 +291,7 @@ class DeviceReplay:
             self.positions,
             (ring.obs[self.achieved].__getitem__, ring.obs[self.desired].__getitem__),
         )
-        positions: Array = steps.chosen_by(self.strategy)  # type: ignore[arg-type]
+        positions: Array = steps.chosen_by(strategy)
         return positions
 
 

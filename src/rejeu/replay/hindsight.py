@@ -7,26 +7,30 @@ drawn: the share ``k / (k + 1)`` of every batch gets, in place of its own goal, 
 - ``final``: the episode's last moment,
 - ``episode``: any moment of the same episode,
 - ``random``: any moment in the buffer,
+- ``desired``: not an achieved goal but the desired one of any step in the buffer,
 - ``closest``: of some later moments of the same episode the one whose achieved goal is closest to the goal (proximity, of
   Fang et al. 2019, "Curriculum-guided Hindsight Experience Replay"),
 - ``next_future``: of every four, one the very next moment, which succeeds in one step, and three as ``future`` (Ozgur et al.
   2025, "Next-Future", arXiv 2504.11247),
 
-and the environment's reward for that goal. Of episodes that still run, or whose beginning was overwritten, the stored
-part is used. ``terminated`` is recomputed if the environment has ``compute_terminated``, and kept otherwise. An episode that
-ended where its own goal was not reached, as in a crash, ends there with any goal. Each strategy is one definition for host
-and device.
+and the environment's reward for that goal. Several strategies may have shares of the relabeled transitions. The mix of later
+achieved goals and desired goals of other steps is that of the code of Pitis et al. 2020, "Maximum Entropy Gain Exploration for
+Long Horizon Multi-goal Reinforcement Learning" (arXiv 2007.02832).
+
+Of episodes that still run, or whose beginning was overwritten, the stored part is used. ``terminated`` is recomputed if the
+environment has ``compute_terminated``, and kept otherwise. An episode that ended where its own goal was not reached, as in a
+crash, ends there with any goal. Each strategy is one definition for host and device.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from copy import deepcopy
 from dataclasses import dataclass
 from enum import Enum
 from functools import cache, cached_property, partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -35,7 +39,7 @@ from rejeu.core.validation import assign, coerce, flag, whole
 from rejeu.envs.goals import GoalFunctions
 from rejeu.replay.prioritized import Draw, Priorities
 from rejeu.replay.ring import LAST, Ring
-from rejeu.replay.uniform import BaseReplayBuffer, NewGoals
+from rejeu.replay.uniform import BaseReplayBuffer, NewGoals, replaced
 
 N_CANDIDATES = 8
 """Later moments of which ``closest`` takes one. All of an episode would always choose the same."""
@@ -99,9 +103,9 @@ class HindsightSteps:
 
     def chosen_by(self, strategy: str | GoalStrategy) -> Any:
         """Returns the positions of the new goals that a strategy, or the one of this name, chooses."""
-        if strategy == "random":
+        if strategy in ANY_STEP:
             env, time = self.drawn()
-            return self.index(env, time + 1)
+            return self.index(env, time + (strategy == "random"))
         times = (STRATEGIES[strategy] if isinstance(strategy, str) else strategy)(self)
         return self.index(self.env, times if strategy in BUILT_IN else stored(self, times))
 
@@ -148,7 +152,9 @@ def next_future(steps: HindsightSteps) -> Any:
 
 FROM_LATER = {"future": future, "final": final, "closest": closest, "next_future": next_future}
 BUILT_IN = {**FROM_LATER, "episode": episode}
-"""Without ``random``, which takes the goals of other environments too."""
+"""Without those of :data:`ANY_STEP`."""
+ANY_STEP = ("random", "desired")
+"""Strategies that take the goal of any stored step, of other environments too."""
 STRATEGIES: dict[str, GoalStrategy] = dict(BUILT_IN)
 """All strategies that have a name."""
 
@@ -164,7 +170,7 @@ def register_goal_strategy(name: str) -> Callable[[GoalStrategy], GoalStrategy]:
     """
 
     def register(strategy: GoalStrategy) -> GoalStrategy:
-        if name == "random" or name in BUILT_IN:
+        if name in ANY_STEP or name in BUILT_IN:
             raise ValueError(f"{name!r} is the name of a goal strategy of rejeu; choose another")
         STRATEGIES[name] = strategy
         return strategy
@@ -187,6 +193,42 @@ class GoalSelectionStrategy(str, Enum):
     RANDOM = "random"
     CLOSEST = "closest"
     NEXT_FUTURE = "next_future"
+    DESIRED = "desired"
+
+
+MAX_SHARE = 1000
+"""Upper limit on the share of a strategy."""
+
+
+class MixedStrategies(NamedTuple):
+    """Goal strategies with shares of the relabeled transitions, which take turns."""
+
+    shares: tuple[tuple[str | GoalStrategy, int], ...]
+    """Strategies and shares, such as ``(("future", 2), ("desired", 2))`` for half of the transitions each."""
+
+    def joined(self, xp: Any, n: int, choose: Callable[[str | GoalStrategy, int, Any], Any]) -> Any:
+        """Returns ``choose(strategy, number, rows)`` of all strategies, in the order of ``n`` transitions."""
+        if len(self.shares) == 1:
+            return choose(self.shares[0][0], 0, slice(None))
+        rows, order = rows_of_shares(tuple(share for _, share in self.shares), n)
+        return xp.concatenate([choose(self.shares[i][0], i, rows[i]) for i in range(len(rows))])[order]
+
+    def goals(self, index: Any, achieved: Callable[[Any], Any], desired: Callable[[Any], Any]) -> Any:
+        """Returns the goals at positions, of which ``achieved`` and ``desired`` return the two kinds."""
+        goals = achieved(index)
+        for i, (strategy, _) in enumerate(self.shares):
+            if strategy == "desired":
+                rows = rows_of_shares(tuple(share for _, share in self.shares), len(index))[0][i]
+                goals = replaced(goals, rows, desired(index[rows]))
+        return goals
+
+
+@cache
+def rows_of_shares(shares: tuple[int, ...], n: int) -> tuple[list[np.ndarray], np.ndarray]:
+    """Returns the indices of each share of ``n`` transitions, which take turns, and the order that sorts all of them."""
+    turns = np.resize(np.repeat(np.arange(len(shares)), shares), n)
+    rows = [np.flatnonzero(turns == i) for i in range(len(shares))]
+    return rows, np.argsort(np.concatenate(rows))
 
 
 @dataclass(frozen=True)
@@ -195,9 +237,11 @@ class HindsightConfig:
 
     n_sampled_goal: int = 4
     """Relabeled transitions per original one. Raising it learns more from failures and less from the real goals."""
-    goal_selection_strategy: str | GoalStrategy = "future"
-    """``future``, ``final``, ``episode``, ``random``, ``closest``, ``next_future``, a ``GoalSelectionStrategy``, or a strategy
-    of your own: a function ``(steps) -> times``, or its registered name (see ``rejeu.replay.hindsight.GoalStrategy``)."""
+    goal_selection_strategy: str | GoalStrategy | MixedStrategies = "future"
+    """``future``, ``final``, ``episode``, ``random``, ``closest``, ``next_future``, ``desired``, a ``GoalSelectionStrategy``,
+    a strategy of your own, which is a function ``(steps) -> times`` or its registered name (see
+    ``rejeu.replay.hindsight.GoalStrategy``), or a dict of names and shares of the relabeled transitions, such as
+    ``{"future": 2, "desired": 2}``."""
     copy_info_dict: bool = False
     """Give ``compute_reward`` and ``compute_terminated`` the info of each step, row by row, instead of an empty one. Files of
     the buffer and checkpoints do not contain infos: after loading, those of earlier steps are empty."""
@@ -205,16 +249,43 @@ class HindsightConfig:
     def __post_init__(self) -> None:
         coerce(self, "n_sampled_goal", whole, least=0)
         coerce(self, "copy_info_dict", flag)
-        strategy = name_of(self.goal_selection_strategy)
-        if isinstance(strategy, GoalSelectionStrategy):
-            strategy = strategy.value
-        known = [*dict.fromkeys([*(one.value for one in GoalSelectionStrategy), *STRATEGIES])]
-        if not callable(strategy) and strategy not in known:
-            raise ValueError(
-                f"goal_selection_strategy={strategy!r} must be one of {', '.join(known)}, or a function (steps) -> times; the "
-                "name of a function of yours is enough if it was registered before (register_goal_strategy)"
-            )
+        strategy = checked_strategy(self.goal_selection_strategy)
         assign(self, goal_selection_strategy=strategy)
+
+
+def checked_strategy(strategy: Any) -> str | GoalStrategy | MixedStrategies:
+    """Returns a goal strategy as settings have it: a name, a function without a name, or several names with shares.
+
+    Raises:
+        ValueError: for anything else.
+    """
+    if isinstance(strategy, Mapping | MixedStrategies):
+        pairs = strategy.shares if isinstance(strategy, MixedStrategies) else strategy.items()
+        names: list[Any] = [checked_strategy(name) for name, _ in pairs]
+        if not names or not all(isinstance(name, str) for name in names):
+            raise ValueError(
+                f"goal_selection_strategy={strategy!r} must have names of strategies as keys, such as "
+                '{"future": 2, "desired": 2}; register_goal_strategy gives a function a name'
+            )
+        shares = [
+            whole(f"goal_selection_strategy {name}", n, 1, MAX_SHARE) for name, (_, n) in zip(names, pairs, strict=True)
+        ]
+        return MixedStrategies(tuple(zip(names, shares, strict=True)))
+    strategy = name_of(strategy)
+    strategy = strategy.value if isinstance(strategy, GoalSelectionStrategy) else strategy
+    names = [*dict.fromkeys([*(member.value for member in GoalSelectionStrategy), *STRATEGIES])]
+    if not callable(strategy) and strategy not in names:
+        raise ValueError(
+            f"goal_selection_strategy={strategy!r} must be one of {', '.join(names)}, a function (steps) -> times, or a dict "
+            "of such names and their shares; the name of a function of yours is enough if it was registered before "
+            "(register_goal_strategy)"
+        )
+    return strategy
+
+
+def mixed(strategy: str | GoalStrategy | MixedStrategies) -> MixedStrategies:
+    """Returns strategies with shares; a single one has all."""
+    return strategy if isinstance(strategy, MixedStrategies) else MixedStrategies(((strategy, 1),))
 
 
 def counters(config: HindsightConfig | None) -> tuple[str, ...]:
@@ -223,9 +294,10 @@ def counters(config: HindsightConfig | None) -> tuple[str, ...]:
     >>> counters(HindsightConfig(goal_selection_strategy="future"))
     ('until_end',)
     """
-    if config is None or config.goal_selection_strategy == "random":
+    strategies = {*dict(mixed(config.goal_selection_strategy).shares)} - {*ANY_STEP} if config is not None else set()
+    if not strategies:
         return ()
-    return ("until_end",) if config.goal_selection_strategy in (*FROM_LATER,) else ("since_start", "until_end")
+    return ("until_end",) if strategies <= {*FROM_LATER} else ("since_start", "until_end")
 
 
 class HerReplayBuffer(BaseReplayBuffer):
@@ -291,7 +363,8 @@ class HerReplayBuffer(BaseReplayBuffer):
         read = ring.read(rows.position)
         which = relabeled_positions(shape, self.config.n_sampled_goal)
         index = self.goal_index(rng, rows.env[which], rows.time[which], read[0][which])
-        goal = ring.read_leaf(self.achieved, index)
+        strategies = mixed(self.config.goal_selection_strategy)
+        goal = strategies.goals(index, *(partial(ring.read_leaf, leaf) for leaf in (self.achieved, self.desired)))
         reward, terminated = self.goals
         if self.infos is not None:
             kept = self.infos[ring.index(rows.env[which, None], rows.time[which, None] + np.arange(self.n_steps))]
@@ -304,6 +377,8 @@ class HerReplayBuffer(BaseReplayBuffer):
     def goal_index(self, rng: np.random.Generator, env: np.ndarray, time: np.ndarray, step: np.ndarray) -> np.ndarray:
         """Returns the positions of the rows whose achieved goals become the new goals, by the strategy, ``(n,)``.
 
+        Where ``desired`` chooses, it is the desired goals of the rows that become the new goals.
+
         Args:
             rng: the only source of random numbers.
             env: environments of the relabeled rows, ``(n,)``.
@@ -311,6 +386,19 @@ class HerReplayBuffer(BaseReplayBuffer):
             step: their records, ``(n,)``, with the :func:`counters` of the strategy: ``until_end`` is the number of steps from
                 ``time`` to the end of the episode, 0 while it runs; ``since_start`` the number since its first observation.
         """
+        return mixed(self.config.goal_selection_strategy).joined(
+            np, len(time), lambda name, _, rows: self.index_by(name, rng, env[rows], time[rows], step[rows])
+        )
+
+    def index_by(
+        self,
+        strategy: str | GoalStrategy,
+        rng: np.random.Generator,
+        env: np.ndarray,
+        time: np.ndarray,
+        step: np.ndarray,
+    ) -> np.ndarray:
+        """Returns the positions that one strategy chooses; the arguments are those of :meth:`goal_index`."""
         ring, newest = self.ring, self.ring.head[env]
 
         def begin(times: np.ndarray) -> np.ndarray:
@@ -332,7 +420,7 @@ class HerReplayBuffer(BaseReplayBuffer):
         drawn = lambda: ring.draw(rng, len(time))[:2]  # noqa: E731
         goals_at = partial(ring.read_leaf, self.achieved), partial(ring.read_leaf, self.desired)
         steps = HindsightSteps(np, env, time, newest, ring.rows, begin, end, integers, drawn, ring.index, goals_at)
-        return np.asarray(steps.chosen_by(self.config.goal_selection_strategy))
+        return np.asarray(steps.chosen_by(strategy))
 
 
 @cache

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from rejeu.replay.device_priorities import order
-from rejeu.replay.hindsight import HerReplayBuffer
+from rejeu.replay.hindsight import HerReplayBuffer, MixedStrategies
 from rejeu.replay.prioritized import Draw
 from rejeu.training.compiled.off_policy import draws
 from rejeu.training.compiled.program import random_action
@@ -26,6 +26,8 @@ class SameDraws:
         """Batches drawn at this step."""
         self.part, self.calls = 0, 0
         """0 for the rows of a batch and 1 for its goals; how often numbers of this part were asked for."""
+        self.strategy: int | None = None
+        """The number of the strategy that chooses goals, where there are several."""
         self.bit_generator = np.random.default_rng(0).bit_generator
 
     def uniform(self, low: float, high: float, shape: tuple[int, ...]) -> np.ndarray:
@@ -41,7 +43,9 @@ class SameDraws:
         if self.step != self.run.step:
             self.step, self.batches = self.run.step, 0
         key = jax.random.fold_in(self._root(), self.batches)
-        key = jax.random.fold_in(jax.random.fold_in(key, self.part), self.calls)
+        key = jax.random.fold_in(key, self.part)
+        key = key if self.strategy is None else jax.random.fold_in(key, self.strategy)
+        key = jax.random.fold_in(key, self.calls)
         self.calls += 1
         if isinstance(shape, tuple) and len(shape) > 1:
             return np.asarray(jax.random.bits(key, shape, jnp.uint32), np.float64) / 2.0**32
@@ -58,11 +62,16 @@ class SameDraws:
         if self.step != self.run.step:
             self.step, self.batches = self.run.step, 0
         self.batches += 1
-        self.part, self.calls, self.sizes = 0, 0, (n, n_goals)
+        self.part, self.calls, self.sizes, self.strategy = 0, 0, (n, n_goals), None
 
     def begin_goals(self) -> None:
         """Says that the goals of the batch follow."""
         self.part, self.calls = 1, 0
+
+    def begin_strategy(self, n: int) -> None:
+        """Says that the goals that the next one of several strategies chooses for ``n`` transitions follow."""
+        self.strategy = 0 if self.strategy is None else self.strategy + 1
+        self.calls, self.sizes = 0, (self.sizes[0], n)
 
     def _root(self) -> jax.Array:
         return draws(jnp.asarray(self.run.key), jnp.uint32(self.run.step))
@@ -93,6 +102,11 @@ def use_same_draws(run: Run) -> None:
         rng.begin_goals()
         return goal_index(rng, *arguments)
 
+    def announced_strategy(strategy: Any, rng: Any, env: np.ndarray, *arguments: Any) -> Any:
+        if isinstance(buffer.config.goal_selection_strategy, MixedStrategies):
+            rng.begin_strategy(len(env))
+        return HerReplayBuffer.index_by(buffer, strategy, rng, env, *arguments)
+
     buffer.draw = announced_draw
     if goal_index is not None:
-        buffer.goal_index = announced_goals
+        buffer.goal_index, buffer.index_by = announced_goals, announced_strategy

@@ -120,11 +120,12 @@ def test_continuous_actions_equal_the_loop_of_the_host(kind: Any, settings: dict
         pytest.param("final", False, 3, None, marks=pytest.mark.exhaustive),
         pytest.param("episode", False, 1, None, marks=pytest.mark.exhaustive),
         pytest.param("random", True, 2, None, marks=pytest.mark.exhaustive),
+        pytest.param({"future": 2, "desired": 2}, True, 1, None, marks=pytest.mark.exhaustive),
         pytest.param("future", True, 2, {}, marks=pytest.mark.exhaustive),
     ],
 )
 def test_hindsight_equals_the_loop_of_the_host(
-    strategy: str, stops: bool, n_steps: int, priorities: dict[str, Any] | None
+    strategy: str | dict[str, int], stops: bool, n_steps: int, priorities: dict[str, Any] | None
 ) -> None:
     settings = {"replay_buffer_class": "HerReplayBuffer", "n_steps": n_steps, "buffer_size": 60}
     settings["priorities"] = priorities
