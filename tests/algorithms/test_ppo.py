@@ -444,6 +444,7 @@ SPACES = {
     "no bounds": gym.spaces.Box(-np.inf, np.inf, (2,), np.float32),
     "one bound": gym.spaces.Box(np.float32([0.0, -np.inf]), np.float32([np.inf, 0.2])),
     "two axes": gym.spaces.Box(-2.0, 2.0, (2, 3), np.float64),
+    "no axis": gym.spaces.Box(-2.0, 1.0, (), np.float32),
     "a choice from 3 on": gym.spaces.Discrete(4, start=3),
     "choices from 1 and -2 on": gym.spaces.MultiDiscrete([2, 3], start=[1, -2]),
     "choices of two axes": gym.spaces.MultiDiscrete([[2, 3], [4, 2]]),
@@ -452,6 +453,9 @@ SPACES = {
 }
 
 
+@pytest.mark.filterwarnings(
+    "ignore:.*Casting input x"
+)  # Gymnasium of an action that is one number, as it passes them itself
 @pytest.mark.parametrize("name", only(["bounds of its own", "choices of two axes"], SPACES))
 def test_actions_have_the_spaces_range_shape_and_dtype_in_training_and_after(name):
     space = SPACES[name]

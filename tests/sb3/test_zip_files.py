@@ -58,6 +58,16 @@ def test_actions_values_and_log_probabilities_are_those_of_the_original(name):
     assert agent.notes == []
 
 
+@pytest.mark.parametrize(("name", "shape"), [("ppo-normalized", (1, -1)), ("a2c-sde", (-1, 1, 1))])
+def test_the_shape_of_box_actions_changes_nothing_else(name, shape, tmp_path):
+    path = FOLDER / f"{name}.zip"
+    flat, obs = load_zip(path, vecnormalize=False), dict(np.load(FOLDER / f"{name}.npz"))["obs"]
+    low, high = (bound.reshape(shape) for bound in (flat.action_space.low, flat.action_space.high))
+    content = changed(path.read_bytes(), {"action_space": serialized(gym.spaces.Box(low, high, dtype=np.float32))})
+    actions = load_zip(write(tmp_path, content)).predict(obs, deterministic=True)[0]
+    np.testing.assert_array_equal(actions, flat.predict(obs, deterministic=True)[0].reshape(-1, *low.shape))
+
+
 @pytest.mark.parametrize("name", only(["dqn-mlp"], ["dqn-mlp", "ddpg-mlp"]))
 def test_the_next_gradient_step_is_the_one_of_the_original(name):
     """Of weights, target networks and moments of Adam."""

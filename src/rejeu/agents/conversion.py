@@ -274,7 +274,7 @@ def actor_critic(policy: OriginalPolicy, latent: bool) -> Network:
 def in_unit_range(space: spaces.Box, head: Network, log_std: str = "") -> Network:
     """Returns the head of a policy in the environment's unit as one in [-1, 1]: as far as actions are bounded."""
     low, high = space.low.ravel().astype(np.float64), space.high.ravel().astype(np.float64)
-    is_bounded = bounded(space)
+    is_bounded = bounded(space).ravel()
     with np.errstate(invalid="ignore"):
         half, middle = np.where(is_bounded, 0.5 * (high - low), 1.0), np.where(is_bounded, 0.5 * (high + low), 0.0)
     weight, bias = head["weight"], head["bias"]

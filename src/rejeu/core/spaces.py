@@ -252,7 +252,7 @@ def wrong_action(space: spaces.Space, algorithm: str, kind: str, advice: str) ->
 
 
 def check_action(space: spaces.Space, algorithm: str) -> spaces.Space:
-    """Returns ``space`` if a stochastic policy can act in it: a Box with an axis, Discrete, MultiDiscrete, MultiBinary.
+    """Returns ``space`` if a stochastic policy can act in it: a Box of floats, Discrete, MultiDiscrete, MultiBinary.
 
     Or any nesting of Dict and Tuple of these.
 
@@ -261,8 +261,8 @@ def check_action(space: spaces.Space, algorithm: str) -> spaces.Space:
     """
     if isinstance(space, spaces.Box):
         check_not_empty(space)
-        if space.dtype.kind != "f" or not space.shape:
-            raise ValueError(f"{algorithm} needs Box actions of floats with an axis, got {space}; use MultiDiscrete")
+        if space.dtype.kind != "f":
+            raise ValueError(f"{algorithm} needs Box actions of floats, got {space}; use MultiDiscrete")
         if not (space.high > space.low).all():
             raise ValueError(
                 f"every action bound must satisfy low < high, got low={space.low.tolist()}, high={space.high.tolist()}"
