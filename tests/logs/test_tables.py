@@ -1,5 +1,6 @@
 """Tables of numbers in CSV files."""
 
+import csv
 import math
 
 import numpy as np
@@ -45,11 +46,38 @@ def test_only_some_columns(tmp_path):
         (b"a,b\n1,2\n3,", "the last row of a.csv is incomplete and was left out"),
         (b"a,b\r1,2\r3,4\n", "the header of a.csv is damaged"),
         (b"a" * 200_000 + b"\n1\n", "the header of a.csv is damaged"),
+        (b'a,b\n1,"' + b"x" * 200_000 + b'"\n4,5\n', "left out of a.csv: 1 damaged row"),
     ],
 )
 def test_damage_is_noted(tmp_path, content, note):
     (tmp_path / "a.csv").write_bytes(content)
     assert read_table(tmp_path / "a.csv").notes == (note,)
+
+
+def test_cells_may_hold_commas_quotes_and_lines(tmp_path):
+    cells = ["two, words", 'say "yes", no', "two\nlines", "{'a': 1, 'b': 2}", "True"]
+    with (tmp_path / "a.csv").open("w", newline="", encoding="utf-8") as file:
+        csv.writer(file).writerows([["a", "text", "b"], *([i, cell, -i] for i, cell in enumerate(cells))])
+    table = read_table(tmp_path / "a.csv")
+    assert table.notes == ()
+    assert (table.column("a").tolist(), table.column("b").tolist()) == ([0, 1, 2, 3, 4], [0, -1, -2, -3, -4])
+    np.testing.assert_array_equal(table.column("text"), [np.nan, np.nan, np.nan, np.nan, 1.0])
+
+
+@pytest.mark.parametrize("row", [b"1,2\n", b"1,\n"])
+def test_a_table_is_read_up_to_a_number_of_cells(tmp_path, monkeypatch, row):
+    monkeypatch.setattr("rejeu.logs.tables.MAX_CELLS", 8)
+    (tmp_path / "a.csv").write_bytes(b"a,b\n" + 4 * row)
+    assert read_table(tmp_path / "a.csv").notes == ()
+    (tmp_path / "a.csv").write_bytes(b"a,b\n" + 5 * row)
+    table = read_table(tmp_path / "a.csv")
+    assert (len(table), table.notes) == (4, ("only the first 4 lines of a.csv were read",))
+
+
+def test_a_line_without_an_end_is_read_in_pieces(tmp_path, monkeypatch):
+    monkeypatch.setattr("rejeu.logs.tables.MAX_LINE", 8)
+    (tmp_path / "a.csv").write_bytes(b'a,b\n1,2\n3,"' + 3 * b"abcdefgh" + b'"\n5,6\n')
+    assert read_table(tmp_path / "a.csv").column("a").tolist() == [1, 3, 5]
 
 
 def test_file_of_a_spreadsheet_has_a_mark_before_the_header(tmp_path):

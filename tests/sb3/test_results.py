@@ -52,6 +52,9 @@ def test_a_folder_without_monitor_files_is_an_error(tmp_path):
     (tmp_path / "x.monitor.csv").write_text("something else\n")
     with pytest.raises(LoadMonitorResultsError, match="was not written by Monitor"):
         load_results(tmp_path)
+    (tmp_path / "x.monitor.csv").write_text(f'#{{"t_start": 0}}\nr,l,t\n1,1,"{"x" * 200_000}"\n')
+    with pytest.raises(LoadMonitorResultsError, match="was not written by Monitor: field larger"):
+        load_results(tmp_path)
     (tmp_path / "x.monitor.csv").write_text('#{"t_start": 0}\nr,l,t\n')
     (tmp_path / "y.monitor.csv").write_text('#{"t_start": 0}\nr,l,t,won\n')
     with pytest.raises(LoadMonitorResultsError, match="other files have"):

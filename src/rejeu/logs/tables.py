@@ -6,20 +6,27 @@ import csv
 import io
 import os
 import stat
+from array import array
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
+from itertools import chain, islice
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
 from rejeu.core.records import shown
 from rejeu.logs.formatting import counted
 
-MAX_BYTES = 2**28
-"""Upper limit on what is read of one table, in bytes; four million episodes fit."""
+MAX_BYTES = 2**27
+"""Upper limit on what is read of one table, in bytes."""
 MAX_COLUMNS = 512
+MAX_CELLS = 2**23
+"""Upper limit on the cells of one table; a million episodes fit."""
+MAX_LINE = 2**20
+"""Upper limit on the bytes of a line."""
 HUGE = 1e100
 """Magnitude from which a return is taken for damage."""
 
@@ -105,48 +112,69 @@ def read_table(path: Path, only: Collection[str] | None = None, skip_lines: int 
         return Table({}, (f"{name} cannot be read: {shown(error.strerror or error)}",))
     notes = []
     if len(data) > MAX_BYTES:
-        data = data[: data.rfind(b"\n", 0, MAX_BYTES) + 1]
         notes.append(f"only the first {MAX_BYTES >> 20} MiB of {name} were read")
+    elif data and not data.endswith(b"\n"):
+        notes.append(f"the last row of {name} is incomplete and was left out")
+    file = io.BytesIO(data[: data.rfind(b"\n") + 1])
+    del data
     for _ in range(skip_lines):
-        data = data[data.find(b"\n") + 1 :]
-    header, _, body = data.partition(b"\n")
+        file.readline(MAX_LINE)
+    header = file.readline(MAX_LINE)
     if not header.strip():
         return Table({}, (*notes, f"{name} is empty"))
     try:
-        names = next(csv.reader([header.decode("utf-8-sig", "replace").strip("\r")]), [])
-    except csv.Error:  # a carriage return, or a name of 100,000 characters
+        names = next(csv.reader([header.decode("utf-8-sig", "replace").strip("\r\n")]), [])
+    except csv.Error:  # a carriage return, or a name of 200,000 characters
         return Table({}, (*notes, f"the header of {name} is damaged"))
     if len(names) > MAX_COLUMNS or len({*names}) < len(names):
         return Table({}, (*notes, f"{name} has {len(names)} columns, expected up to {MAX_COLUMNS} of different names"))
-    if body and not body.endswith(b"\n"):
-        body = body[: body.rfind(b"\n") + 1]
-        notes.append(f"the last row of {name} is incomplete and was left out")
     wanted = [i for i, one in enumerate(names) if only is None or one in only]
-    columns, n_bad = numbers(body, len(names), wanted)
+    columns, n_bad = numbers(file, len(names), wanted)
     if n_bad:
         notes.append(f"left out of {name}: {counted(n_bad, 'damaged row')}")
+    if file.readline(1):
+        notes.append(f"only the first {MAX_CELLS // len(names):,} lines of {name} were read")
     return Table({names[i]: column for i, column in zip(wanted, columns, strict=True)}, tuple(notes))
 
 
-def numbers(body: bytes, n_columns: int, wanted: Sequence[int]) -> tuple[np.ndarray, int]:
+def lines_of(file: BinaryIO) -> Iterator[bytes]:
+    """Yields the lines of a file; one of more than ``MAX_LINE`` bytes, which is damage, in pieces."""
+    return iter(partial(file.readline, MAX_LINE), b"")
+
+
+def numbers(file: BinaryIO, n_columns: int, wanted: Sequence[int]) -> tuple[Sequence[Any], int]:
     """Returns the numbers in some columns of a CSV text, and how many rows have another number of cells than ``n_columns``.
 
-    Tables without empty or damaged cells, such as those of episodes, are read by NumPy, four times as fast.
+    Tables without empty or damaged cells or text, such as those of episodes, are read by NumPy, four times as fast.
     """
-    if not body:
+    begin, n_lines = file.tell(), MAX_CELLS // n_columns
+    if not (first := file.readline(MAX_LINE)):
         return np.zeros((len(wanted), 0)), 0
     with suppress(ValueError):
-        values = np.loadtxt(io.BytesIO(body), delimiter=",", comments=None, ndmin=2)
+        lines = chain([first], islice(lines_of(file), n_lines - 1))
+        values = np.loadtxt(lines, delimiter=",", comments=None, ndmin=2)
         if values.shape[1] == n_columns:
             return values[:, wanted].T, 0
-    lines = body.decode("utf-8", "replace").split("\n")[:-1]
-    rows = [row for line in lines if len(row := line.rstrip("\r").split(",")) == n_columns]
-    return np.array([[number(row[i]) for row in rows] for i in wanted], np.float64), len(lines) - len(rows)
+    file.seek(begin)
+    reader = csv.reader(line.decode("utf-8", "replace") for line in islice(lines_of(file), n_lines))
+    columns, n_bad = [array("d") for _ in wanted], 0
+    while True:
+        try:
+            row = next(reader, None)
+        except csv.Error:  # such as a cell of 200,000 characters
+            row = []
+        if row is None:
+            return [np.array(column) for column in columns], n_bad
+        if len(row) != n_columns:
+            n_bad += 1
+            continue
+        for column, i in zip(columns, wanted, strict=True):
+            column.append(number(row[i]))
 
 
 def number(word: str) -> float:
-    """Returns a number, NaN for what is none."""
+    """Returns a number, NaN for what is none; Python's words for true and false are 1 and 0."""
     try:
-        return float(word)
+        return float({"True": 1, "False": 0}.get(word, word))
     except ValueError:
         return float("nan")

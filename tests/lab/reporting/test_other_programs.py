@@ -10,6 +10,7 @@ import pytest
 from rejeu.lab.reporting import run_list
 from rejeu.lab.reporting.comparison import compare
 from rejeu.lab.reporting.other_programs import read_monitor
+from rejeu.sb3.common.monitor import ResultsWriter, load_results
 
 RECORDED = Path(__file__).parents[2] / "golden" / "sb3_monitor"
 ZOO = RECORDED / "ppo" / "CartPole-v1_1"
@@ -51,6 +52,16 @@ def test_the_clocks_of_several_files_begin_with_the_first(tmp_path):
         (tmp_path / f"{i}.monitor.csv").write_text(f"{head}\nr,l,t\n{row}\n", encoding="utf-8")
     episodes = read_monitor(tmp_path).episodes
     assert (episodes.column("seconds").tolist(), episodes.column("return").tolist()) == ([30, 35], [1, 2])
+
+
+def test_episodes_with_texts_of_the_info_are_all_read(tmp_path):
+    file = ResultsWriter(tmp_path, {"t_start": 0.0}, ("is_success", "note"))
+    for i, note in enumerate(["plain", "two, words", 'say "yes"', "two\nlines", {"a": 1, "b": [2, 3]}]):
+        file.write_row({"r": float(i), "l": 1, "t": float(i), "is_success": i > 2, "note": note})
+    run = read_monitor(tmp_path)
+    assert len(run.episodes) == len(load_results(tmp_path)) == 5
+    assert run.episodes.column("success").tolist() == [0, 0, 0, 1, 1]
+    assert run.notes == ()
 
 
 def test_hostile_monitor_file(tmp_path):

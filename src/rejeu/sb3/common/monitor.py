@@ -252,7 +252,7 @@ def load_results(path: str | Path) -> np.recarray:
                 start = float(json.loads(file.readline().removeprefix("#"))["t_start"])
                 reader = csv.DictReader(file)
                 found = [{**row, "t": float(row["t"]) + start} for row in reader]
-            except (ValueError, KeyError, TypeError) as error:
+            except (ValueError, KeyError, TypeError, csv.Error) as error:
                 raise LoadMonitorResultsError(f"{name} was not written by Monitor: {error}") from None
         if columns not in (None, reader.fieldnames):
             raise LoadMonitorResultsError(f"{name} has the columns {reader.fieldnames}, other files have {columns}")
