@@ -10,7 +10,7 @@ import pytest
 import rejeu
 from rejeu.checkpoints.run_folder import RunFolder
 from rejeu.core.interrupt import Interrupt
-from rejeu.lab.cli import main
+from rejeu.lab.cli import main, resume
 from rejeu.lab.runs import requests
 
 
@@ -53,11 +53,22 @@ def test_the_model_is_written_only_while_somebody_watches_and_at_most_every_two_
     assert list(asked.folder.path.iterdir()) == []
 
 
-def test_a_request_to_stop_is_answered_as_ctrl_c_and_an_older_one_dropped(asked):
+def test_a_request_to_stop_that_comes_while_a_run_starts_is_answered(asked):
     requests.ask(asked.folder.stop)
     asked.callback.before_training(asked.agent)
     asked.callback(asked.agent, None)
-    assert not asked.stop.requested
+    assert asked.stop.signal == signal.SIGINT
+
+
+def test_what_an_earlier_process_has_shown_is_not_shown_again(asked):
+    for path in (asked.folder.live, asked.folder.watch, asked.folder.paused):
+        requests.ask(path)
+    asked.callback.before_training(asked.agent)
+    assert list(asked.folder.path.iterdir()) == []
+
+
+def test_a_request_to_stop_is_answered_as_ctrl_c(asked):
+    asked.callback(asked.agent, None)
     requests.ask(asked.folder.stop)
     asked.callback(asked.agent, SimpleNamespace())  # less than two seconds later
     assert not asked.stop.requested
@@ -119,4 +130,37 @@ def test_a_run_keeps_models_that_act_and_stops_when_it_is_asked(tmp_path, capsys
     assert second.name > first.name > "step_000000000100"
     assert first.name == f"step_{rejeu.load(first).num_timesteps:012}.safetensors"
     assert not {"stop", "watch", "live.safetensors"} & {path.name for path in out.iterdir()}
+    assert "stopped by Ctrl-C; everything is saved" in capsys.readouterr().out
+
+
+def test_a_request_to_an_earlier_process_is_dropped_when_a_run_is_resumed_and_one_to_this_process_is_not(
+    tmp_path, capsys, monkeypatch
+):
+    out, options = tmp_path / "run", ["--no-report", "--no-video"]
+    argv = [
+        "train",
+        "CartPole-v1",
+        "--algo",
+        "PPO",
+        "--steps",
+        "500",
+        "--pause",
+        "50",
+        "--set",
+        "n_steps=50",
+        "--seed",
+        "0",
+    ]
+    assert main([*argv, "--evaluate-episodes", "1", "--out", str(out), *options]) == 0
+    requests.ask(out / "stop")
+    assert main(["resume", str(out), "--steps", "100", *options]) == 0
+    assert "paused" in capsys.readouterr().out
+    made = resume.make_evaluation_env
+
+    def make_and_ask(*arguments):
+        requests.ask(out / "stop")
+        return made(*arguments)
+
+    monkeypatch.setattr(resume, "make_evaluation_env", make_and_ask)
+    assert main(["resume", str(out), *options]) == 130
     assert "stopped by Ctrl-C; everything is saved" in capsys.readouterr().out

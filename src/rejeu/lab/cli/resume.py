@@ -31,6 +31,7 @@ from rejeu.lab.experiments.study import StudyFolder
 from rejeu.lab.reporting.runs import is_locked
 from rejeu.lab.runs import config as configs_of_runs
 from rejeu.lab.runs.config import DecidedRun, Origin, merged, read_folder
+from rejeu.lab.runs.requests import drop
 from rejeu.logs.logging import require
 from rejeu.logs.tables import read_table
 
@@ -52,6 +53,7 @@ def run_resume(arguments: Resume) -> tuple[int, dict[str, Any]]:
     folder = RunFolder(arguments.run)
     if is_locked(folder.lock):  # before the tables are opened, which the other process writes
         raise RunInUseError(f"another process is training in {folder.path}; wait for it, or stop it")
+    drop(folder.stop)  # a later one is for this process
     return resume(arguments, folder.checkpoints, lambda agent, config: (folder, config), arguments.finish)
 
 

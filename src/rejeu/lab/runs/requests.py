@@ -39,20 +39,27 @@ def is_asked(path: Path) -> bool:
         return False
 
 
+def drop(*paths: Path) -> None:
+    """Removes requests, also those to an earlier process of a run, before anything that takes time."""
+    for path in paths:
+        with suppress(OSError):
+            path.unlink(missing_ok=True)
+
+
 class Requests(TrainingCallback):
-    """Callback that answers requests. Mutable. Those from before training are dropped."""
+    """Callback that answers requests. Mutable. One to stop may come before training: see :func:`drop`."""
 
     def __init__(self, folder: RunFolder, stop: Interrupt) -> None:
         self.folder, self.stop = folder, stop
         self._next = 0.0
 
     def before_training(self, agent: Any) -> None:
-        """Drops older requests."""
-        self.withdraw()
+        """Removes what an earlier process has shown, and the mark of its pause."""
+        drop(self.folder.watch, self.folder.live, self.folder.paused)
 
     def after_training(self, agent: Any, error: BaseException | None) -> None:
-        """Removes the files."""
-        self.withdraw()
+        """Removes the files of requests and of what was shown."""
+        drop(self.folder.stop, self.folder.watch, self.folder.live, self.folder.paused)
 
     def __call__(self, agent: Any, progress: Progress) -> None:
         """Answers, at most every two seconds: writes the current model while it is watched; stops as Ctrl-C does."""
@@ -64,12 +71,6 @@ class Requests(TrainingCallback):
         if is_asked(self.folder.watch):
             show(agent, self.folder.live)
         self._next = now + EVERY
-
-    def withdraw(self) -> None:
-        """Removes the files of requests and of what was shown, and the mark of a pause."""
-        for path in (self.folder.stop, self.folder.watch, self.folder.live, self.folder.paused):
-            with suppress(OSError):
-                path.unlink(missing_ok=True)
 
 
 def show(agent: Any, path: Path) -> None:
