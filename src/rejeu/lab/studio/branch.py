@@ -10,7 +10,7 @@ from nicegui import ui
 from rejeu.checkpoints.run_folder import RunFolder, checkpoint_files, step_of
 from rejeu.lab.cli import parsing
 from rejeu.lab.cli.commands import COMMANDS, TASKS
-from rejeu.lab.studio.new import below, lead_to
+from rejeu.lab.studio.new import lead_to, new_folder
 from rejeu.lab.studio.state import Studio
 
 
@@ -28,7 +28,7 @@ def open_form(studio: Studio, name: str, path: Path) -> None:
         async def begin() -> None:
             button.disable()
             try:
-                out = below(studio.folder, folder.value or "")
+                out = new_folder(studio, folder.value or "")
                 words = ["branch", str(path), "--at", str(step.value), "--out", str(out), *studio.words(name)]
                 words += ["--steps", more.value] if more.value else []
                 words += ["--set", *shlex.split(settings.value)] if settings.value else []

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import re
 import shlex
 import subprocess
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
@@ -16,13 +18,16 @@ from nicegui import ui
 
 from rejeu.agents import AGENTS, presets
 from rejeu.checkpoints.run_folder import dated
+from rejeu.core.records import shown
 from rejeu.core.validation import field_docs
 from rejeu.envs.registry import in_envpool, is_plain_id, register, unknown_environment
 from rejeu.lab.cli import parsing
 from rejeu.lab.cli.commands import COMMANDS, TASKS, Train, check_options
+from rejeu.lab.reporting.run_list import MAX_DEPTH, SKIPPED, find, is_run
+from rejeu.lab.reporting.runs import MAX_NAME
 from rejeu.lab.runs.config import Option, Topic, options
 from rejeu.lab.studio import processes
-from rejeu.lab.studio.layout import address
+from rejeu.lab.studio.layout import action, address
 from rejeu.lab.studio.state import Studio
 
 LEFT_OUT = {"assist", "json", "fps"}
@@ -31,6 +36,8 @@ LABELS = {"hyperparameters": "hyperparameters", "n_envs": "environments at once"
 """Of fields, where the option is called otherwise."""
 LOOK = 0.5
 """Seconds between two looks whether the run has begun."""
+NAME = re.compile(r"(?!(con|prn|aux|nul|com\d|lpt\d)(\.|$))[\w(][\w .,()+=@-]*(?<![ .])", re.IGNORECASE)
+"""Names of folders that every system takes."""
 Texts = Mapping[str, Any]
 """What stands in the form: texts, and of flags whether they are set, by field."""
 
@@ -130,18 +137,18 @@ def words_of(option: Option, given: Any) -> list[str]:
     return [part for word in words for part in (*name, word)]
 
 
-def command(texts: Texts, folder: Path, imports: Sequence[str] = ()) -> tuple[list[str], Train]:
-    """Returns the words of the command that starts a run below a folder, and its arguments; it imports some modules too.
+def command(texts: Texts, studio: Studio) -> tuple[list[str], Train]:
+    """Returns the words of the command that starts a run in the folder of a studio, and its arguments.
 
     Raises:
         ValueError: for a mistake, as the command line says it, or a folder elsewhere.
     """
     if not texts.get("env"):
         raise ValueError("choose an environment")
-    named = str(texts.get("out") or dated(texts["env"], texts.get("algorithm")).name)
-    given = {**texts, "out": str(below(folder, named))}
+    named = str(texts.get("out") or dated(texts["env"], texts.get("algorithm")).name[-150:].lstrip("-. "))
+    given = {**texts, "out": str(new_folder(studio, named))}
     words = [word for one in options(Train) for word in words_of(one, given.get(one.field))]
-    words += [word for name in imports for word in ("--import", name)]
+    words += [word for name in studio.imports for word in ("--import", name)]
     _, arguments = parsing.parse(["train", *words], COMMANDS, TASKS, "")
     check_options(arguments)
     return ["train", *words], arguments
@@ -158,12 +165,40 @@ def below(folder: Path, named: str) -> Path:
     return folder / named
 
 
+def new_folder(studio: Studio, named: str) -> Path:
+    """Returns the path of a folder for a new run, which is then found below the folder of the studio, on every system.
+
+    Raises:
+        ValueError: if it exists, or no run can be there.
+    """
+    path = below(studio.folder, named)
+    parts = path.relative_to(studio.folder).parts
+    is_valid = parts and all(NAME.fullmatch(part) and len(os.fsencode(part)) <= MAX_NAME for part in parts)
+    if not is_valid or len(parts) >= MAX_DEPTH or SKIPPED & {*parts}:
+        raise ValueError(
+            f"folder {shown(named)!r} must be a name such as sac-1 or group/sac-1: letters, digits, spaces and ._-()+=@, the "
+            f"first one a letter or a digit, the last one no dot or space, {MAX_NAME} bytes at most, and none that Windows "
+            "or runs reserve, such as con and videos"
+        )
+    for one in path.parents[: len(parts)]:
+        if is_run(one) or (one.exists() and not one.is_dir()):
+            raise ValueError(f"folder {named!r} would be in {one}, which is a run or a file; name another")
+    check_new(path)
+    return path
+
+
+def check_new(path: Path) -> None:
+    """Raises ``ValueError`` if there is a file or a folder."""
+    if os.path.lexists(path):
+        raise ValueError(f"folder {path} exists; name another, or remove it first")
+
+
 async def start(studio: Studio, texts: Texts, say: Callable[[str], object]) -> str:
     """Checks the environment and starts the run, and leads to its page; returns what went wrong, if anything did.
 
     An environment with a preset is not checked: the tests of rejeu do that.
     """
-    words, arguments = command(texts, studio.folder, studio.imports)
+    words, arguments = command(texts, studio)
     if presets.find(arguments.env, None) is None:
         await asyncio.to_thread(require_known, arguments)
         say("rejeu check tries the environment for a few seconds ...")
@@ -188,14 +223,26 @@ def require_known(arguments: Train) -> None:
 
 async def lead_to(studio: Studio, words: Sequence[str], path: Path) -> str:
     """Starts a run by a command, and leads to its page once it has begun; returns what went wrong, if anything did."""
+    check_new(path)  # also a while after the form was read
     process = processes.start(words, path)
     name = path.relative_to(studio.folder).as_posix()
-    while process.poll() is None and not studio.holds(name):
-        await asyncio.sleep(LOOK)
-    if not studio.holds(name):
-        return processes.read_log(path) or f"rejeu {words[0]} ended with exit status {process.returncode}"
+    with stoppable(process):
+        while not studio.holds(name):
+            if process.poll() is not None and not (path.is_dir() and find(path)):
+                return processes.read_log(path) or f"rejeu {words[0]} ended with exit status {process.returncode}"
+            await asyncio.sleep(LOOK)
     ui.navigate.to(address("/run", run=name))
     return ""
+
+
+@contextmanager
+def stoppable(process: subprocess.Popen[bytes]) -> Iterator[None]:
+    """Context in which a button ends a process, of which nothing is written yet."""
+    button = action("Stop", "stop", process.terminate)
+    try:
+        yield
+    finally:
+        button.delete()
 
 
 async def check(arguments: Train) -> tuple[int, str]:
@@ -204,9 +251,8 @@ async def check(arguments: Train) -> tuple[int, str]:
     A thread waits for it: a process of uvloop's own is a fork, against which JAX warns.
     """
     command = [sys.executable, "-m", "rejeu", "check", *arguments.environment_words()]
-    ended = await asyncio.to_thread(
-        lambda: subprocess.run(
-            command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, check=False
-        )
-    )
-    return ended.returncode, processes.plain(ended.stdout.decode("utf-8", "replace"))
+    process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+    with stoppable(process):
+        printed, _ = await asyncio.to_thread(process.communicate)
+    text = processes.plain(printed.decode("utf-8", "replace"))
+    return process.returncode, text or f"rejeu check ended with exit status {process.returncode}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 import sys
@@ -15,8 +16,8 @@ HIDDEN = ".studio"
 """Folder of the logs, beside the run folders."""
 APART: dict[str, Any] = {"creationflags": 0x208} if sys.platform == "win32" else {"start_new_session": True}
 """Options of a process that no signal to this one reaches; on Windows it is detached, and a process group of its own."""
-STARTED: dict[tuple[str, ...], subprocess.Popen[bytes]] = {}
-"""The processes, by their words: what is under way is not started twice."""
+STARTED: dict[tuple[str, str], subprocess.Popen[bytes]] = {}
+"""The processes by command and run: what is under way is not started twice. That a run begins is one command."""
 TAIL = 2**16
 """Most bytes of a log that are shown."""
 
@@ -28,13 +29,13 @@ def start(words: Sequence[str], run: Path) -> subprocess.Popen[bytes]:
         OSError: if that is impossible.
         ValueError: if the same command is under way.
     """
-    known = STARTED.get((*words,))
-    if known is not None and known.poll() is None:
+    key = words[0].replace("branch", "train"), os.path.normcase(run)
+    if (known := STARTED.get(key)) is not None and known.poll() is None:
         raise ValueError(f"rejeu {words[0]} is under way for {run.name}; wait until it has ended")
     log = log_of(run)
     log.parent.mkdir(parents=True, exist_ok=True)
     with log.open("ab") as out:
-        process = STARTED[*words] = subprocess.Popen(
+        process = STARTED[key] = subprocess.Popen(
             [sys.executable, "-m", "rejeu", *words], stdin=subprocess.DEVNULL, stdout=out, stderr=out, **APART
         )
         return process

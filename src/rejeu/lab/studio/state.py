@@ -93,7 +93,8 @@ class Studio:
 
     def holds(self, run: str) -> bool:
         """Returns whether a run has begun, by its path below the folder."""
-        return self.row(run) is not None or any(row["run"].startswith(f"{run}/") for row in self.rows)
+        there = [row["run"] for row in self.rows if row["state"] != "gone"]
+        return any(name == run or name.startswith(f"{run}/") for name in there)
 
     def file(self, run: str, name: str) -> Path | None:
         """Returns a regular file in the folder of a run; None if there is none, or it is a symbolic link."""
