@@ -49,18 +49,18 @@ class Reach(GoalEnv):
     def step(self, key: Array, state: Point, action: Array) -> tuple[Point, Any, Array, Array, Array]:
         action = jnp.round(4 * action) / 4 if self.grid else action
         after = Point(state.position + action, state.goal, state.time + 1)
-        reward = self.compute_reward(after.position, after.goal)
+        reward = self.compute_reward(after.position, after.goal, {})
         terminated = (reward == 0.0) if self.stops else jnp.zeros((), bool)
         return after, self.observe(after), reward, terminated, time_is_up(after.time, self.max_episode_steps)
 
     def success(self, state: Point) -> Array:
-        return self.compute_reward(state.position, state.goal) == 0.0
+        return self.compute_reward(state.position, state.goal, {}) == 0.0
 
-    def compute_reward(self, achieved_goal: Array, desired_goal: Array, info: Any = None) -> Array:
+    def compute_reward(self, achieved_goal: Array, desired_goal: Array, info: Any) -> Array:
         return (jnp.abs(achieved_goal - desired_goal)[..., 0] < 0.5).astype(jnp.float32) - 1.0
 
-    def compute_terminated(self, achieved_goal: Array, desired_goal: Array, info: Any = None) -> Array | None:
-        return self.compute_reward(achieved_goal, desired_goal) == 0.0 if self.stops else None
+    def compute_terminated(self, achieved_goal: Array, desired_goal: Array, info: Any) -> Array | None:
+        return self.compute_reward(achieved_goal, desired_goal, info) == 0.0 if self.stops else None
 
     def observe(self, state: Point) -> dict[str, Array]:
         """Returns the observation of a state."""
@@ -74,9 +74,9 @@ class Undefined(Reach):
         after, obs, reward, *flags = super().step(key, state, action)
         return after, obs, jnp.nan_to_num(reward), *flags
 
-    def compute_reward(self, achieved_goal: Array, desired_goal: Array, info: Any = None) -> Array:
+    def compute_reward(self, achieved_goal: Array, desired_goal: Array, info: Any) -> Array:
         is_bad = ((achieved_goal == desired_goal) & (achieved_goal > 1.0))[..., 0]
-        return jnp.where(is_bad, jnp.nan, super().compute_reward(achieved_goal, desired_goal))
+        return jnp.where(is_bad, jnp.nan, super().compute_reward(achieved_goal, desired_goal, info))
 
 
 class Breaks(FunctionalEnv):

@@ -13,6 +13,7 @@ import pytest
 from rejeu.core import spaces
 from rejeu.core.prng import below
 from rejeu.core.schedules import Linear
+from rejeu.envs.functional.protocol import of_two_goals
 from rejeu.envs.functional.vector import goal_functions
 from rejeu.replay import device_priorities
 from rejeu.replay.device import DeviceReplay, download, uploaded
@@ -81,13 +82,13 @@ def assert_same_batches(replay: DeviceReplay, buffer: Any, stops: bool, exact: b
     ring = uploaded(replay, buffer.ring)
     if buffer.priorities is not None:
         ring = ring._replace(priorities=device_priorities.uploaded(buffer.priorities, [], 1, BATCH))
-    terminated = env.compute_terminated if stops else None
+    reward, terminated = of_two_goals(env.compute_reward), of_two_goals(env.compute_terminated) if stops else None
     for step in range(3):
         run = SimpleNamespace(replay=buffer, key=key, step=step, rng=None)
         progress = step / 2
-        batch, rows = jax.jit(
-            lambda ring, key, progress: replay.draw(ring, key, progress, env.compute_reward, terminated)
-        )(ring, jax.random.fold_in(draws(key, jnp.uint32(step)), 1), jnp.float32(progress))
+        batch, rows = jax.jit(lambda ring, key, progress: replay.draw(ring, key, progress, reward, terminated))(
+            ring, jax.random.fold_in(draws(key, jnp.uint32(step)), 1), jnp.float32(progress)
+        )
         use_same_draws(run)
         expected, drawn = run.replay.draw(run.rng, (BATCH,), progress)
         if buffer.priorities is not None:

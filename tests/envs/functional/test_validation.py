@@ -17,6 +17,7 @@ import rejeu
 from rejeu.core.errors import BadEnvironmentError
 from rejeu.envs.checker import findings
 from rejeu.envs.functional import REGISTRY, FunctionalEnv, GoalEnv, make
+from rejeu.envs.functional.gym_env import GymnasiumEnv
 from rejeu.envs.functional.validation import check
 from rejeu.lab.cli import main
 
@@ -160,6 +161,45 @@ def test_a_wrong_function_of_goals_is_named(field, function, said):
     with pytest.raises(BadEnvironmentError, match=f"Reach.{NAMES[field]} {said}") as raised:
         rejeu.make_vector(Reach(**{field: function}))
     assert "\n" not in str(raised.value)
+
+
+def distance(achieved_goal, desired_goal):
+    return -jnp.abs(achieved_goal - desired_goal).sum(axis=-1)
+
+
+SIGNATURES = [
+    lambda self, achieved_goal, desired_goal, info: distance(achieved_goal, desired_goal) * info.get("scale", 1.0),
+    lambda self, achieved_goal, desired_goal, info=None: distance(achieved_goal, desired_goal),
+    lambda self, achieved_goal, desired_goal, *, info: distance(achieved_goal, desired_goal),
+    lambda self, achieved_goal, desired_goal, _info: distance(achieved_goal, desired_goal),
+    lambda self, achieved_goal, desired_goal: distance(achieved_goal, desired_goal),
+    lambda self, *goals, **infos: distance(*goals),
+    staticmethod(lambda achieved_goal, desired_goal, info: distance(achieved_goal, desired_goal)),
+]
+
+
+@pytest.mark.parametrize("function", SIGNATURES)
+def test_functions_of_goals_get_an_empty_info_if_they_take_one(function):
+    kind = type("Signed", (Reach,), {"compute_reward": function, "compute_terminated": function})
+    goals = rejeu.make_vector(kind()).goals()
+    achieved = np.float32([[0, 0], [1, 2]])
+    np.testing.assert_array_equal(goals.reward(achieved, 0 * achieved), [0.0, -3.0])
+    np.testing.assert_array_equal(goals.terminated(achieved, 0 * achieved), [False, True])
+    np.testing.assert_array_equal(GymnasiumEnv(kind()).compute_reward(achieved, 0 * achieved, {}), [0.0, -3.0])
+
+
+def test_an_error_of_a_function_of_goals_is_shown_without_advice_on_something_else():
+    def rewarded(achieved, desired):
+        return {}["scale"]
+
+    with pytest.raises(BadEnvironmentError, match="compute_reward found no key 'scale': environments in JAX have no"):
+        rejeu.make_vector(Reach(rewarded=rewarded))
+    with pytest.raises(
+        BadEnvironmentError, match=r"compute_reward cannot be compiled \(TypeError: object of type 'int' .*\)$"
+    ):
+        rejeu.make_vector(Reach(rewarded=lambda achieved, desired: len(0)))
+    with pytest.raises(AttributeError, match="has no attribute"):
+        rejeu.make_vector(Reach(rewarded=lambda achieved, desired: achieved.nothing))
 
 
 class NearlyReach(Walk):

@@ -7,6 +7,10 @@ over many environments and put into a training program. The meaning of the retur
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
+from inspect import signature
 from typing import Any
 
 import equinox as eqx
@@ -76,7 +80,8 @@ class FunctionalEnv(eqx.Module):
 class GoalEnv(FunctionalEnv):
     """An environment with goals, whose observations are dicts of ``observation``, ``achieved_goal`` and ``desired_goal``.
 
-    Hindsight replay calls the functions below inside compiled code, with goals ``(..., goal_dim)``.
+    Hindsight replay calls the functions below inside compiled code, with goals ``(..., goal_dim)`` and an empty info, which
+    they need not take.
     """
 
     @abstractmethod
@@ -86,6 +91,24 @@ class GoalEnv(FunctionalEnv):
     def compute_terminated(self, achieved_goal: Array, desired_goal: Array, info: Any = None) -> Array | None:
         """Returns where the goals end the episode, ``bool (...)``; None if relabeled steps keep their termination flags."""
         return None
+
+
+def of_two_goals(function: Callable[..., Any]) -> Callable[[Any, Any], Any]:
+    """Returns ``compute_reward`` or ``compute_terminated`` as a function of two goals, with an empty info where one is taken.
+
+    >>> of_two_goals(lambda achieved, desired, info: (achieved, desired, info))(1, 2)
+    (1, 2, {})
+    """
+    calls: tuple[Callable[..., Any], ...] = (
+        lambda function, *goals: function(*goals, info={}),
+        lambda function, *goals: function(*goals, {}),
+        lambda function, *goals: function(*goals),
+    )
+    for call in calls:
+        with suppress(TypeError):
+            call(signature(function).bind, None, None)
+            break
+    return partial(call, function)
 
 
 def time_is_up(time: Array, max_episode_steps: int | None) -> Array:

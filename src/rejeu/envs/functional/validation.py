@@ -13,7 +13,7 @@ from gymnasium import spaces
 from rejeu.core.errors import BadEnvironmentError
 from rejeu.core.spaces import check_goal_space, leaves, narrow, structure
 from rejeu.core.validation import whole
-from rejeu.envs.functional.protocol import FunctionalEnv, GoalEnv
+from rejeu.envs.functional.protocol import FunctionalEnv, GoalEnv, of_two_goals
 
 UNTRACEABLE = (jax.errors.JAXTypeError, jax.errors.JAXIndexError)
 """What JAX raises where Python needs a value that is not known yet."""
@@ -74,10 +74,9 @@ def _traced(said: str, function: Callable[..., Any], *arguments: Any) -> Any:
             "jnp.where instead of if, and no float(), int() or bool() of arrays"
         ) from error
     except MISTAKES as error:
-        raise BadEnvironmentError(
-            f"{said} cannot be compiled ({_line(error)}); arguments are arrays without values, and nothing may be changed "
-            "in place: return new arrays"
-        ) from error
+        writes = isinstance(error, FrozenInstanceError) or "immutable" in str(error)
+        fix = "; nothing may be changed in place: return new arrays" if writes else ""
+        raise BadEnvironmentError(f"{said} cannot be compiled ({_line(error)}){fix}") from error
 
 
 def _line(error: Exception) -> str:
@@ -145,7 +144,12 @@ def _check_goals(env: GoalEnv, name: str) -> None:
     goals = jax.ShapeDtypeStruct((N_GOALS, *goal.shape), narrow(goal.dtype))
     for function, may_be_none in ((env.compute_reward, False), (env.compute_terminated, True)):
         said = f"{name}.{function.__name__}"
-        result = _traced(said, function, goals, goals)
+        try:
+            result = _traced(said, of_two_goals(function), goals, goals)
+        except KeyError as error:
+            raise BadEnvironmentError(
+                f"{said} found no key {error}: environments in JAX have no infos; let it depend on the goals alone"
+            ) from error
         if getattr(result, "shape", None) != (N_GOALS,) and not (result is None and may_be_none):
             got = f"the shape {result.shape}" if hasattr(result, "shape") else f"{result!r:.60}"
             raise BadEnvironmentError(

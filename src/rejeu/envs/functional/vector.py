@@ -20,7 +20,7 @@ from rejeu.core import prng
 from rejeu.core.spaces import cast, leaves
 from rejeu.core.validation import whole
 from rejeu.envs.base import Seed, Step, VectorEnv, success_of
-from rejeu.envs.functional.protocol import FunctionalEnv, GoalEnv
+from rejeu.envs.functional.protocol import FunctionalEnv, GoalEnv, of_two_goals
 from rejeu.envs.functional.validation import check
 from rejeu.envs.goals import GoalFunctions
 
@@ -263,10 +263,9 @@ def goal_functions(env: FunctionalEnv) -> GoalFunctions | None:
     """Returns the goal functions of an environment for the host, which take and return NumPy arrays; None without goals."""
     if not isinstance(env, GoalEnv):
         return None
-    reward = jax.jit(env.compute_reward)
-    terminated = jax.jit(env.compute_terminated)
+    reward, terminated = (of_two_goals(jax.jit(f)) for f in (env.compute_reward, env.compute_terminated))
     goal = env.observation_space["achieved_goal"]  # type: ignore[index]
-    is_judged = jax.eval_shape(env.compute_terminated, goal.sample(), goal.sample()) is not None
+    is_judged = jax.eval_shape(terminated, goal.sample(), goal.sample()) is not None
     return GoalFunctions(
         lambda achieved, desired, infos=None: np.asarray(reward(achieved, desired), np.float32),
         (lambda achieved, desired, infos=None: np.asarray(terminated(achieved, desired), bool)) if is_judged else None,

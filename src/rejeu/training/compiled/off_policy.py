@@ -20,7 +20,7 @@ from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.core import spaces
 from rejeu.core.algorithm import Clock, PyTree, Transition, unmasked
 from rejeu.core.prng import nth
-from rejeu.envs.functional.protocol import FunctionalEnv, GoalEnv
+from rejeu.envs.functional.protocol import FunctionalEnv, GoalEnv, of_two_goals
 from rejeu.envs.masks import FunctionalMask
 from rejeu.replay import device_priorities
 from rejeu.replay.device import DeviceReplay, DeviceRing, DeviceRows, download, uploaded
@@ -107,9 +107,9 @@ class OffPolicyProgram(Program):
         env = env.env if isinstance(env, FunctionalMask) else env
         assert isinstance(env, GoalEnv)
         goal = ring.obs[self.replay.achieved][:1]
-        judges = jax.eval_shape(env.compute_terminated, goal, goal) is not None
-        terminated: Any = env.compute_terminated if judges else None
-        return self.replay.draw(ring, key, progress, env.compute_reward, terminated)
+        reward, terminated = of_two_goals(env.compute_reward), of_two_goals(env.compute_terminated)
+        judges = jax.eval_shape(terminated, goal, goal) is not None
+        return self.replay.draw(ring, key, progress, reward, terminated if judges else None)
 
     def begin_episodes(self, run: Run) -> None:
         run.replay.begin(checked_restart(run))
