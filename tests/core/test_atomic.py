@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import ast
 import os
+import re
 import warnings
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
+import rejeu
 from rejeu.agents import presets
 from rejeu.core import atomic
 from rejeu.lab.cli.output import noted_in
@@ -37,7 +40,75 @@ def test_nothing_is_appended_to_the_target_of_a_link(link):
     with pytest.raises(OSError, match=r"link.png could not be written: .*is a symbolic link; remove it"):
         atomic.append(link, b"1,2\n")
     with pytest.raises(OSError, match="is a symbolic link; remove it"):
-        atomic.open_log(link)
+        atomic.open_file(link)
+    for refused in (atomic.touch, atomic.lock):
+        with pytest.raises(OSError, match="is a symbolic link; remove it"):
+            refused(link)
+
+
+def test_a_link_that_is_made_after_the_check_is_not_followed(link, monkeypatch):
+    monkeypatch.setattr(atomic, "check_no_link", lambda path: None)
+    for mode in ("ab", "wb", "r+b"):
+        with pytest.raises(OSError, match="symbolic links"):
+            atomic.open_file(link, mode)
+
+
+def test_a_pipe_is_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "log")
+    with pytest.raises(OSError, match="No such device"):
+        atomic.open_file(tmp_path / "log")
+
+
+def test_a_link_is_found_at_any_depth_of_a_folder(tmp_path):
+    (tmp_path / "run" / "checkpoints").mkdir(parents=True)
+    atomic.check_no_links(tmp_path)
+    (tmp_path / "run" / "checkpoints" / "lock").symlink_to(tmp_path / "nowhere")
+    with pytest.raises(OSError, match="lock is a symbolic link"):
+        atomic.check_no_links(tmp_path)
+
+
+OPENED_ELSEWHERE = {
+    ("atomic.py", "replacing"),  # a new file of a name of its own
+    ("notebooks.py", "_write_new"),  # a new file
+    ("logging.py", "__init__"),  # likewise
+    ("ray.py", "write_marker"),  # likewise, of a name of its own
+    ("hub.py", "lay_out"),  # in a new folder
+    ("resume.py", "run_branch"),
+    ("resume.py", "begin"),
+    ("work.py", "move_aside"),  # a folder, in one without links
+    ("web_file.py", "node"),  # in a temporary folder
+    ("c_file.py", "c_run"),
+    ("c_file.py", "run"),
+    ("algorithms.py", "readable"),
+    ("interrupt.py", "by_parent"),  # the lock that the scheduler has made
+    ("atomic.py", "open_file"),
+    ("atomic.py", "lock"),
+}
+"""Functions that write without :func:`rejeu.core.atomic.open_file`, where no link can be."""
+
+
+def test_every_file_is_opened_for_writing_where_links_are_not_followed():
+    writers = set()
+    for path in Path(rejeu.__file__).parent.rglob("*.py"):
+        for scope in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            calls = ast.walk(scope) if isinstance(scope, ast.FunctionDef) else ()
+            writers |= {(path.name, scope.name) for call in calls if isinstance(call, ast.Call) and writes(call)}
+    assert writers == OPENED_ELSEWHERE
+
+
+def writes(call):
+    """Returns whether a call opens a file for writing, or creates one."""
+    name = ast.unparse(call.func)
+    if name.endswith(
+        (".touch", ".write_text", ".write_bytes", "FileLock", "np.save", "copyfile", "shutil.copy", "shutil.move")
+    ):
+        return not name.startswith("atomic.")
+    modes = [
+        one.value for one in (*call.args, *(word.value for word in call.keywords)) if isinstance(one, ast.Constant)
+    ]
+    is_open = name == "open" or name.endswith(".open")
+    is_for_writing = any(isinstance(mode, str) and re.fullmatch("[rwaxbt+]*[wax+][rwaxbt+]*", mode) for mode in modes)
+    return is_open and (is_for_writing or any(ast.unparse(one) == "mode" for one in call.args))
 
 
 def test_a_file_takes_the_place_of_a_link_and_not_of_its_target(link):

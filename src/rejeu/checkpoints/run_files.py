@@ -26,7 +26,7 @@ import jax
 import msgspec
 import numpy as np
 import optax
-from filelock import FileLock, Timeout
+from filelock import Timeout
 from msgspec import Meta
 
 from rejeu.agents.base import BaseAgent
@@ -91,7 +91,7 @@ class CheckpointFolder:
         self.agent = agent
         self.folder = folder
         self.row_files = RowFiles()
-        self._lock = FileLock(folder / "lock")
+        self._lock = atomic.lock(folder / "lock")
         self._named: dict[Path, list[str]] = {}
 
     def open(self) -> None:

@@ -10,12 +10,18 @@ import secrets
 import time
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import BinaryIO
+from typing import IO, TYPE_CHECKING, Any, BinaryIO
 
 from rejeu.core import interrupt
 
+if TYPE_CHECKING:
+    from filelock import FileLock
+
 STALE = 3600.0
 """Age in seconds from which a temporary file is taken for one that a killed process left behind."""
+
+NO_FOLLOW = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+"""Flags with which neither a symbolic link is followed nor a pipe is waited for, on systems that have them."""
 
 ADVICE = {
     errno.ENOSPC: "free some space, or give a path on another disk",
@@ -109,8 +115,7 @@ def append(path: Path, content: bytes) -> None:
             before.
     """
     try:
-        check_no_link(path)
-        with path.open("r+b", buffering=0) as file:
+        with open_file(path, "r+b", buffering=0) as file:
             end = file.seek(0, os.SEEK_END)
             try:
                 rest = memoryview(content)
@@ -123,20 +128,45 @@ def append(path: Path, content: bytes) -> None:
         raise _explained(error, path) from error
 
 
-def open_log(path: Path) -> BinaryIO:
-    """Opens a file to which lines are added, a new one if there is none.
+def open_file(path: str | Path, mode: str = "ab", **settings: Any) -> IO[Any]:
+    """Opens a file for writing as ``open`` does, but follows no symbolic link; by default lines are added to it.
 
     Raises:
         OSError: if that is impossible, or the path is a symbolic link.
     """
-    check_no_link(path)
-    return path.open("ab")
+    check_no_link(Path(path))
+    return open(path, mode, opener=lambda name, flags: os.open(name, flags | NO_FOLLOW, 0o666), **settings)
+
+
+def touch(path: Path) -> None:
+    """Creates a file or renews its time, as :func:`open_file` opens it."""
+    open_file(path).close()
+    os.utime(path)
+
+
+def lock(path: str | Path, timeout: float = -1) -> FileLock:
+    """Returns the lock on a file, which is created where it is acquired; ``timeout`` is in seconds, negative for none.
+
+    Raises:
+        OSError: if the path is a symbolic link.
+    """
+    from filelock import FileLock  # slow to import
+
+    check_no_link(Path(path))
+    return FileLock(path, timeout)
 
 
 def check_no_link(path: Path) -> None:
     """Raises ``OSError`` if a path is a symbolic link, through which a folder from elsewhere could change any file."""
     if path.is_symlink():
         raise OSError(errno.ELOOP, f"{shortened(path)} is a symbolic link; remove it")
+
+
+def check_no_links(folder: Path) -> None:
+    """Raises ``OSError`` if anything in a folder, at any depth, is a symbolic link: before libraries write into it."""
+    for root, folders, names in os.walk(folder):
+        for name in (*folders, *names):
+            check_no_link(Path(root, name))
 
 
 def remove_stale(path: Path, age: float = STALE) -> None:

@@ -7,6 +7,7 @@ import dataclasses
 import html
 import os
 import re
+import secrets
 import subprocess
 from contextlib import suppress
 from dataclasses import dataclass
@@ -61,7 +62,7 @@ class VideoFile:
         self.path = (path if path.suffix else path.with_name(path.name + ".mp4")).absolute()
         self.fps = fps
         self.n_frames = 0
-        self._partial = self.path.with_name(f".{self.path.stem}.{os.getpid()}.partial.mp4")
+        self._partial = self.path.with_name(f".{self.path.stem}.{secrets.token_hex(4)}.partial.mp4")
         self._program = ffmpeg()
         self._process: subprocess.Popen[bytes] | None = None
         self._shape: tuple[int, ...] = ()

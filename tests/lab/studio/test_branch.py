@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from rejeu.lab.studio.new import below
+from rejeu.lab.studio.state import Studio
 from tests.lab.studio.conftest import opened
 
 
@@ -33,4 +33,4 @@ def test_a_run_is_branched_with_other_settings(browser, common):
 @pytest.mark.parametrize("name", ["", "/elsewhere/x", "a/../../b"])
 def test_a_new_run_begins_below_the_folder_only(tmp_path, name):
     with pytest.raises(ValueError, match="must be a name of a folder below"):
-        below(tmp_path, name)
+        Studio(tmp_path).below(name)

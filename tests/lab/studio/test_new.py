@@ -3,7 +3,7 @@
 import asyncio
 import os
 from dataclasses import fields
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from types import SimpleNamespace
 
 import pytest
@@ -16,7 +16,7 @@ from rejeu.lab.cli.commands import Train
 from rejeu.lab.runs.config import options
 from rejeu.lab.studio import new, processes
 from rejeu.lab.studio.new import LEFT_OUT, command, lead_to, new_folder, prefilled, problem_of, require_known
-from rejeu.lab.studio.state import Studio
+from rejeu.lab.studio.state import Studio, is_below
 from tests.lab.reporting.report.folders import write
 
 OPTIONS = {one.field: one for one in options(Train)}
@@ -226,3 +226,19 @@ def test_a_check_that_does_not_end_can_be_stopped(tmp_path, page, monkeypatch):
         return await checking
 
     assert asyncio.run(check()) == (-15, "rejeu check ended with exit status -15")
+
+
+@pytest.mark.parametrize(
+    "name", [r"\evil", "/evil", "D:evil", r"D:\evil", r"\\host\share", r"..\evil", "a/../../evil", "", "."]
+)
+def test_a_name_does_not_lead_out_of_the_folder_on_windows(name):
+    assert not is_below(PureWindowsPath(name))
+
+
+@pytest.mark.skipif(os.name != "posix", reason="links need rights on Windows")
+def test_a_link_in_the_folder_does_not_lead_out_of_it(tmp_path):
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "runs" / "away").symlink_to(tmp_path)
+    with pytest.raises(ValueError, match="is not in the folder of the studio"):
+        Studio(tmp_path / "runs").below("away/run")
+    assert Studio(tmp_path / "runs").below("group/run") == tmp_path / "runs" / "group" / "run"

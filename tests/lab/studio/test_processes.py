@@ -1,11 +1,16 @@
 """Commands that the studio starts. No browser and no server."""
 
+import os
 from types import SimpleNamespace
 
 import pytest
 
 pytest.importorskip("nicegui", reason="needs nicegui, which is in the extra studio")
 
+from rejeu.checkpoints.run_folder import RunFolder
+from rejeu.lab.cli.commands import Resume
+from rejeu.lab.cli.resume import run_resume
+from rejeu.lab.runs import requests
 from rejeu.lab.studio import processes, run
 from rejeu.lab.studio.state import Studio
 
@@ -41,3 +46,41 @@ def test_a_command_that_fails_says_why_and_its_button_can_be_pressed_again(tmp_p
     assert presses == ["off", "on"]
     assert said[1:] == ["rejeu: error: no checkpoint"]
     assert looks[1:] == [None]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="links need rights on Windows")
+@pytest.mark.parametrize("name", [".studio", ".studio/mine.log", "mine/stop", "mine/watch"])
+def test_the_studio_writes_through_no_link_of_a_folder_of_runs(tmp_path, monkeypatch, name):
+    profile, linked = tmp_path / "home" / "profile", tmp_path / "runs" / name
+    profile.parent.mkdir()
+    profile.write_text("export PATH\n", encoding="utf-8")
+    os.utime(profile, (0, 0))
+    (tmp_path / "runs" / "mine").mkdir(parents=True)
+    linked.parent.mkdir(exist_ok=True)
+    linked.symlink_to(profile if "/" in name else profile.parent, target_is_directory="/" not in name)
+    said = []
+    monkeypatch.setattr(run.ui, "notify", lambda text, **_: said.append(text))
+    folder, button = RunFolder(tmp_path / "runs" / "mine"), SimpleNamespace(disable=None)
+    if name.startswith("mine"):
+        requests.ask(linked)
+        run.stop(button, RunFolder(folder.path)) if name == "mine/stop" else said.append("is a symbolic link")
+    else:
+        page = SimpleNamespace(path=folder.path, name="mine", studio=SimpleNamespace(words=lambda name: []))
+        run.command(button, "runs", page, "")
+    assert "is a symbolic link" in said[0]
+    assert profile.stat().st_mtime == 0
+    assert [one.name for one in profile.parent.iterdir()] == ["profile"]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="links need rights on Windows")
+@pytest.mark.parametrize(
+    "name", ["checkpoints", "checkpoints/lock", "models", "videos", "wandb", ".sweep", "a/config.json"]
+)
+def test_a_folder_with_a_link_is_not_resumed(tmp_path, name):
+    (tmp_path / "run" / name).parent.mkdir(parents=True)
+    (tmp_path / "run" / name).symlink_to(tmp_path / "home")
+    for kind in ("config.json", "sweep.json", "study.json"):
+        (tmp_path / "run" / kind).write_text("{}", encoding="utf-8")
+    with pytest.raises(OSError, match=f"{name} is a symbolic link; remove it"):
+        run_resume(Resume(run=tmp_path / "run"))
+    assert not (tmp_path / "home").exists()

@@ -144,7 +144,7 @@ def noted_in(path: Path) -> Iterator[None]:
     show = warnings.showwarning
 
     def note(text: object) -> None:
-        with suppress(OSError), atomic.open_log(path) as file:
+        with suppress(OSError), atomic.open_file(path) as file:
             file.write((" ".join(str(text).split()) + "\n").encode())
 
     def show_and_note(message: Warning | str, *arguments: Any, **options: Any) -> None:

@@ -18,7 +18,7 @@ from typing import Any
 from rejeu.agents import Agent, agent_of_file
 from rejeu.algorithms import config as configs
 from rejeu.checkpoints.run_folder import RunFolder, check_free, checkpoint_files, create, step_of
-from rejeu.core import devices
+from rejeu.core import atomic, devices
 from rejeu.core.errors import RunInUseError
 from rejeu.core.interrupt import Interrupt
 from rejeu.envs.make import WorkerOptions
@@ -28,7 +28,7 @@ from rejeu.lab.cli.output import Stopwatch, echo
 from rejeu.lab.cli.session import Session, TrainingLimits, has_reached_goal, make_evaluation_env
 from rejeu.lab.experiments.folder import is_sweep
 from rejeu.lab.experiments.study import StudyFolder
-from rejeu.lab.reporting.runs import is_locked
+from rejeu.lab.reporting.runs import is_file, is_locked
 from rejeu.lab.runs import config as configs_of_runs
 from rejeu.lab.runs.config import DecidedRun, Origin, merged, read_folder
 from rejeu.lab.runs.requests import drop
@@ -42,7 +42,9 @@ def run_resume(arguments: Resume) -> tuple[int, dict[str, Any]]:
     Raises:
         ValueError: for options of a sweep with the folder of a run, or of a run with that of a sweep or a study.
         RunInUseError: if another process trains there.
+        OSError: if there is a symbolic link in the folder.
     """
+    atomic.check_no_links(arguments.run)
     holds_sweep = is_sweep(arguments.run)
     if holds_sweep or StudyFolder(arguments.run).plan.is_file():
         if arguments.steps is not None or arguments.minutes is not None:
@@ -67,7 +69,7 @@ def run_branch(arguments: Branch) -> tuple[int, dict[str, Any]]:
     def begin(agent: Agent, config: DecidedRun) -> tuple[RunFolder, DecidedRun]:
         folder = create(arguments.out, config.env, config.algorithm, config.seed)
         for table in (parent.metrics, parent.metrics.with_suffix(".json"), parent.evaluations):
-            if table.is_file():
+            if is_file(table):
                 shutil.copyfile(table, folder.path / table.name)  # the session leaves out later rows
         agent.run_id = secrets.token_hex(8)
         write_best(agent, folder.best)

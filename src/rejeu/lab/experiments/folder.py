@@ -18,7 +18,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, TypeVar
 
-from filelock import FileLock
 from msgspec import Meta
 
 from rejeu.core import atomic
@@ -152,6 +151,7 @@ def read_folder(path: Path, typed: RunConfig = NOTHING) -> SweepFolder:
         job.check_code(typed, path / SWEEP)
     if not os.access(path, os.W_OK):
         raise PermissionError(f"{path} cannot be written; check its permissions")
+    atomic.check_no_links(path)
     (path / HIDDEN).mkdir(exist_ok=True)
     return SweepFolder(path, plan)
 
@@ -175,8 +175,9 @@ def begin(path: Path, name: str, plan: P, read: Callable[[Path], P], difference:
         raise FileExistsError(
             f"{path} exists and holds something else than {name}; name another folder, or remove it first"
         )
+    atomic.check_no_links(path)
     atomic.make_folder(path / HIDDEN)
-    with FileLock(path / HIDDEN / "lock", timeout=PATIENCE):
+    with atomic.lock(path / HIDDEN / "lock", timeout=PATIENCE):
         if not (path / name).is_file():
             atomic.write(path / name, json_text(plan))
             return plan

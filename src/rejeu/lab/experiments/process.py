@@ -33,7 +33,7 @@ class Process:
         Raises:
             OSError: if the log cannot be written.
         """
-        with atomic.open_log(log) as file:
+        with atomic.open_file(log) as file:
             self._process = subprocess.Popen(
                 program(task),
                 stdin=subprocess.PIPE,
@@ -117,7 +117,7 @@ class LocalLauncher:
 def hold(path: Path) -> FileLock | None:
     """Returns the lock on a file, held by this process; None if another process holds it."""
     atomic.make_folder(path.parent)
-    lock = FileLock(path)
+    lock = atomic.lock(path)
     try:
         lock.acquire(timeout=0)
     except Timeout:

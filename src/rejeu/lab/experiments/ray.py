@@ -130,12 +130,12 @@ class RayRun:
     def stop(self) -> None:
         """Asks it to stop after the current step, with a checkpoint."""
         with suppress(OSError):
-            self._stop.touch()
+            atomic.touch(self._stop)
         self._cancel_at = time.monotonic() + PATIENCE
 
     def _note(self, error: Exception) -> None:
         """Writes an error of the cluster to the log."""
-        with suppress(OSError), atomic.open_log(self._log) as file:
+        with suppress(OSError), atomic.open_file(self._log) as file:
             file.write(f"{type(error).__name__}: {cluster.one_line(error)}\n".encode())
 
 

@@ -99,7 +99,7 @@ class StudyFolder:
 
     def lock(self) -> FileLock:
         """Returns the lock that is held while trials are entered."""
-        return FileLock(self.path / HIDDEN / "lock")
+        return atomic.lock(self.path / HIDDEN / "lock")
 
 
 @dataclass(eq=False)
@@ -260,7 +260,7 @@ def connect(folder: StudyFolder, plan: StudyPlan) -> optuna.Study:
     from optuna.storages.journal import JournalFileBackend
 
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    lock: Any = FileLock(f"{folder.journal}.held")  # released with the process, as those of Optuna are not
+    lock: Any = atomic.lock(f"{folder.journal}.held")  # released with the process, as those of Optuna are not
     complete_last_line(folder.journal, lock)
     with readable(folder.journal):
         return optuna.create_study(
@@ -285,7 +285,7 @@ def complete_last_line(journal: Path, lock: Any) -> None:
     with lock:
         content = journal.read_bytes()
         if content and not content.endswith(b"\n"):
-            with journal.open("r+b") as file:
+            with atomic.open_file(journal, "r+b") as file:
                 file.truncate(content.rfind(b"\n") + 1)
 
 

@@ -19,11 +19,12 @@ from types import MappingProxyType
 from typing import Any, Literal
 
 import numpy as np
-from filelock import FileLock, Timeout
+from filelock import Timeout
 
 from rejeu.agents import presets
 from rejeu.algorithms.catalog import CATALOG
 from rejeu.checkpoints.run_folder import RunFolder, newest_inside, newest_step
+from rejeu.core import atomic
 from rejeu.core.errors import CheckpointError
 from rejeu.core.records import Malformed, convert, parse_json, shown
 from rejeu.lab.runs.config import MAX_BYTES, RunConfig
@@ -244,10 +245,10 @@ def has_process(folder: Path) -> bool | None:
 def is_locked(path: Path) -> bool:
     """Returns whether another process holds the lock on a file; the file is not changed."""
     if os.name != "posix":
-        if not path.is_file():  # FileLock would create it
+        if not is_file(path):  # the lock would create it
             return False
         try:
-            with FileLock(path).acquire(timeout=0):
+            with atomic.lock(path).acquire(timeout=0):
                 return False
         except Timeout:
             return True

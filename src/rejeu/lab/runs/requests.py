@@ -14,6 +14,7 @@ from typing import Any
 
 from rejeu.callbacks.base import TrainingCallback
 from rejeu.checkpoints.run_folder import RunFolder
+from rejeu.core import atomic
 from rejeu.core.interrupt import Interrupt
 from rejeu.training.run import Progress
 
@@ -28,7 +29,7 @@ MOST_MODELS = 16
 def ask(path: Path) -> None:
     """Makes or renews a request, unless the folder cannot be written to."""
     with suppress(OSError):
-        path.touch()
+        atomic.touch(path)
 
 
 def is_asked(path: Path) -> bool:

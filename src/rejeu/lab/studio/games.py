@@ -54,7 +54,7 @@ class Wanted(NamedTuple):
             if own.env_id != (self.env or made.env_id):
                 raise ValueError(f"{name} plays {own.env_id}, not {self.env or made.env_id}")
         agents = {name: load(model, device="cpu") for name, (model, _) in players.items()}
-        folder = studio.folder / "played" / dated(made.env_id).name if self.record and self.by_hand else None
+        folder = studio.below(f"played/{dated(made.env_id).name}") if self.record and self.by_hand else None
         return opened(made.make, agents, self.by_hand, seed=self.seed, record=folder, has_video=False)
 
 
@@ -67,10 +67,7 @@ def find_agent(studio: Studio, name: str) -> tuple[Path, Environment]:
     """
     if name in studio.guests:
         return studio.guests[name]
-    path = Path(name)
-    if path.is_absolute() or ".." in path.parts:
-        raise ValueError(f"{name!r} is not in the folder of the studio")
-    model = find_model(studio.folder / path)
+    model = find_model(studio.below(name))
     return model, environment.environment_of(model, studio.given(name))
 
 

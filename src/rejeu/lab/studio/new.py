@@ -154,24 +154,13 @@ def command(texts: Texts, studio: Studio) -> tuple[list[str], Train]:
     return ["train", *words], arguments
 
 
-def below(folder: Path, named: str) -> Path:
-    """Returns the path of a name below a folder.
-
-    Raises:
-        ValueError: if it is elsewhere.
-    """
-    if not named or Path(named).is_absolute() or ".." in Path(named).parts:
-        raise ValueError(f"folder {named!r} must be a name of a folder below {folder}")
-    return folder / named
-
-
 def new_folder(studio: Studio, named: str) -> Path:
     """Returns the path of a folder for a new run, which is then found below the folder of the studio, on every system.
 
     Raises:
         ValueError: if it exists, or no run can be there.
     """
-    path = below(studio.folder, named)
+    path = studio.below(named)
     parts = path.relative_to(studio.folder).parts
     is_valid = parts and all(NAME.fullmatch(part) and len(os.fsencode(part)) <= MAX_NAME for part in parts)
     if not is_valid or len(parts) >= MAX_DEPTH or SKIPPED & {*parts}:

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from rejeu.core import atomic
 from rejeu.lab.reporting.runs import is_file
 
 HIDDEN = ".studio"
@@ -33,8 +34,9 @@ def start(words: Sequence[str], run: Path) -> subprocess.Popen[bytes]:
     if (known := STARTED.get(key)) is not None and known.poll() is None:
         raise ValueError(f"rejeu {words[0]} is under way for {run.name}; wait until it has ended")
     log = log_of(run)
-    log.parent.mkdir(parents=True, exist_ok=True)
-    with log.open("ab") as out:
+    atomic.check_no_link(log.parent)
+    atomic.make_folder(log.parent)
+    with atomic.open_file(log) as out:
         process = STARTED[key] = subprocess.Popen(
             [sys.executable, "-m", "rejeu", *words], stdin=subprocess.DEVNULL, stdout=out, stderr=out, **APART
         )

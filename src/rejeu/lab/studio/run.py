@@ -14,6 +14,7 @@ from fastapi import Request
 from nicegui import ui
 
 from rejeu.checkpoints.run_folder import RunFolder
+from rejeu.core import atomic
 from rejeu.core.records import brief
 from rejeu.lab.experiments.work import HIDDEN
 from rejeu.lab.reporting import run_list
@@ -173,7 +174,7 @@ def show_actions(page: RunPage, row: Row) -> None:
 def stop(button: Any, folder: RunFolder) -> None:
     """Asks the run to stop with a checkpoint, as Ctrl-C does."""
     try:
-        folder.stop.touch()
+        atomic.touch(folder.stop)
     except OSError as error:
         ui.notify(brief(error), type="negative")
     else:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PurePath
 from types import TracebackType
 
 from rejeu.envs.registry import are_plain, is_plain_id
@@ -20,6 +20,11 @@ EVERY = 1.0
 
 NOTHING = RunConfig(env="")
 """What the command line names if it names no environment and no module."""
+
+
+def is_below(path: PurePath) -> bool:
+    """Returns whether a path stays below the folder that it is joined to, on the system of its class."""
+    return bool(path.parts) and not path.anchor and ".." not in path.parts and "\0" not in str(path)
 
 
 class Studio:
@@ -51,6 +56,19 @@ class Studio:
 
     def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
         self._ended.set()
+
+    def below(self, name: str) -> Path:
+        """Returns the path of a name below the folder.
+
+        Raises:
+            ValueError: if it is elsewhere, also by a symbolic link.
+        """
+        path = self.folder / name
+        if not is_below(Path(name)) or not path.resolve().is_relative_to(self.folder.resolve()):
+            raise ValueError(
+                f"{name!r} is not in the folder of the studio; it must be a name of a folder below {self.folder}"
+            )
+        return path
 
     def row(self, run: str) -> Row | None:
         """Returns the row of a run by its path below the folder, as pages have it in their address; None if there is none."""

@@ -23,6 +23,7 @@ from typing import Any, TextIO
 
 import numpy as np
 
+from rejeu.core import atomic
 from rejeu.logs import logging
 from rejeu.logs.formatting import LOGS
 from rejeu.logs.logging import CsvFile, JsonLines, TensorBoard, add_text, open_log
@@ -148,7 +149,9 @@ class HumanOutputFormat(KVWriter):
     def __init__(self, filename_or_file: Any, max_length: int = 36) -> None:
         self.max_length = max_length
         self._owns = isinstance(filename_or_file, str | Path)
-        self.file: TextIO = open(filename_or_file, "w", encoding="utf-8") if self._owns else filename_or_file  # noqa: SIM115
+        self.file: TextIO = (
+            atomic.open_file(filename_or_file, "w", encoding="utf-8") if self._owns else filename_or_file
+        )
         if not hasattr(self.file, "write"):
             raise ValueError(f"Expected file or str, got {filename_or_file}")
 

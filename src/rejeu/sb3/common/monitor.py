@@ -184,7 +184,7 @@ class ResultsWriter:
         self._failed_writes = FailedWrites()
         if override_existing or not self.path.exists():
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            with self.path.open("w", newline="\n", encoding="utf-8") as file:
+            with atomic.open_file(self.path, "w", newline="\n", encoding="utf-8") as file:
                 file.write(f"#{json.dumps(header or {})}\n")
                 csv.writer(file).writerow(self.columns)
 

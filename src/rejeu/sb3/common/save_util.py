@@ -9,6 +9,8 @@ from typing import Any
 
 import msgspec
 
+from rejeu.core import atomic
+
 __all__ = [
     "load_from_pkl",
     "open_path",
@@ -73,7 +75,7 @@ def open_path(path: Any, mode: str, verbose: int = 0, suffix: str | None = None)
     if not path.parent.exists():
         warnings.warn(f"Path {path.parent!s} does not exist and is created.", UserWarning, stacklevel=2)
         path.parent.mkdir(parents=True)
-    return path.open("wb")
+    return atomic.open_file(path, "wb")
 
 
 open_path_pathlib = open_path_str = open_path
