@@ -5,7 +5,8 @@
 SRC is the folder that contains ``rejeu`` (default: ``src``). The layers are the list under "Layout" in docs/design.md, and the
 limits the table under "Size". A line counts if it holds code: not a comment, a docstring or a blank line. Every Python file of
 the package counts. Exits with status 1 if there is a cycle, an access to a private attribute, an import against the layers,
-more lines than a limit, or the name of an algorithm as text outside of :data:`NAMES_ALGORITHMS`.
+more lines than a limit, the name of an algorithm as text outside of :data:`NAMES_ALGORITHMS`, or more placeholders or vague
+docstrings than :data:`MAX_PLACEHOLDER_SHARE` and :data:`MAX_VAGUE_DOCSTRINGS`.
 """
 
 from __future__ import annotations
@@ -49,6 +50,30 @@ NAMES_ALGORITHMS = {
     "agents.presets": "the default for a kind of action space",
 }
 """Where names of algorithms may stand as text, and why; elsewhere they come from ``algorithms/catalog.toml``."""
+PLACEHOLDERS = {
+    *(
+        "one",
+        "found",
+        "kind",
+        "kinds",
+        "part",
+        "given",
+        "made",
+        "own",
+        "known",
+        "what",
+        "which",
+        "seen",
+        "chosen",
+        "other",
+    ),
+    *("rest", "taken", "said", "kept", "left", "place", "answer", "thing", "named", "most", "about"),
+}
+"""Names that do not say what they hold."""
+MAX_PLACEHOLDER_SHARE = 7.2
+"""Largest share of placeholders among the names that are bound, in percent. It may only fall."""
+MAX_VAGUE_DOCSTRINGS = 209
+"""Largest number of docstrings that paraphrase with "what" or begin with "the same". It may only fall."""
 EXCEPTIONS = PUBLIC_IN_SPITE_OF_ITS_NAME | GYMNASIUM_STATE
 
 
@@ -182,6 +207,36 @@ def algorithm_names(src: Path, modules: dict[str, tuple[Path, ast.Module]]) -> l
     ]
 
 
+def bound_names(tree: ast.Module) -> Iterator[tuple[int, str]]:
+    """Yields line and text of each name that is assigned, looped over or a parameter."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            yield node.lineno, node.id
+        elif isinstance(node, ast.arg):
+            yield node.lineno, node.arg
+
+
+def vague_docstrings(tree: ast.Module) -> Iterator[tuple[int, str]]:
+    """Yields line and first words of each docstring that begins with "what", "Returns what" or "the same"."""
+    for node in ast.walk(tree):
+        is_text = (
+            isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
+        )
+        if is_text and re.match(
+            r"(what|(returns|yields) what|(returns |yields )?the same)\b", node.value.value.strip(), re.I
+        ):
+            yield node.lineno, node.value.value.strip()[:60]
+
+
+def over_the_share(modules: dict[str, tuple[Path, ast.Module]], names: list[str], docstrings: list[str]) -> list[str]:
+    """Returns which of the limits of placeholders and of vague docstrings is exceeded."""
+    n_bound = sum(1 for _, tree in modules.values() for _ in bound_names(tree))
+    share = 100 * len(names) / n_bound
+    too_many = [f"{share:.2f} % of {n_bound:,} names are placeholders, the limit is {MAX_PLACEHOLDER_SHARE} %"]
+    too_vague = [f"{len(docstrings)} docstrings are vague, the limit is {MAX_VAGUE_DOCSTRINGS}"]
+    return too_many * (share > MAX_PLACEHOLDER_SHARE) + too_vague * (len(docstrings) > MAX_VAGUE_DOCSTRINGS)
+
+
 def code_lines(path: Path) -> list[str]:
     """Returns a module's lines that hold code, stripped: those with a token that is not a comment or a docstring."""
     held: set[int] = set()
@@ -247,6 +302,10 @@ def measure(src: Path) -> dict[str, Any]:
     algorithms = [code[name] for name in modules if ".algorithms" in name]
     repeated, of = repeated_lines(algorithms)
     length, function = longest_function(modules)
+    placeholders = [
+        f"{m}:{line} {name}" for m, (_, t) in modules.items() for line, name in bound_names(t) if name in PLACEHOLDERS
+    ]
+    vague = [f"{m}:{line} {text}" for m, (_, t) in modules.items() for line, text in vague_docstrings(t)]
     return {
         "files": len(modules),
         "lines_of_code": sum(lines.values()),
@@ -265,7 +324,10 @@ def measure(src: Path) -> dict[str, Any]:
         ],
         "private_imports": [f"{m}:{line} {text}" for m, (_, t) in modules.items() for line, text in private_imports(t)],
         "layering_violations": layering_violations(found, layers()),
-        "over_the_limit": over_the_limit(lines),
+        "over_the_limit": over_the_limit(lines) + over_the_share(modules, placeholders, vague),
+        "placeholders": placeholders,
+        "vague_docstrings": vague,
+        "any": sum(len(re.findall(r"\bAny\b", path.read_text(encoding="utf-8"))) for path, _ in modules.values()),
         "algorithm_names": algorithm_names(src, modules),
     }
 
@@ -282,7 +344,12 @@ def report(counts: dict[str, Any], verbose: bool) -> None:
     print(f"{counts['repeated_share_in_algorithms']} % of the lines of algorithms/ occur in three or more of its files")
     longest = f"{counts['longest_function_name']} has {counts['longest_function']}"
     print(f"functions: {counts['mean_function']} lines in the mean; {longest}")
-    for key in ENFORCED:
+    by_room = Counter(entry.split(":")[0].split(".")[1] for entry in counts["placeholders"])
+    print(
+        f"placeholders: {by_room.total()} ({', '.join(f'{room} {n}' for room, n in by_room.most_common())});", end=" "
+    )
+    print(f"vague docstrings: {len(counts['vague_docstrings'])}; Any: {counts['any']:,}")
+    for key in (*ENFORCED, *(("placeholders", "vague_docstrings") if verbose else ())):
         found = counts[key]
         sizes = f" of {', '.join(str(len(cycle)) for cycle in found)} modules" if key == "cycles" and found else ""
         print(f"{key.replace('_', ' ')}: {len(found)}{sizes}")
