@@ -192,7 +192,7 @@ def train(
     """
     if agent.name in DETERMINISTIC:
         warn_without_noise(agent)
-    bar = [ProgressBar.of(call, taken=agent.run.step - call.first_step)] if progress_bar else []
+    bar = [ProgressBar.of(call, steps_before=agent.run.step - call.first_step)] if progress_bar else []
     callbacks = in_order([*listed(callback), *bar])
     agent.stops, agent.n_together = device.stops_of(agent, call, callbacks), 1
     if agent.stops is not None:

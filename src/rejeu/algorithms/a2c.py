@@ -94,11 +94,11 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     Raises:
         ValueError: if no policy can act in the action space, or if the settings do not fit the observation space.
     """
-    obs_leaves, kind, shape = checked(config, observation_space, action_space)
+    obs_leaves, action_kind, shape = checked(config, observation_space, action_space)
     optimizer = optimizer_of(config)
 
     def init(key: Array) -> State:
-        network = ActorCritic(key, obs_leaves, kind, shape, config.use_sde)
+        network = ActorCritic(key, obs_leaves, action_kind, shape, config.use_sde)
         return State(network, optimizer.init(network), jnp.int32(0))
 
     def update(state: State, rollout: Rollout, clock: Clock) -> tuple[State, Metrics]:
@@ -118,7 +118,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         }
         return State(network, optimizer_state, state.n_updates + 1), metrics
 
-    return algorithm_of(config, kind, init, update)
+    return algorithm_of(config, action_kind, init, update)
 
 
 def optimizer_of(config: Config) -> optax.GradientTransformation:

@@ -240,5 +240,5 @@ def weights(plus: Array, minus: Array, n_top: int) -> tuple[Array, Array]:
     """
     best = jnp.argsort(-jnp.maximum(plus, minus))[:n_top]
     deviation = jnp.std(jnp.concatenate([plus[best], minus[best]])) + SMALLEST_DEVIATION
-    chosen = jnp.zeros_like(plus).at[best].set(1.0)
-    return chosen * (plus - minus) / (n_top * deviation), deviation
+    is_best = jnp.zeros_like(plus).at[best].set(1.0)
+    return is_best * (plus - minus) / (n_top * deviation), deviation

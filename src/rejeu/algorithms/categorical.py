@@ -52,31 +52,35 @@ def project(values: Array, probabilities: Array, atoms: Array) -> Array:
     >>> project(jnp.array([0.25, 9.0]), jnp.array([0.8, 0.2]), make_atoms(-1.0, 1.0, 3)).tolist()
     [0.0, 0.6000000238418579, 0.4000000059604645]
     """
-    place = (jnp.clip(values, atoms[0], atoms[-1]) - atoms[0]) / (atoms[1] - atoms[0])
-    return (_scattered if xla.platform() == "cpu" else _spread)(place, probabilities, atoms.shape[0])
+    positions = (jnp.clip(values, atoms[0], atoms[-1]) - atoms[0]) / (atoms[1] - atoms[0])
+    return (_scattered if xla.platform() == "cpu" else _spread)(positions, probabilities, atoms.shape[0])
 
 
-def _spread(place: Array, probabilities: Array, n_atoms: int) -> Array:
-    """Returns the projection of values at ``place`` ``(..., n)``, from 0 to ``n_atoms - 1``, by equation 7.
+def _spread(positions: Array, probabilities: Array, n_atoms: int) -> Array:
+    """Returns the projection of values at ``positions`` ``(..., n)``, from 0 to ``n_atoms - 1``, by equation 7.
 
     On a GPU the order of a sum of scattered numbers is not fixed, and runs would not be reproducible.
     """
-    atom = jnp.arange(n_atoms, dtype=jnp.float32).reshape(*[1] * (place.ndim - 1), -1, 1)
-    return jnp.sum(jnp.maximum(1.0 - jnp.abs(place[..., None, :] - atom), 0.0) * probabilities[..., None, :], axis=-1)
-
-
-def _scattered(place: Array, probabilities: Array, n_atoms: int) -> Array:
-    """Returns the same by adding each probability to two atoms: for 101 atoms, a hundred times as fast on a CPU."""
-    shape, place, probabilities = (
-        place.shape,
-        place.reshape(-1, place.shape[-1]),
-        probabilities.reshape(-1, place.shape[-1]),
+    atom = jnp.arange(n_atoms, dtype=jnp.float32).reshape(*[1] * (positions.ndim - 1), -1, 1)
+    return jnp.sum(
+        jnp.maximum(1.0 - jnp.abs(positions[..., None, :] - atom), 0.0) * probabilities[..., None, :], axis=-1
     )
-    lower = jnp.clip(jnp.floor(place), 0.0, n_atoms - 2.0)
-    upper_share = place - lower
-    rows, lower = jnp.arange(place.shape[0])[:, None], lower.astype(jnp.int32)
-    found = jnp.zeros((place.shape[0], n_atoms), jnp.float32).at[rows, lower].add(probabilities * (1.0 - upper_share))
-    return found.at[rows, lower + 1].add(probabilities * upper_share).reshape(*shape[:-1], n_atoms)
+
+
+def _scattered(positions: Array, probabilities: Array, n_atoms: int) -> Array:
+    """Returns the same by adding each probability to two atoms: for 101 atoms, a hundred times as fast on a CPU."""
+    shape, positions, probabilities = (
+        positions.shape,
+        positions.reshape(-1, positions.shape[-1]),
+        probabilities.reshape(-1, positions.shape[-1]),
+    )
+    lower = jnp.clip(jnp.floor(positions), 0.0, n_atoms - 2.0)
+    upper_share = positions - lower
+    rows, lower = jnp.arange(positions.shape[0])[:, None], lower.astype(jnp.int32)
+    lower_sums = (
+        jnp.zeros((positions.shape[0], n_atoms), jnp.float32).at[rows, lower].add(probabilities * (1.0 - upper_share))
+    )
+    return lower_sums.at[rows, lower + 1].add(probabilities * upper_share).reshape(*shape[:-1], n_atoms)
 
 
 def cross_entropy(logits: Array, target: Array) -> Array:

@@ -244,9 +244,9 @@ class OffPolicyConfig(AlgorithmConfig):
             "demonstrations": self.demonstrations is not None,
             "action_noise=ParameterNoise()": isinstance(self.action_noise, ParameterNoise),
         }
-        if given := [setting for setting, is_given in refused.items() if is_given]:
+        if refusal := [setting for setting, is_given in refused.items() if is_given]:
             raise ValueError(
-                f"{given[0]} is not available for networks with memory, which learn from whole sequences; leave it out, or "
+                f"{refusal[0]} is not available for networks with memory, which learn from whole sequences; leave it out, or "
                 "lstm_hidden_size"
             )
         length = self.policy_kwargs.sequence_length
@@ -269,7 +269,7 @@ class OffPolicyConfig(AlgorithmConfig):
         return settings if isinstance(settings, HindsightConfig) else None
 
 
-def rebuild(kind: type[C], saved: Mapping[str, Any], changes: Mapping[str, Any]) -> C:
+def rebuild(config_class: type[C], saved: Mapping[str, Any], changes: Mapping[str, Any]) -> C:
     """Returns the configuration of a file with some settings changed; of ``policy_kwargs`` only the given ones.
 
     Raises:
@@ -288,7 +288,7 @@ def rebuild(kind: type[C], saved: Mapping[str, Any], changes: Mapping[str, Any])
             f"its {keys[-1]} is your own, {name!r}, and no file holds code; give it again: load(path, {argument})"
             + (", or import the module that registers it (--import MODULE)" if keys[-1] in NAMED else "")
         )
-    return build(kind, merged)
+    return build(config_class, merged)
 
 
 def own_names(saved: Mapping[str, Any]) -> Iterator[tuple[tuple[str, ...], str]]:
@@ -308,8 +308,8 @@ def own_changes(saved: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[st
     mentioned = {keys[0] for keys, _ in own_names(saved)} - {"policy_kwargs"}
     policy = changes.get("policy_kwargs")
     modules = {key: policy[key] for key in OWN_MODULES if key in policy} if isinstance(policy, Mapping) else {}
-    own = {key: value for key, value in changes.items() if key in mentioned}
-    return own | ({"policy_kwargs": modules} if modules else {})
+    replacements = {key: value for key, value in changes.items() if key in mentioned}
+    return replacements | ({"policy_kwargs": modules} if modules else {})
 
 
 def is_own(value: Any) -> bool:
@@ -322,11 +322,11 @@ def with_widths(config: C, obs_leaves: tuple[Leaf, ...]) -> C:
 
     These depend on the observation, whose leaves are given.
     """
-    kind: Any = type(config)
+    config_class: Any = type(config)
     shape = config.policy_kwargs  # type: ignore[attr-defined]
-    widths = kind.hidden_layers_on_images if reads_image(obs_leaves, shape) else kind.hidden_layers
-    said = settled(vars(shape), widths)
-    return dataclasses.replace(config, policy_kwargs=dataclasses.replace(shape, **said)) if said else config  # type: ignore
+    widths = config_class.hidden_layers_on_images if reads_image(obs_leaves, shape) else config_class.hidden_layers
+    missing = settled(vars(shape), widths)
+    return dataclasses.replace(config, policy_kwargs=dataclasses.replace(shape, **missing)) if missing else config  # type: ignore
 
 
 def network_inputs(config: Any, observation_space: spaces.Space) -> tuple[tuple[Leaf, ...], Any]:
@@ -378,10 +378,13 @@ def buffer_name(key: str, value: Any) -> str | type:
 def buffer_settings(key: str, value: Any, buffer: str | type) -> Any:
     """Returns the settings of a replay buffer: a record or, for a class of the user's own, pairs of names and values."""
     if isinstance(buffer, type) and not issubclass(buffer, HerReplayBuffer):
-        return tuple((name, tuple(one) if isinstance(one, list) else one) for name, one in dict(value or {}).items())
-    kind = HindsightConfig if isinstance(buffer, type) else REPLAY_BUFFERS[buffer]
-    if kind is not None:
-        return nested(key, value or {}, kind)
+        return tuple(
+            (name, tuple(setting) if isinstance(setting, list) else setting)
+            for name, setting in dict(value or {}).items()
+        )
+    settings_class = HindsightConfig if isinstance(buffer, type) else REPLAY_BUFFERS[buffer]
+    if settings_class is not None:
+        return nested(key, value or {}, settings_class)
     if value:
         raise ValueError(
             f"{key}={value!r} does not apply to {buffer}; did you forget replay_buffer_class=HerReplayBuffer?"

@@ -59,9 +59,9 @@ def check_action(action: Any, obs: PyTree, sample: np.ndarray, function: str) ->
     shape, is_float = (len(jax.tree.leaves(obs)[0]), *sample.shape[1:]), sample.dtype.kind == "f"
     dtype = getattr(action, "dtype", None)
     if dtype is None or action.shape != shape or jnp.issubdtype(dtype, jnp.floating) != is_float:
-        kind = "float32" if is_float else "int32"
+        dtype = "float32" if is_float else "int32"
         raise TypeError(
-            f"{function} returned the actions {described(action)}, expected {kind}{[*shape]}: one for each of the {shape[0]} "
+            f"{function} returned the actions {described(action)}, expected {dtype}{[*shape]}: one for each of the {shape[0]} "
             "observations of its batch" + (", in [-1, 1]" if is_float else ", counted from 0")
         )
 
@@ -69,10 +69,10 @@ def check_action(action: Any, obs: PyTree, sample: np.ndarray, function: str) ->
 def check_update(returned: Any) -> None:
     """Raises ``TypeError`` unless ``update`` returned a state and a dict of scalars."""
     if not isinstance(returned, tuple) or len(returned) != 2 or not isinstance(returned[1], Mapping):
-        kinds = [type(one).__name__ for one in returned] if isinstance(returned, tuple) else [type(returned).__name__]
+        items = returned if isinstance(returned, tuple) else (returned,)
         raise TypeError(
-            f"update returned ({', '.join(kinds)}), expected (state, metrics): the new state and a dict of scalars, which "
-            "may be empty"
+            f"update returned ({', '.join(type(item).__name__ for item in items)}), expected (state, metrics): the "
+            "new state and a dict of scalars, which may be empty"
         )
     for name, value in returned[1].items():
         if name != TD_ERROR and np.shape(value) != ():
@@ -86,9 +86,9 @@ def check_state(state: PyTree, expected: PyTree, function: str) -> None:
 
     ``function`` is that of the algorithm which returned the state.
     """
-    given, wanted = (dict(zip(names(tree), jax.tree.leaves(tree), strict=True)) for tree in (state, expected))
-    for name in [*wanted, *given]:
-        ours, theirs = (described(leaves[name]) if name in leaves else "no such leaf" for leaves in (wanted, given))
+    returned, wanted = (dict(zip(names(tree), jax.tree.leaves(tree), strict=True)) for tree in (state, expected))
+    for name in [*wanted, *returned]:
+        ours, theirs = (described(leaves[name]) if name in leaves else "no such leaf" for leaves in (wanted, returned))
         if ours != theirs:
             raise TypeError(f"{function} returned a state with {name or 'state'}: {theirs}, expected an array {ours}")
 

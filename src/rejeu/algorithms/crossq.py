@@ -65,7 +65,7 @@ class Config(EntropyConfig):
 
     name: ClassVar[str] = "CrossQ"
     search_space: ClassVar[SearchSpace] = {
-        **{name: one for name, one in search.OFF_POLICY.items() if name != "tau"},
+        **{name: distribution for name, distribution in search.OFF_POLICY.items() if name != "tau"},
         "policy_delay": Integers(1, 4),
     }
     hidden_layers: ClassVar[Widths] = Widths(ACTOR_LAYERS, CRITIC_LAYERS)
@@ -148,8 +148,8 @@ def make_with(
         return next_action, equations.target(target_critics, batch, next_action, alpha * next_log_prob)
 
     def policy_loss(actor: Any, critics: Any, alpha: Array, batch: Transition, key: Array) -> tuple[Array, Any]:
-        seen = equations.seen(batch)
-        return actor_loss(actor, critics, alpha, batch.obs, key, seen, distribution, equations.values)
+        obs = equations.seen(batch)
+        return actor_loss(actor, critics, alpha, batch.obs, key, obs, distribution, equations.values)
 
     def step(*arguments: Any) -> tuple[Any, PyTree, Array, Any]:
         network, optimizer_state, loss, (extra, trained) = minimize(*arguments)
@@ -177,7 +177,7 @@ def make_with(
 
 def check_shape(shape: PolicyConfig, name: str) -> None:
     """Raises ``ValueError`` for network shapes other than widths: the algorithm ``name`` has normalized layers of its own."""
-    given = {
+    settings = {
         "layer_norm": shape.layer_norm,
         "cnn_layer_norm": shape.cnn_layer_norm,
         "cnn_features": shape.cnn_features is not None,
@@ -188,7 +188,7 @@ def check_shape(shape: PolicyConfig, name: str) -> None:
         "torso": shape.torso is not None,
         "branches": shape.has_branches,
     }
-    if refused := [key for key, present in given.items() if present]:
+    if refused := [key for key, present in settings.items() if present]:
         raise ValueError(
             f"{name} normalizes layers of its own; its policy_kwargs take net_arch and activation_fn, not "
             f"{', '.join(refused)}: leave that out, or use SAC or TQC"

@@ -338,8 +338,12 @@ def value_network(
     key: Array, leaves: tuple[Leaf, ...], shape: PolicyConfig, n_actions: int, dueling: bool, n: int | None = None
 ) -> Any:
     """Returns a network from observations to values ``(batch, n_actions)``, or ``(batch, n_actions, n)`` for a number n."""
-    kind, widths, n_outputs = Dueling if dueling else Network, shape.critic_widths(HIDDEN_LAYERS), n_actions * (n or 1)
-    outputs = kind(key, leaves, n_outputs, widths, shape, **({"n_streams": n} if dueling and n else {}))
+    network_class, widths, n_outputs = (
+        Dueling if dueling else Network,
+        shape.critic_widths(HIDDEN_LAYERS),
+        n_actions * (n or 1),
+    )
+    outputs = network_class(key, leaves, n_outputs, widths, shape, **({"n_streams": n} if dueling and n else {}))
     return outputs if n is None else DistributionalNetwork(outputs, n)
 
 
@@ -380,13 +384,13 @@ class Dueling(eqx.Module):
     ) -> None:
         """Builds the streams of ``n_outputs``, those of the actions one after another, with ``n_streams`` for each."""
         keys = jax.random.split(key, 6)
-        shared, own = parted(widths, shape)
-        stream = lambda k, n_inputs: MLP(k, n_inputs, own, shape.activation_fn, shape.layer_norm)  # noqa: E731
+        shared, stream_widths = parted(widths, shape)
+        stream = lambda k, n_inputs: MLP(k, n_inputs, stream_widths, shape.activation_fn, shape.layer_norm)  # noqa: E731
         self.encoder = make_encoder(keys[0], leaves, shape)
         self.torso, n_shared = make_torso(keys[1], self.encoder.n_features, None, shared, shape)
         self.value = stream(keys[2], n_shared)
         self.advantage = stream(keys[3], n_shared)
-        n_hidden = (n_shared, *own)[-1]
+        n_hidden = (n_shared, *stream_widths)[-1]
         self.value_head = make_head(keys[4], n_hidden, n_streams, shape)
         self.advantage_head = make_head(keys[5], n_hidden, n_outputs, shape)
 
@@ -469,13 +473,15 @@ def td_target(
     values, mask = returns.values(chooser, batch.next_obs, key), unmasked(some_allowed(batch.next_obs))[1]
     following = returns.describe(target_network, batch.next_obs, keys[1])
     if returns.munchausen is not None:
-        own = returns.values(chooser, batch.obs, key)
-        return returns.target(*munchausen_target(returns.munchausen, batch, own, forbid(values, mask), following))
+        current_values = returns.values(chooser, batch.obs, key)
+        return returns.target(
+            *munchausen_target(returns.munchausen, batch, current_values, forbid(values, mask), following)
+        )
     return returns.target(batch.reward, batch.discount, taken(following, greedy(values, mask)))
 
 
 def munchausen_target(
-    settings: Munchausen, batch: Transition, own: Array, values: Array, following: Array
+    settings: Munchausen, batch: Transition, current_values: Array, values: Array, following: Array
 ) -> tuple[Array, Array, Array]:
     """Returns the reward, the discount and what follows, of Munchausen Q-learning (arXiv 2007.14430, equation 3 and M-IQN).
 
@@ -490,7 +496,7 @@ def munchausen_target(
     Args:
         settings: ``alpha``, the temperature ``tau`` and ``clip``.
         batch: of transitions.
-        own: values of all actions in ``obs`` by which the policy chooses, ``(batch, n_actions)``.
+        current_values: values of all actions in ``obs`` by which the policy chooses, ``(batch, n_actions)``.
         values: those in ``next_obs``, likewise.
         following: ``(batch, n_actions, ...)``.
     """
@@ -498,8 +504,8 @@ def munchausen_target(
     log_policy = jax.nn.log_softmax(values / tau, axis=-1)
     policy = jnp.exp(log_policy)
     entropy = -tau * jnp.sum(policy * log_policy, axis=-1)
-    own = jax.nn.log_softmax(forbid(own, unmasked(batch.obs)[1]) / tau, axis=-1)
-    bonus = settings.alpha * jnp.clip(tau * taken(own, batch.action), settings.clip, 0.0)
+    log_current_policy = jax.nn.log_softmax(forbid(current_values, unmasked(batch.obs)[1]) / tau, axis=-1)
+    bonus = settings.alpha * jnp.clip(tau * taken(log_current_policy, batch.action), settings.clip, 0.0)
     mean = jnp.einsum("ba,ba...->b...", policy, following)
     return batch.reward + bonus + batch.discount * entropy, batch.discount, mean
 
@@ -515,8 +521,8 @@ def td_loss(
 
     For ``returns`` a function of the TD error, such as ``jnp.square``, stands for :func:`expected` of it.
     """
-    known = returns if isinstance(returns, Returns) else expected(returns)
-    loss, td_error, value = known.loss(network, batch.obs, batch.action, target, key)
+    description = returns if isinstance(returns, Returns) else expected(returns)
+    loss, td_error, value = description.loss(network, batch.obs, batch.action, target, key)
     return weighted_mean(loss, batch.weight), (td_error, value)
 
 
@@ -563,8 +569,8 @@ def check_epsilon(config: Any) -> None:
 
 def epsilon_schedule(config: Any) -> Schedule:
     """Returns the probability of a random action that these settings describe, as a function of the progress."""
-    kind = {"linear": Linear, "exponential": Exponential}[config.exploration_schedule]
-    return kind(config.exploration_initial_eps, config.exploration_final_eps, config.exploration_fraction)
+    schedule_class = {"linear": Linear, "exponential": Exponential}[config.exploration_schedule]
+    return schedule_class(config.exploration_initial_eps, config.exploration_final_eps, config.exploration_fraction)
 
 
 def moves_due(last_step: Array, step: Any, interval: Any) -> Array:

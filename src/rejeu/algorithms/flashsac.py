@@ -153,9 +153,9 @@ def td_target(
     """
     _, logits, _ = joint_outputs(target_critics, batch, next_action)
     least = jnp.argmin(mean_of(logits, atoms), axis=0)
-    chosen = jnp.take_along_axis(logits, least[None, :, None], axis=0)[0]
+    least_logits = jnp.take_along_axis(logits, least[None, :, None], axis=0)[0]
     following = batch.reward[:, None] + batch.discount[:, None] * (atoms[None] - next_entropy_cost[:, None])
-    return project(following, jax.nn.softmax(chosen), atoms)
+    return project(following, jax.nn.softmax(least_logits), atoms)
 
 
 def critics_loss(critics: Any, batch: Transition, next_action: Array, target: Array) -> tuple[Array, tuple[Array, Any]]:

@@ -97,13 +97,13 @@ class ImplicitNetwork(eqx.Module):
         self, key: Array, leaves: tuple[Leaf, ...], shape: PolicyConfig, n_actions: int, dueling: bool, n_cosines: int
     ) -> None:
         keys = jax.random.split(key, 4)
-        shared, own = parted(shape.critic_widths(HIDDEN_LAYERS), shape)
+        shared, reader_widths = parted(shape.critic_widths(HIDDEN_LAYERS), shape)
         self.encoder = make_encoder(keys[0], leaves, shape)
         self.torso, n_shared = make_torso(keys[1], self.encoder.n_features, None, shared, shape)
         self.embedding = Linear(keys[2], n_cosines, n_shared)
         plain = PolicyConfig(activation_fn=shape.activation_fn, layer_norm=shape.layer_norm, head=shape.head)
         features = (Leaf("", "continuous", (n_shared,), "float32"),)
-        self.reader = (Dueling if dueling else Network)(keys[3], features, n_actions, own, plain)
+        self.reader = (Dueling if dueling else Network)(keys[3], features, n_actions, reader_widths, plain)
 
     def __call__(self, obs: PyTree, fractions: Array) -> Array:
         """Maps observations ``(batch, ...)`` and fractions to quantiles ``(batch, n_actions, n)``.

@@ -81,9 +81,9 @@ def parse(key: str, value: Any) -> Any:
         return value
     if isinstance(value, Mapping) and isinstance(value.get("name"), str):
         settings = tuple((name, setting) for name, setting in value.items() if name != "name")
-        named = Named(parse(key, value["name"]), settings)
-        named.make()  # raises for a setting that it does not have
-        return named
+        optimizer = Named(parse(key, value["name"]), settings)
+        optimizer.make()  # raises for a setting that it does not have
+        return optimizer
     if isinstance(value, str):
         if value.lower() not in OPTIMIZERS:
             raise ValueError(
@@ -110,8 +110,8 @@ def make(optimizer: Any, max_norm: float | None = None, max_value: float | None 
         max_value: largest absolute value of each component, applied before. None: no limit.
         adam: the algorithm's settings of Adam (``b1``, ``eps``); an optimizer of your own has its own.
     """
-    made = _unlimited(optimizer, **adam)
-    return made if max_norm is None and max_value is None else Clipped(made, max_value, max_norm)
+    transformation = _unlimited(optimizer, **adam)
+    return transformation if max_norm is None and max_value is None else Clipped(transformation, max_value, max_norm)
 
 
 def _unlimited(optimizer: Any, **adam: float) -> optax.GradientTransformation:
@@ -119,8 +119,8 @@ def _unlimited(optimizer: Any, **adam: float) -> optax.GradientTransformation:
         return optimizer.make(**adam)
     if isinstance(optimizer, str):
         return Elementwise(*OPTIMIZERS[optimizer](**adam))
-    given = optimizer if isinstance(optimizer, optax.GradientTransformation) else optimizer(1.0)
-    return optax.chain(given, optax.scale(-1.0))  # Optax adds updates; the direction is subtracted
+    transformation = optimizer if isinstance(optimizer, optax.GradientTransformation) else optimizer(1.0)
+    return optax.chain(transformation, optax.scale(-1.0))  # Optax adds updates; the direction is subtracted
 
 
 def name(optimizer: Any) -> str:

@@ -120,11 +120,13 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     Raises:
         ValueError: if no policy can act in the action space, or if the settings do not fit the observation space.
     """
-    obs_leaves, kind, shape = checked(config, observation_space, action_space)
+    obs_leaves, action_kind, shape = checked(config, observation_space, action_space)
     optimizer = optimizers.make(config.optimizer, eps=ADAM_EPSILON)
 
     def init(key: Array) -> State:
-        return initial_state(key, lambda key: ActorCritic(key, obs_leaves, kind, shape, config.use_sde), optimizer)
+        return initial_state(
+            key, lambda key: ActorCritic(key, obs_leaves, action_kind, shape, config.use_sde), optimizer
+        )
 
     def update(state: State, rollout: Rollout, clock: Clock) -> tuple[State, Metrics]:
         data = samples(state.network, rollout, config.gae_lambda)
@@ -136,7 +138,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         state = state.after(network, optimizer_state, n_steps)
         return state, metrics_of(network, n_steps, losses, data.value, data.target, data.valid, config, clock)
 
-    return algorithm_of(config, kind, init, update)
+    return algorithm_of(config, action_kind, init, update)
 
 
 def metrics_of(

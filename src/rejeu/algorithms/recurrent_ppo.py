@@ -212,11 +212,11 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     Raises:
         ValueError: if no policy can act in the action space.
     """
-    obs_leaves, kind, shape = checked(config, observation_space, action_space)
+    obs_leaves, action_kind, shape = checked(config, observation_space, action_space)
     optimizer = optimizers.make(config.optimizer, eps=ADAM_EPSILON)
 
     def init(key: Array) -> State:
-        return initial_state(key, lambda key: RecurrentActorCritic(key, obs_leaves, kind, shape), optimizer)
+        return initial_state(key, lambda key: RecurrentActorCritic(key, obs_leaves, action_kind, shape), optimizer)
 
     def act(
         memory: Memory, actor: RecurrentActorCritic, obs: PyTree, ended: Array, key: Array, clock: Clock
@@ -247,9 +247,9 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
             first = (i % n_batches) * size
             index = jax.lax.dynamic_slice(orders, (i // n_batches, first), (1, size))[0]
             exists = first + jnp.arange(size) < n_envs
-            chosen = jax.tree.map(lambda x: x[:, index], data)
+            sequences = jax.tree.map(lambda x: x[:, index], data)
             memory = jax.tree.map(lambda x: x[index], rollout.carry)
-            return chosen._replace(valid=chosen.valid & exists[None]), started[:, index], memory
+            return sequences._replace(valid=sequences.valid & exists[None]), started[:, index], memory
 
         network, optimizer_state, n_taken, losses = epochs(
             loss,

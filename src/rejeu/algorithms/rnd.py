@@ -81,14 +81,14 @@ def with_rnd(algorithm: Algorithm, obs_leaves: tuple[Leaf, ...], config: RndConf
             next_obs, valid = flat(next_obs), batch.valid.reshape(-1)
         weight = valid.astype(jnp.float32)
         moments = normalizer.with_obs(state.moments, next_obs, weight)
-        seen = Seen(normalizer.obs(moments, next_obs), valid)
-        error = errors(state.predictor, state.target, seen.obs)
+        observed = Seen(normalizer.obs(moments, next_obs), valid)
+        error = errors(state.predictor, state.target, observed.obs)
         moments = moments._replace(returns=merged(moments.returns, error, weight))
         bonus = config.coefficient * normalizer.reward(moments, error)
         reward = batch.reward + jnp.where(valid, bonus, 0.0).reshape(batch.reward.shape)
         learner, metrics = algorithm.update(state.learner, batch._replace(reward=reward), clock)
         order_key = nth(state.key, state.n_updates)
-        predictor, optimizer = trained(state.predictor, state.target, state.optimizer, seen, order_key, config)
+        predictor, optimizer = trained(state.predictor, state.target, state.optimizer, observed, order_key, config)
         state = State(learner, predictor, state.target, optimizer, moments, state.key, state.n_updates + 1)
         mean = {"rnd_bonus": masked_mean(bonus, valid), "rnd_loss": masked_mean(error, valid)}
         return state, {**metrics, **mean}
@@ -100,7 +100,9 @@ def with_rnd(algorithm: Algorithm, obs_leaves: tuple[Leaf, ...], config: RndConf
         update=update,
         action_values=action_values and (lambda state, obs, action: action_values(state.learner, obs, action)),
         observe=observe
-        and (lambda state, *seen: eqx.tree_at(lambda s: s.learner, state, observe(state.learner, *seen))),
+        and (
+            lambda state, *observations: eqx.tree_at(lambda s: s.learner, state, observe(state.learner, *observations))
+        ),
     )
 
 
@@ -109,16 +111,16 @@ def errors(predictor: Network, target: Network, obs: PyTree) -> Array:
     return jnp.mean(jnp.square(predictor(obs) - jax.lax.stop_gradient(target(obs))), axis=-1)
 
 
-def loss(predictor: Network, target: Network, seen: Seen) -> tuple[Array, None]:
+def loss(predictor: Network, target: Network, observed: Seen) -> tuple[Array, None]:
     """Returns the mean error of a minibatch."""
-    return masked_mean(errors(predictor, target, seen.obs), seen.valid), None
+    return masked_mean(errors(predictor, target, observed.obs), observed.valid), None
 
 
 def trained(
-    predictor: Network, target: Network, optimizer_state: PyTree, seen: Seen, key: Array, config: RndConfig
+    predictor: Network, target: Network, optimizer_state: PyTree, observed: Seen, key: Array, config: RndConfig
 ) -> tuple[Network, PyTree]:
     """Returns predictor and optimizer state after a gradient step on each minibatch."""
-    minibatch, n = minibatches(seen, key, 1, config.batch_size)
+    minibatch, n = minibatches(observed, key, 1, config.batch_size)
 
     def step(i: Array, learned: tuple[Network, PyTree]) -> tuple[Network, PyTree]:
         return minimize(loss, *learned, OPTIMIZER, config.learning_rate, target, minibatch(i))[:2]

@@ -92,7 +92,7 @@ class Choice:
     values: tuple[Any, ...]
 
     def __post_init__(self) -> None:
-        if len({plain(one) for one in self.values}) < max(len(self.values), 2):
+        if len({plain(value) for value in self.values}) < max(len(self.values), 2):
             raise ValueError(f"a choice needs two or more different values, got {list(self.values)}")
 
     def contains(self, value: Any) -> bool:
@@ -108,7 +108,7 @@ class Choice:
         return self.values
 
     def __str__(self) -> str:
-        return ", ".join(json.dumps(one) for one in self.values)
+        return ", ".join(json.dumps(value) for value in self.values)
 
 
 Dimension = Range | Choice

@@ -74,8 +74,8 @@ class EntropyConfig(OffPolicyConfig):
         initial_temperature(self.ent_coef)
         coerce(self, "target_entropy", entropy_target)
         coerce(self, "noise_repeat", whole, least=1)
-        for key, given in (("action_noise", self.action_noise is not None), ("lstm_hidden_size", self.has_memory)):
-            if self.noise_repeat > 1 and given:
+        for key, is_set in (("action_noise", self.action_noise is not None), ("lstm_hidden_size", self.has_memory)):
+            if self.noise_repeat > 1 and is_set:
                 raise ValueError(f"noise_repeat={self.noise_repeat} is not available with {key}; leave one of them out")
         coerce(self, ("n_critics", "policy_delay"), whole, least=1)
 
@@ -280,9 +280,9 @@ def initial_temperature(ent_coef: float | str) -> float:
         ValueError: for anything else.
     """
     if isinstance(ent_coef, str):
-        rest = ent_coef.removeprefix("auto").removeprefix("_")
+        initial_value = ent_coef.removeprefix("auto").removeprefix("_")
         try:
-            value = float(rest) if rest else 1.0
+            value = float(initial_value) if initial_value else 1.0
         except ValueError:
             value = -1.0
         if ent_coef.startswith("auto") and 0 < value < math.inf:

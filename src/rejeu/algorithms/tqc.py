@@ -96,8 +96,8 @@ def td_target(
 ) -> Array:
     """Returns samples of the return that the critics should predict, ``(batch, n_kept)``."""
     next_action, next_log_prob = policy(actor, batch.next_obs).sample_and_log_prob(key)
-    kept = truncate(action_quantiles(target_critics, batch.next_obs, next_action), n_kept)
-    return batch.reward[:, None] + batch.discount[:, None] * (kept - (alpha * next_log_prob)[:, None])
+    smallest_quantiles = truncate(action_quantiles(target_critics, batch.next_obs, next_action), n_kept)
+    return batch.reward[:, None] + batch.discount[:, None] * (smallest_quantiles - (alpha * next_log_prob)[:, None])
 
 
 def critics_loss(critics: QNetwork, batch: Transition, target: Array) -> tuple[Array, Array]:

@@ -130,16 +130,18 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     Raises:
         ValueError: if no policy can act in the action space, or if the settings do not fit the observation space.
     """
-    obs_leaves, kind, shape = checked(config, observation_space, action_space)
+    obs_leaves, action_kind, shape = checked(config, observation_space, action_space)
     optimizer = optimizers.make(config.optimizer, config.max_grad_norm)
 
     def init(key: Array) -> State:
-        return initial_state(key, lambda key: ActorCritic(key, obs_leaves, kind, shape, config.use_sde), optimizer)
+        return initial_state(
+            key, lambda key: ActorCritic(key, obs_leaves, action_kind, shape, config.use_sde), optimizer
+        )
 
     def update(state: State, rollout: Rollout, clock: Clock) -> tuple[State, Metrics]:
         warn_of_unused(config.sub_sampling_factor, rollout.reward.shape[1])
         data = samples(state.network, rollout, config.gae_lambda)
-        network, taken = policy_step(state.network, data, config)
+        network, trust_region_step = policy_step(state.network, data, config)
         order_key = nth(state.key, state.n_rollouts)
         minibatch, n_steps = minibatches(data, order_key, config.n_critic_updates, config.batch_size)
         rate = at(config.learning_rate, clock.progress)
@@ -155,9 +157,9 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
             0, n_steps, fit, (network, state.optimizer, jnp.float32(0.0))
         )
         metrics = {
-            "policy_objective": taken.objective,
-            "kl_divergence_loss": taken.kl,
-            "is_line_search_success": taken.accepted,
+            "policy_objective": trust_region_step.objective,
+            "kl_divergence_loss": trust_region_step.kl,
+            "is_line_search_success": trust_region_step.accepted,
             "value_loss": total / jnp.maximum(n_steps, 1),
             GRADIENT_STEPS: (1 + n_steps).astype(jnp.float32),
             EXPLAINED_VARIANCE: explained_variance(data.value, data.target, data.valid),
@@ -166,7 +168,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         }
         return state.after(network, optimizer_state, 1 + n_steps), metrics
 
-    return algorithm_of(config, kind, init, update)
+    return algorithm_of(config, action_kind, init, update)
 
 
 def warn_of_unused(factor: int, n_envs: int) -> None:
@@ -233,9 +235,9 @@ def damped_product(function: Callable[[Any], Array], at_point: Any, damping: flo
     return product
 
 
-def dot(left: Any, right: Any) -> Array:
+def dot(first: Any, right: Any) -> Array:
     """Returns the sum of the products of all numbers of two trees, ``float32[]``."""
-    return jnp.sum(jnp.stack(jax.tree.leaves(jax.tree.map(lambda a, b: jnp.sum(a * b), left, right))))
+    return jnp.sum(jnp.stack(jax.tree.leaves(jax.tree.map(lambda a, b: jnp.sum(a * b), first, right))))
 
 
 def value_loss(network: ActorCritic, batch: Samples) -> tuple[Array, None]:

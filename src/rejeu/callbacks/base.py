@@ -75,8 +75,8 @@ def crossed(before: int, now: int, every: int) -> bool:
 
 def step_before(agent: Any, progress: Progress, n_steps: int | None = None) -> int:
     """Returns the total environment steps before the first turn of a ``learn`` of ``n_steps`` (None: of more than a turn)."""
-    taken = agent.n_envs if n_steps is None else min(agent.n_envs, n_steps)
-    return max(progress.step - taken, 0)
+    n_taken = agent.n_envs if n_steps is None else min(agent.n_envs, n_steps)
+    return max(progress.step - n_taken, 0)
 
 
 def listed(callback: Callback | Iterable[Callback] | None) -> list[Callback]:
@@ -91,7 +91,7 @@ def in_order(callbacks: Iterable[Callback]) -> list[Callback]:
 
 def stateful(callbacks: Iterable[Any]) -> list[Stateful]:
     """Returns the callbacks whose state a checkpoint contains."""
-    return [one for one in callbacks if isinstance(one, Stateful)]
+    return [callback for callback in callbacks if isinstance(callback, Stateful)]
 
 
 def called(callback: Callback, agent: Any, turn: Progress) -> bool | None:
@@ -124,8 +124,8 @@ def listening(agent: Any, callbacks: Sequence[Callback]) -> Iterator[None]:
                 restore_one(callback, saved)
         agent.saved_callbacks = None
         if saved is not None:
-            for one in started:
-                one.resumed(agent)
+            for training_callback in started:
+                training_callback.resumed(agent)
         if saved:
             names = shown(", ".join(name for name, _ in saved))
             warnings.warn(f"the run was saved with {names}, which learn was not given now", UserWarning, stacklevel=6)
@@ -135,8 +135,8 @@ def listening(agent: Any, callbacks: Sequence[Callback]) -> Iterator[None]:
         raise
     finally:
         with ExitStack() as ends:
-            for one in reversed(started):
-                ends.callback(one.after_training, agent, error)
+            for training_callback in reversed(started):
+                ends.callback(training_callback.after_training, agent, error)
 
 
 def restore(agent: Any, callbacks: Sequence[Callback]) -> None:

@@ -51,8 +51,8 @@ class Checkpoint(TrainingCallback):
             raise TypeError(f"folder={folder!r} must be a path: Checkpoint(folder, every={folder})")
         self.folder = Path(folder)
         self.every = None if every is None else whole("every", every, least=1)
-        given = None if minutes is None else number("minutes", minutes, above=0)
-        self.minutes = MINUTES if given is None and every is None else given
+        checked_minutes = None if minutes is None else number("minutes", minutes, above=0)
+        self.minutes = MINUTES if checked_minutes is None and every is None else checked_minutes
         self.keep = whole("keep", keep, least=1)
         self.seconds = 0.0
         """Wall time spent saving."""
@@ -117,8 +117,8 @@ class Checkpoint(TrainingCallback):
 
     def _attempt(self, agent: Any, reason: str = "") -> None:
         """Saves; if that fails, warns and tries again after a minute."""
-        what = f"checkpoints in {self.folder}"
-        written = agent.failed_writes.attempt(what, lambda: self.save(agent, reason), retry=False)
+        description = f"checkpoints in {self.folder}"
+        written = agent.failed_writes.attempt(description, lambda: self.save(agent, reason), retry=False)
         self._retry_at = math.inf
         if not written:
             self._last_time = time.monotonic()

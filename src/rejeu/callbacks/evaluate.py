@@ -119,11 +119,11 @@ class Evaluate(TrainingCallback):
     def state_dict(self) -> dict[str, Any]:
         """Returns its results for a checkpoint."""
         parts = [r.evaluation for r in self.results]
-        columns = {key: [getattr(part, key) for part in parts] for key in EVALUATED}
+        columns = {key: [getattr(evaluated, key) for evaluated in parts] for key in EVALUATED}
         return {
             "steps": np.array([r.step for r in self.results], np.int64),
-            "counts": np.array([len(part.returns) for part in parts], np.int64),
-            "cut": np.array([part.cut for part in parts], np.int64),
+            "counts": np.array([len(evaluated.returns) for evaluated in parts], np.int64),
+            "cut": np.array([evaluated.cut for evaluated in parts], np.int64),
             **{key: np.concatenate([np.zeros(0), *arrays]) for key, arrays in columns.items()},
             "best": None if self.best is None else self.results.index(self.best),
             "due": self._is_due,

@@ -53,7 +53,7 @@ class ProgressBar(TrainingCallback):
         n_steps: int | None,
         seconds: float | None,
         console: Console | None = None,
-        taken: int = 0,
+        steps_before: int = 0,
         spent: float = 0.0,
     ) -> None:
         """Starts the clock; the bar appears with the first step.
@@ -62,7 +62,7 @@ class ProgressBar(TrainingCallback):
             n_steps: environment steps to take; None without such a limit.
             seconds: time to take, without compilation; None without such a limit.
             console: where to write; None: standard output.
-            taken: steps of a resumed run that were taken before.
+            steps_before: steps of a resumed run that were taken before.
             spent: time that it had taken before, in seconds.
         """
         from rich.live import Live
@@ -77,7 +77,7 @@ class ProgressBar(TrainingCallback):
         )
         self._began = xla.clock()
         self._refresh_at = -math.inf
-        self._taken, self._spent = taken, spent
+        self._taken, self._spent = steps_before, spent
         self._first_step = 0
         self._step_before: int | None = None
         self._latest: tuple[Any, int] | None = None
@@ -85,9 +85,9 @@ class ProgressBar(TrainingCallback):
         self._marks: deque[_Mark] = deque()
 
     @classmethod
-    def of(cls, call: TrainingCall, taken: int = 0) -> Self:
-        """Returns the bar of a call of ``learn``, of which ``taken`` steps were taken before it was resumed."""
-        return cls(call.n_steps, call.seconds, taken=taken, spent=call.spent)
+    def of(cls, call: TrainingCall, steps_before: int = 0) -> Self:
+        """Returns the bar of a call of ``learn``, of which ``steps_before`` steps were taken before it was resumed."""
+        return cls(call.n_steps, call.seconds, steps_before=steps_before, spent=call.spent)
 
     def before_training(self, agent: Any) -> None:
         """Notes the step at which training begins, since the bar is first called after a turn, or after many at once."""
@@ -149,18 +149,18 @@ class ProgressBar(TrainingCallback):
             self._marks.popleft()
         then, done = self._marks[0], step - self._first_step
         rate = (step - then.step) / max(now - then.time, 1e-9)
-        shares, left = [], []
+        shares, seconds_left = [], []
         if self.n_steps is not None:
             shares.append(done / self.n_steps)
-            left.append((self.n_steps - done) / max(rate, 1e-9))
+            seconds_left.append((self.n_steps - done) / max(rate, 1e-9))
         if self.seconds is not None:
             spent_seconds = self._spent + now - self._began
             shares.append(spent_seconds / self.seconds)
-            left.append(max(self.seconds - spent_seconds, 0.0))
+            seconds_left.append(max(self.seconds - spent_seconds, 0.0))
         share = min(max(shares, default=0.0), 1.0)
         text = status(
             done, self.n_steps, rate, _mean(e["r"] for e in agent.ep_info_buffer), _mean(agent.ep_success_buffer),
-            min(left, default=math.nan),
+            min(seconds_left, default=math.nan),
         )  # fmt: skip
         self._show(*filter(None, (text, time_spent(then.seconds, agent.seconds))), share=share)
 
@@ -202,10 +202,10 @@ def time_spent(before: Mapping[str, float], now: Mapping[str, float]) -> str:
     ... )
     'env 12% · replay 9% · update 70% · rest 9%'
     """
-    passed = {part: now[part] - before[part] for part in now}
+    passed = {activity: now[activity] - before[activity] for activity in now}
     if passed["total"] <= 0.0:
         return ""
-    return " · ".join(f"{part} {max(share, 0.0):.0%}" for part, share in time_shares(passed).items())
+    return " · ".join(f"{activity} {max(share, 0.0):.0%}" for activity, share in time_shares(passed).items())
 
 
 def duration(seconds: float) -> str:
@@ -214,9 +214,9 @@ def duration(seconds: float) -> str:
     >>> duration(59.6), duration(3725)
     ('1:00', '1:02:05')
     """
-    minutes, rest = divmod(round(seconds), 60)
+    minutes, full_seconds = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
+    return f"{hours}:{minutes:02}:{full_seconds:02}" if hours else f"{minutes}:{full_seconds:02}"
 
 
 def _mean(values: Iterable[float]) -> float:

@@ -57,17 +57,17 @@ def plain(algorithm: Algorithm) -> Explorer:
 
 def with_action_noise(algorithm: Algorithm, noise: NoiseProcess) -> Explorer:
     """Returns exploration by ``noise`` on actions in [-1, 1]; the carry is the noise's state, with memory :class:`Noisy`."""
-    own, has_memory = plain(algorithm), algorithm.recall is not None
+    explorer, has_memory = plain(algorithm), algorithm.recall is not None
 
     def init(actor: PyTree, n_envs: int) -> PyTree:
         state = jax.tree.map(jnp.asarray, noise.init(n_envs))
-        return Noisy(own.init(actor, n_envs), state) if has_memory else state
+        return Noisy(explorer.init(actor, n_envs), state) if has_memory else state
 
     def act(carry: PyTree, actor: PyTree, obs: PyTree, ended: Array, key: Array, clock: Clock) -> tuple[Array, PyTree]:
         action_key, noise_key = jax.random.split(key)
         memory, state = carry if has_memory else ((), carry)
         state = renew(ended, noise.init(ended.shape[0]), state)
-        action, memory = own.act(memory, actor, obs, ended, action_key, clock)
+        action, memory = explorer.act(memory, actor, obs, ended, action_key, clock)
         state, action = noise.perturb(state, action, noise_key)
         return jnp.clip(action, -1.0, 1.0), Noisy(memory, state) if has_memory else state
 

@@ -3,7 +3,7 @@
 Source: FlashSAC (:mod:`rejeu.algorithms.flashsac`), after the repeated actions of Dabney et al. 2021, "Temporally-Extended
 epsilon-Greedy Exploration" (arXiv 2006.01782). An action is ``tanh(mean(s) + std(s) e)``, where ``e ~ N(0, 1)`` is drawn anew
 after ``n`` steps and where an episode begins. Each ``n`` is drawn with a probability proportional to ``n^-2``, from 1 to
-``most``.
+``max_steps``.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ class Held(NamedTuple):
     """Steps for which it stays, ``int32 (n_envs,)``."""
 
 
-def held_explorer(policy: Callable[[Any, PyTree], TanhNormal], action_dim: int, most: int) -> Explorer:
-    """Returns exploration by the policy with noise that is held for up to ``most`` steps."""
+def held_explorer(policy: Callable[[Any, PyTree], TanhNormal], action_dim: int, max_steps: int) -> Explorer:
+    """Returns exploration by the policy with noise that is held for up to ``max_steps`` steps."""
 
     def init(actor: Any, n_envs: int) -> Held:
         return Held(jnp.zeros((n_envs, action_dim), jnp.float32), jnp.zeros((n_envs,), jnp.int32))
@@ -42,14 +42,14 @@ def held_explorer(policy: Callable[[Any, PyTree], TanhNormal], action_dim: int, 
         due = ended | (carry.left <= 0)
         fresh = jax.random.normal(noise_key, carry.noise.shape, carry.noise.dtype)
         noise = jnp.where(due[:, None], fresh, carry.noise)
-        left = jnp.where(due, spells(spell_key, due.shape[0], most), carry.left)
+        steps_left = jnp.where(due, spells(spell_key, due.shape[0], max_steps), carry.left)
         mean, log_std = policy(actor, obs)
-        return jnp.tanh(mean + jnp.exp(log_std) * noise), Held(noise, left - 1)
+        return jnp.tanh(mean + jnp.exp(log_std) * noise), Held(noise, steps_left - 1)
 
     return Explorer(init, act)
 
 
-def spells(key: Array, n: int, most: int) -> Array:
-    """Returns ``n`` numbers of steps from 1 to ``most``, ``int32 (n,)``, with probabilities proportional to ``steps^-2``."""
-    weights = -EXPONENT * jnp.log(jnp.arange(1, most + 1, dtype=jnp.float32))
+def spells(key: Array, n: int, max_steps: int) -> Array:
+    """Returns ``n`` numbers of steps up to ``max_steps``, ``int32 (n,)``, with probabilities proportional to ``steps^-2``."""
+    weights = -EXPONENT * jnp.log(jnp.arange(1, max_steps + 1, dtype=jnp.float32))
     return 1 + jax.random.categorical(key, weights, shape=(n,)).astype(jnp.int32)

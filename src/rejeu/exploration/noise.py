@@ -154,9 +154,9 @@ class NormalActionNoise(ActionNoise):
         state, noisy = super().perturb(state, action, key)
         if self.random == 0:
             return state, noisy
-        which, what = jax.random.split(jax.random.fold_in(key, 1))
-        is_random = jax.random.bernoulli(which, self.random, action.shape[:1])
-        uniform = jax.random.uniform(what, action.shape, action.dtype, -1.0, 1.0)
+        choice_key, action_key = jax.random.split(jax.random.fold_in(key, 1))
+        is_random = jax.random.bernoulli(choice_key, self.random, action.shape[:1])
+        uniform = jax.random.uniform(action_key, action.shape, action.dtype, -1.0, 1.0)
         return state, jnp.where(is_random[:, None], uniform, noisy)
 
 
@@ -280,7 +280,7 @@ def parse(value: Any) -> Noise | str | None:
         return noise if isinstance(noise, ParameterNoise) else text
     raise TypeError(
         f"action_noise={value!r} must be None, a standard deviation such as 0.1, a string such as 'ou(0.2)', one of "
-        f"{', '.join(kind.__name__ for kind in NOISES.values())}, such as NormalActionNoise(mean=[0, 0], sigma=[0.1, 0.1]), "
+        f"{', '.join(noise.__name__ for noise in NOISES.values())}, such as NormalActionNoise(mean=[0, 0], sigma=[0.1, 0.1]), "
         "or an object with the methods init and perturb (see rejeu.exploration.noise.NoiseProcess)"
     )
 
@@ -295,26 +295,32 @@ def read(text: str, n: int) -> Noise:
     >>> read("ou(0.2, theta=0.3)", 2).theta
     0.3
     """
-    found = WRITTEN.fullmatch(text)
-    kinds = {**NOISES, "ou": OrnsteinUhlenbeckActionNoise}
-    if found is None or found[1] not in kinds:
-        raise TypeError(f"action_noise={text!r} must be one of {', '.join(f'{name}(0.1)' for name in kinds)}")
-    kind = kinds[found[1]]
-    first = "initial_sigma" if kind is ParameterNoise else "sigma"
-    given: dict[str, Any] = {}
-    known = [field.name for field in dataclasses.fields(kind) if field.name != "mean"]
-    for i, part in enumerate(filter(None, (part.strip() for part in found[2].split(",")))):
-        name, equals, value = part.partition("=")
+    match = WRITTEN.fullmatch(text)
+    noise_classes = {**NOISES, "ou": OrnsteinUhlenbeckActionNoise}
+    if match is None or match[1] not in noise_classes:
+        raise TypeError(f"action_noise={text!r} must be one of {', '.join(f'{name}(0.1)' for name in noise_classes)}")
+    noise_class = noise_classes[match[1]]
+    first = "initial_sigma" if noise_class is ParameterNoise else "sigma"
+    settings: dict[str, Any] = {}
+    setting_names = [field.name for field in dataclasses.fields(noise_class) if field.name != "mean"]
+    for i, assignment in enumerate(filter(None, (assignment.strip() for assignment in match[2].split(",")))):
+        name, equals, value = assignment.partition("=")
         name, value = (name.strip(), value) if equals else (first, name)
-        if name not in known or name in given or (not equals and i > 0):
-            raise TypeError(f"action_noise={text!r} takes no {part!r}; {found[1]} takes {', '.join(known)}, each once")
+        if name not in setting_names or name in settings or (not equals and i > 0):
+            raise TypeError(
+                f"action_noise={text!r} takes no {assignment!r}; {match[1]} takes {', '.join(setting_names)}, each once"
+            )
         try:
-            given[name] = float(value)
+            settings[name] = float(value)
         except ValueError:
             raise ValueError(f"action_noise={text!r}: {value.strip()!r} is not a number") from None
         if name == "adaptation_interval":
-            given[name] = int(given[name])
-    return kind(**given) if kind is ParameterNoise else kind(**{"mean": [0.0] * n, first: 0.1, **given})
+            settings[name] = int(settings[name])
+    return (
+        noise_class(**settings)
+        if noise_class is ParameterNoise
+        else noise_class(**{"mean": [0.0] * n, first: 0.1, **settings})
+    )
 
 
 def for_actions(noise: Noise | float | str | None, action_space: spaces.Space) -> Noise | None:
@@ -329,7 +335,7 @@ def for_actions(noise: Noise | float | str | None, action_space: spaces.Space) -
 
 def to_json(noise: Any) -> dict[str, Any]:
     """Returns the JSON form that :func:`parse` reads."""
-    name = next(key for key, kind in NOISES.items() if isinstance(noise, kind))
+    name = next(key for key, noise_class in NOISES.items() if isinstance(noise, noise_class))
     return {"noise": name, **{k: list(v) if isinstance(v, tuple) else v for k, v in asdict(noise).items()}}
 
 

@@ -85,9 +85,9 @@ class State(eqx.Module):
 
 def initial(noise: ParameterNoise, actor: PyTree, n_envs: int) -> State:
     """Returns the state before the first episodes; of ``actor`` only the shapes are used."""
-    leaves, which = jax.tree.leaves(actor), perturbed_leaves(actor)
+    leaves, perturbed = jax.tree.leaves(actor), perturbed_leaves(actor)
     return State(
-        perturbation=[jnp.zeros((n_envs, *leaves[i].shape), leaves[i].dtype) for i in which],
+        perturbation=[jnp.zeros((n_envs, *leaves[i].shape), leaves[i].dtype) for i in perturbed],
         sigma=jnp.float32(noise.initial_sigma),
         distance=jnp.zeros(n_envs, jnp.float32),
         count=jnp.full(n_envs, -1, jnp.int32),

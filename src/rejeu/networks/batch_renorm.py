@@ -181,8 +181,8 @@ class RenormalizedNetwork(eqx.Module):
 def with_statistics(network: Network, trained: Network) -> Network:
     """Returns ``network`` with the running statistics of ``trained``, a network of the same structure."""
 
-    def take(own: Any, other: Any) -> Any:
-        return eqx.tree_at(_statistics, own, _statistics(other)) if isinstance(own, BatchRenorm) else own
+    def take(node: Any, trained_node: Any) -> Any:
+        return eqx.tree_at(_statistics, node, _statistics(trained_node)) if isinstance(node, BatchRenorm) else node
 
     return jax.tree.map(take, network, trained, is_leaf=lambda node: isinstance(node, BatchRenorm))
 
@@ -193,17 +193,17 @@ def in_training(network: Network, use: Callable[[Network], Array]) -> tuple[Arra
     ``use`` must call each normalization once, and be traced with the call.
     """
     parts, structure = jax.tree.flatten(network, is_leaf=lambda node: isinstance(node, BatchRenorm))
-    seen = [*parts]
+    updated = [*parts]
 
     def recorded(i: int, norm: BatchRenorm) -> Callable[[Array], Array]:
         def normalized(x: Array) -> Array:
-            y, seen[i] = norm.train(x)
+            y, updated[i] = norm.train(x)
             return y
 
         return normalized
 
-    given = [recorded(i, part) if isinstance(part, BatchRenorm) else part for i, part in enumerate(parts)]
-    return use(jax.tree.unflatten(structure, given)), jax.tree.unflatten(structure, seen)
+    recorders = [recorded(i, module) if isinstance(module, BatchRenorm) else module for i, module in enumerate(parts)]
+    return use(jax.tree.unflatten(structure, recorders)), jax.tree.unflatten(structure, updated)
 
 
 def is_normalized(network: Any) -> bool:

@@ -85,17 +85,22 @@ class CNN(eqx.Module):
     """What pixels are divided by."""
 
     def __init__(
-        self, key: Array, shape: tuple[int, ...], kind: Convolutions, layer_norm: bool = False, scale: float = 255.0
+        self,
+        key: Array,
+        shape: tuple[int, ...],
+        design: Convolutions,
+        layer_norm: bool = False,
+        scale: float = 255.0,
     ) -> None:
-        *layer_keys, linear_key = jax.random.split(key, len(kind.layers) + 1)
+        *layer_keys, linear_key = jax.random.split(key, len(design.layers) + 1)
         height, width, channels = image_shape(shape)
         layers = []
-        for layer_key, (n_filters, kernel, stride) in zip(layer_keys, kind.layers, strict=True):
+        for layer_key, (n_filters, kernel, stride) in zip(layer_keys, design.layers, strict=True):
             layers.append(Convolution(layer_key, channels, n_filters, kernel, stride))
             height, width, channels = (height - kernel) // stride + 1, (width - kernel) // stride + 1, n_filters
         self.layers = tuple(layers)
-        self.linear = Linear(linear_key, height * width * channels, kind.n_outputs)
-        widths = (*(n_filters for n_filters, _, _ in kind.layers), kind.n_outputs)
+        self.linear = Linear(linear_key, height * width * channels, design.n_outputs)
+        widths = (*(n_filters for n_filters, _, _ in design.layers), design.n_outputs)
         self.norms = tuple(map(LayerNorm, widths)) if layer_norm else ()
         self.scale = scale
 
@@ -120,14 +125,14 @@ def in_chunks(function: Callable[[Array], Array], x: Array, size: int) -> Array:
 
     A gradient recomputes each chunk, so that intermediate values of only one chunk are kept.
     """
-    n_chunks, rest = divmod(x.shape[0], size)
-    if n_chunks == 0 or (n_chunks == 1 and rest == 0):
+    n_chunks, remainder = divmod(x.shape[0], size)
+    if n_chunks == 0 or (n_chunks == 1 and remainder == 0):
         return function(x)
     chunks = x[: n_chunks * size].reshape(n_chunks, size, *x.shape[1:])
     once = jax.checkpoint(lambda chunk: function(chunk), prevent_cse=False)  # checkpoint hashes the function
     parts = jax.lax.map(once, chunks)
     parts = parts.reshape(n_chunks * size, *parts.shape[2:])
-    return parts if rest == 0 else jnp.concatenate([parts, function(x[n_chunks * size :])])
+    return parts if remainder == 0 else jnp.concatenate([parts, function(x[n_chunks * size :])])
 
 
 class Encoder(eqx.Module):
@@ -147,20 +152,20 @@ class Encoder(eqx.Module):
         self.leaves, self.shape = leaves, PolicyConfig() if shape is None else shape
         images: list[CNN] = []
         for leaf in leaves:
-            if (kind := convolutions(leaf, self.shape)) is not None:
+            if (layers := convolutions(leaf, self.shape)) is not None:
                 if key is None:
                     raise TypeError("Encoder(leaves, key): the encoder of an image has weights and needs a key")
                 scale = 255.0 if self.shape.normalize_images else 1.0
                 image_key = jax.random.fold_in(key, len(images))
-                images.append(CNN(image_key, leaf.shape, kind, self.shape.cnn_layer_norm, scale))
+                images.append(CNN(image_key, leaf.shape, layers, self.shape.cnn_layer_norm, scale))
         self.images = tuple(images)
 
     @property
     def n_features(self) -> int:
         """Length of the feature vector."""
-        kinds = [convolutions(leaf, self.shape) for leaf in self.leaves]
-        pairs = zip(self.leaves, kinds, strict=True)
-        return sum(leaf.n_features if kind is None else kind.n_outputs for leaf, kind in pairs)
+        layers_of_leaves = [convolutions(leaf, self.shape) for leaf in self.leaves]
+        pairs = zip(self.leaves, layers_of_leaves, strict=True)
+        return sum(leaf.n_features if layers is None else layers.n_outputs for leaf, layers in pairs)
 
     def __call__(self, obs: PyTree) -> Array:
         """Maps observations ``(batch, ...)`` to features ``(batch, n_features)``."""
@@ -221,9 +226,9 @@ def convolutions(leaf: Leaf, shape: PolicyConfig | None = None) -> Convolutions 
     if (leaf.dtype != "uint8" and not is_scaled) or len(leaf.shape) not in (3, 4):
         return None
     side = min(image_shape(leaf.shape)[:2])
-    kind = NATURE if side >= 36 else SMALL if side >= 8 else None
+    layers = NATURE if side >= 36 else SMALL if side >= 8 else None
     width = None if shape is None else shape.cnn_features
-    return kind if kind is None or width is None else kind._replace(n_outputs=width)
+    return layers if layers is None or width is None else layers._replace(n_outputs=width)
 
 
 def image_shape(shape: tuple[int, ...]) -> tuple[int, int, int]:

@@ -132,8 +132,8 @@ class Dropout(eqx.Module):
         """Returns ``x`` of any shape, some of it dropped; unchanged without a key."""
         if self.key is None:
             return x
-        kept = jax.random.bernoulli(self.key, 1.0 - self.rate, x.shape)
-        return jnp.where(kept, x / (1.0 - self.rate), 0.0)
+        is_kept = jax.random.bernoulli(self.key, 1.0 - self.rate, x.shape)
+        return jnp.where(is_kept, x / (1.0 - self.rate), 0.0)
 
 
 def with_dropout(networks: Any, key: Array | None) -> Any:
@@ -142,9 +142,9 @@ def with_dropout(networks: Any, key: Array | None) -> Any:
         return networks
     n = jax.tree.leaves(networks)[-1].shape[0]
     is_dropout = lambda node: isinstance(node, Dropout)  # noqa: E731
-    given, tree = jax.tree.flatten(networks, is_leaf=is_dropout)
-    keys = [jax.random.split(jax.random.fold_in(key, i), n) for i in range(len(given))]
-    pairs = zip(given, keys, strict=True)
+    nodes, tree = jax.tree.flatten(networks, is_leaf=is_dropout)
+    keys = [jax.random.split(jax.random.fold_in(key, i), n) for i in range(len(nodes))]
+    pairs = zip(nodes, keys, strict=True)
     return jax.tree.unflatten(tree, [Dropout(k, node.rate) if is_dropout(node) else node for node, k in pairs])
 
 
@@ -253,10 +253,10 @@ def own_module(role: str, module: Any, example: PyTree) -> tuple[Any, int]:
         raise TypeError(f"{role} made {type(module).__name__}, expected an equinox.Module")
     for path, leaf in jax.tree_util.tree_leaves_with_path(module):
         if eqx.is_array_like(leaf) and not (isinstance(leaf, jax.Array) and leaf.dtype == jnp.float32):
-            kind = f"array of {leaf.dtype}" if hasattr(leaf, "dtype") else type(leaf).__name__
+            leaf_type = f"array of {leaf.dtype}" if hasattr(leaf, "dtype") else type(leaf).__name__
             where = jax.tree_util.keystr(path, simple=True, separator=".")
             raise TypeError(
-                f"{role} holds {where}, which is of type {kind} and cannot be learned; declare that field "
+                f"{role} holds {where}, which is of type {leaf_type} and cannot be learned; declare that field "
                 "eqx.field(static=True)"
             )
     size = 2 + sum(sum(leaf.shape) for leaf in jax.tree.leaves(example))  # no axis of the input has that length

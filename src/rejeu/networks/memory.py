@@ -65,9 +65,9 @@ class Cell(eqx.Module):
     """``(n_gates * size,)``."""
     kind: str = eqx.field(static=True)
 
-    def __init__(self, key: Array, n_inputs: int, size: int, kind: str) -> None:
+    def __init__(self, key: Array, n_inputs: int, size: int, cell_type: str) -> None:
         """Draws everything uniformly within ``1 / sqrt(size)`` of 0, PyTorch's default."""
-        width = (4 if kind == "lstm" else 3) * size
+        width = (4 if cell_type == "lstm" else 3) * size
         bound = 1.0 / math.sqrt(size)
         shapes = ((n_inputs, width), (size, width), (width,), (width,))
         drawn = [
@@ -75,7 +75,7 @@ class Cell(eqx.Module):
             for k, shape in zip(jax.random.split(key, 4), shapes, strict=True)
         ]
         self.inputs, self.recurrent, self.bias, self.recurrent_bias = drawn
-        self.kind = kind
+        self.kind = cell_type
 
     @property
     def size(self) -> int:
@@ -145,8 +145,8 @@ class Recurrent(eqx.Module):
 
     def part(self, memory: Array) -> tuple[Array, ...]:
         """Returns its part of the memory of all networks ``(n, n_numbers)``, ``(n, size)`` each."""
-        own = memory[:, self.slot * self.n_numbers : (self.slot + 1) * self.n_numbers]
-        return tuple(jnp.split(own, self.n_numbers // self.cell.size, axis=1))
+        columns = memory[:, self.slot * self.n_numbers : (self.slot + 1) * self.n_numbers]
+        return tuple(jnp.split(columns, self.n_numbers // self.cell.size, axis=1))
 
     def after(self, memory: Array, obs: PyTree) -> Array:
         """Returns its part of the memory after observations ``(n, ...)``, from the memory of all networks before them."""
@@ -167,9 +167,9 @@ class Recurrent(eqx.Module):
         memory, burn_in = self.part(sequences.memory), self.burn_in
 
         def unroll(
-            network: Recurrent, memory: tuple[Array, ...], part: slice, absent: Array | None = None
+            network: Recurrent, memory: tuple[Array, ...], window: slice, absent: Array | None = None
         ) -> tuple[Array, ...]:
-            rows = jax.tree.map(lambda x: jnp.swapaxes(x[:, part], 0, 1), (sequences.obs, sequences.begins))
+            rows = jax.tree.map(lambda x: jnp.swapaxes(x[:, window], 0, 1), (sequences.obs, sequences.begins))
             obs, begins = rows
             flat = jax.tree.map(lambda x: x.reshape(begins.size, *x.shape[2:]), obs)
             features = network.encoder(flat).reshape(*begins.shape, -1)

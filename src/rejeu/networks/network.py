@@ -215,7 +215,7 @@ def actor_and_critics(
     inputs: tuple[tuple[Leaf, ...], PolicyConfig],
     n_outputs: int,
     n_critics: int,
-    kind: Any,
+    critic_class: Any,
     *sizes: int,
     critic_shape: PolicyConfig | None = None,
 ) -> tuple[Callable[[Array], Any], Callable[[Array], Any]]:
@@ -225,7 +225,7 @@ def actor_and_critics(
         inputs: the leaves of observations, and the shape of the networks with its widths.
         n_outputs: of the actor.
         n_critics: number of critics.
-        kind: class of a critic.
+        critic_class: class of a critic.
         sizes: its numbers of actions and outputs, as it takes them.
         critic_shape: of the critics, if it is another.
     """
@@ -237,8 +237,11 @@ def actor_and_critics(
 
     def critics(key: Array) -> Any:
         size, *more = sizes
-        one = lambda leaves, shape: lambda key: kind(key, leaves, size, shape.critic_widths(), shape, *more)  # noqa: E731
-        build = lambda leaves, shape: ensemble(one(leaves, shape), key, n_critics)  # noqa: E731
+
+        def build(leaves: tuple[Leaf, ...], shape: PolicyConfig) -> Any:
+            critic = lambda key: critic_class(key, leaves, size, shape.critic_widths(), shape, *more)  # noqa: E731
+            return ensemble(critic, key, n_critics)
+
         return with_memory(key, leaves, critic_shape or shape, build, slot=1)
 
     return actor, critics

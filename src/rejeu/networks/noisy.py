@@ -63,15 +63,15 @@ def noisy(network: PyTree) -> PyTree:
         scales = jnp.full_like(layer.weight, scale), jnp.full_like(layer.bias, scale)
         return NoisyLinear(layer.weight, layer.bias, *scales)
 
-    return jax.tree.map(replaced, network, is_leaf=lambda one: isinstance(one, Linear))
+    return jax.tree.map(replaced, network, is_leaf=lambda node: isinstance(node, Linear))
 
 
 def drawn(network: PyTree, key: Array | None) -> PyTree:
     """Returns a network with the weights of all its noisy layers drawn, independently; unchanged if the key is None."""
     if key is None:
         return network
-    is_noisy = lambda one: isinstance(one, NoisyLinear)  # noqa: E731
+    is_noisy = lambda node: isinstance(node, NoisyLinear)  # noqa: E731
     parts, structure = jax.tree.flatten(network, is_leaf=is_noisy)
     keys = jax.random.split(jax.random.fold_in(key, 1), len(parts))
-    drawn = [part.drawn(key) if is_noisy(part) else part for part, key in zip(parts, keys, strict=True)]
+    drawn = [module.drawn(key) if is_noisy(module) else module for module, key in zip(parts, keys, strict=True)]
     return jax.tree.unflatten(structure, drawn)

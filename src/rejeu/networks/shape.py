@@ -101,12 +101,12 @@ class PolicyConfig:
         arch = [key for key in ("net_arch", "pi", "qf") if getattr(self, key) is not None]
         branches = [key for key in BRANCHES if getattr(self, key)]
         simba = ["architecture='simba'"] * (self.architecture == "simba")
-        own = ["torso"] * (self.torso is not None)
+        torso = ["torso"] * (self.torso is not None)
         norm = ["layer_norm"] * self.layer_norm + ["dropout"] * (self.dropout > 0)
         pairs = [(branches, arch), (branches, simba), (simba, norm)]
-        for one, other in pairs + [(own, others) for others in (arch, branches, simba, norm)]:
-            if one and other:
-                raise ValueError(f"policy_kwargs: {one[0]} conflicts with {other[0]}; give one of the two")
+        for settings, conflicting in pairs + [(torso, others) for others in (arch, branches, simba, norm)]:
+            if settings and conflicting:
+                raise ValueError(f"policy_kwargs: {settings[0]} conflicts with {conflicting[0]}; give one of the two")
         if simba and any(len(set(getattr(self, key))) != 1 for key in arch):
             raise ValueError(
                 f"architecture='simba' has one width throughout: {arch[0]}={list(getattr(self, arch[0]))} must hold "
@@ -160,8 +160,8 @@ def split_net_arch(config: Any, fields: Mapping[str, str]) -> None:
     if unknown := set(arch) - set(fields):
         expected = " and ".join(map(repr, fields))
         raise ValueError(f"net_arch has the unknown keys {sorted(unknown)}; expected {expected}")
-    given = {field: arch.get(key) for key, field in fields.items() if getattr(config, field) is None}
-    assign(config, net_arch=None, **given)
+    widths = {field: arch.get(key) for key, field in fields.items() if getattr(config, field) is None}
+    assign(config, net_arch=None, **widths)
 
 
 def activation_name(key: str, value: Any) -> str:

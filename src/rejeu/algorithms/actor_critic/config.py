@@ -75,12 +75,12 @@ class ActorCriticConfig(PolicyConfig):
 
     def _check_shared_widths(self) -> None:
         """Raises ``ValueError`` if layers that policy and value share are given widths for each."""
-        key, own = ("critic_layers", self.critic_layers or None) if self.has_branches else ("vf", self.vf)
+        key, value_widths = ("critic_layers", self.critic_layers or None) if self.has_branches else ("vf", self.vf)
         widths = self.actor_widths(HIDDEN_LAYERS)
-        if self.share_layers and own is not None and own != widths:
+        if self.share_layers and value_widths is not None and value_widths != widths:
             raise ValueError(
                 f"policy_kwargs: share_layers=True has one stack of hidden layers, of the policy's widths {list(widths)}, "
-                f"and conflicts with {key}={list(own)}; leave out one"
+                f"and conflicts with {key}={list(value_widths)}; leave out one"
             )
 
 

@@ -50,7 +50,7 @@ class ActionKind(NamedTuple):
     @property
     def n_stds(self) -> int:
         """Standard deviations of an action: one for each component of a Box."""
-        return self.n_outputs if self.kind == "box" else sum(part.n_stds for part in self.parts)
+        return self.n_outputs if self.kind == "box" else sum(component.n_stds for component in self.parts)
 
     def distribution(self, outputs: Array, log_std: Any, box: type[Normal] | type[TanhNormal]) -> Distribution:
         """Returns the distribution of a head's ``outputs`` ``(batch, n_outputs)``.
@@ -66,10 +66,10 @@ class ActionKind(NamedTuple):
         columns = jnp.split(outputs, np.cumsum(self.sizes)[:-1].tolist(), axis=-1)
         if self.kind == "categorical":
             return MultiCategorical(tuple(map(Categorical, columns)))
-        ends = np.cumsum([part.n_stds for part in self.parts])[:-1].tolist()
+        ends = np.cumsum([component.n_stds for component in self.parts])[:-1].tolist()
         stds = [None] * len(columns) if log_std is None else jnp.split(log_std, ends, axis=-1)
         triples = zip(self.parts, columns, stds, strict=True)
-        return Joint(tuple(part.distribution(column, std, box) for part, column, std in triples))
+        return Joint(tuple(component.distribution(column, std, box) for component, column, std in triples))
 
 
 def action_kind(space: spaces.Space) -> ActionKind:
@@ -82,7 +82,7 @@ def action_kind(space: spaces.Space) -> ActionKind:
         return ActionKind("categorical", tuple(int(n) for n in space.nvec.ravel()), False)
     if isinstance(space, spaces.Dict | spaces.Tuple):
         parts = tuple(map(action_kind, members(space)))
-        return ActionKind("joint", tuple(part.n_outputs for part in parts), False, parts)
+        return ActionKind("joint", tuple(component.n_outputs for component in parts), False, parts)
     assert isinstance(space, spaces.MultiBinary)
     return ActionKind("binary", (int(np.prod(space.shape, dtype=int)),), False)
 
@@ -267,7 +267,7 @@ def sde_explorer(n_steps: int, restarts: bool = True) -> Explorer:
     return Explorer(init, act)
 
 
-def explorer_of(config: OnPolicyConfig, kind: ActionKind) -> Explorer | None:
+def explorer_of(config: OnPolicyConfig, action_kind: ActionKind) -> Explorer | None:
     """Returns exploration by state-dependent noise if the configuration uses it, else None.
 
     Raises:
@@ -275,27 +275,27 @@ def explorer_of(config: OnPolicyConfig, kind: ActionKind) -> Explorer | None:
     """
     if not config.use_sde:
         return None
-    if kind.kind != "box":
+    if action_kind.kind != "box":
         raise ValueError("use_sde=True needs Box actions: noise cannot be added to discrete actions; leave it out")
     by_rollout = config.sde_sample_freq == -1 and config.n_episodes is None
     return sde_explorer(config.n_steps if by_rollout else config.sde_sample_freq, restarts=not by_rollout)
 
 
 def algorithm_of(
-    config: OnPolicyConfig, kind: ActionKind, init: Callable[[Array], Any], update: Callable[..., Any]
+    config: OnPolicyConfig, action_kind: ActionKind, init: Callable[[Array], Any], update: Callable[..., Any]
 ) -> Algorithm:
     """Returns the algorithm whose state has an :class:`ActorCritic` as ``network``, from how it begins and learns.
 
     Demonstrated actions other than Box are imitated by their log-probabilities.
     """
-    imitation = None if kind.kind == "box" else lambda actor, obs, action: -actor.policy(obs).log_prob(action)
+    imitation = None if action_kind.kind == "box" else lambda actor, obs, action: -actor.policy(obs).log_prob(action)
     return Algorithm(
         init,
         lambda state: state.network,
         explore,
         exploit,
         update,
-        explorer_of(config, kind),
+        explorer_of(config, action_kind),
         state_value=state_value,
         imitation=imitation,
     )

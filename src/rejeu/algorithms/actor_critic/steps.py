@@ -114,8 +114,8 @@ def clip_and_descend(
     if config.critic_learning_rate is None:
         return descend(network, clip(gradients, None, config.max_grad_norm), optimizer_state, optimizer, rate)
     belongs_to_value, value_rate = is_value(network), at(config.critic_learning_rate, progress)
-    parts = [clip(part, None, config.max_grad_norm) for part in eqx.partition(gradients, belongs_to_value)]
-    rates = jax.tree.map(lambda own: value_rate if own else rate, belongs_to_value)
+    parts = [clip(half, None, config.max_grad_norm) for half in eqx.partition(gradients, belongs_to_value)]
+    rates = jax.tree.map(lambda of_value: value_rate if of_value else rate, belongs_to_value)
     return descend(network, eqx.combine(*parts), optimizer_state, optimizer, rates)
 
 
@@ -169,8 +169,8 @@ def minibatches(data: D, key: Array, n_epochs: int, batch_size: int) -> tuple[Ca
     def minibatch(i: Array) -> D:
         first = (i % n_batches) * size
         index = jax.lax.dynamic_slice(orders, (i // n_batches, first), (1, size))[0]
-        chosen = jax.tree.map(lambda x: x[index], steps)
-        return chosen._replace(valid=first + jnp.arange(size) < n_valid)
+        batch = jax.tree.map(lambda x: x[index], steps)
+        return batch._replace(valid=first + jnp.arange(size) < n_valid)
 
     return minibatch, n_epochs * n_batches
 
@@ -196,8 +196,8 @@ def shuffled(key: Array, valid: Array, n_epochs: int, n_padding: int) -> Array:
 def valid_first(valid: Array) -> Array:
     """Returns the numbers of the valid steps, and after them those of the others, ``int32 (n,)``."""
     n = len(valid)
-    place = jnp.where(valid, jnp.cumsum(valid), jnp.sum(valid) + jnp.cumsum(~valid)) - 1
-    return jnp.zeros(n, jnp.int32).at[place].set(jnp.arange(n, dtype=jnp.int32), unique_indices=True)
+    position = jnp.where(valid, jnp.cumsum(valid), jnp.sum(valid) + jnp.cumsum(~valid)) - 1
+    return jnp.zeros(n, jnp.int32).at[position].set(jnp.arange(n, dtype=jnp.int32), unique_indices=True)
 
 
 def permuted(key: Array, n: int, n_first: Array, n_epochs: int) -> Array:

@@ -103,14 +103,14 @@ def make_with(
     config: Config,
     observation_space: spaces.Space,
     n_outputs: int,
-    kind: Any,
+    critic_class: Any,
     td_target: Callable[[Any, Any, Transition], Array],
     critic_loss: Callable[[Any, Transition, Array], tuple[Array, Array]],
     actor_loss: Callable[[Any, Any, PyTree], tuple[Array, Metrics]],
 ) -> tuple[Any, Any, Any]:
     """Returns ``init``, ``actor`` and ``update`` of DDPG with losses as those of this module.
 
-    The actor has ``n_outputs``, which the critic, of the class ``kind``, takes or gives. With the actor's loss come metrics.
+    The actor has ``n_outputs``, which the critic, a ``critic_class``, takes or gives. With the actor's loss come metrics.
     """
     obs_leaves, shape = network_inputs(config, observation_space)
     optimizer = optimizers.make(config.optimizer, config.max_grad_norm)
@@ -118,7 +118,7 @@ def make_with(
     def init(key: Array) -> State:
         actor_key, critic_key = jax.random.split(key)
         actor = Network(actor_key, obs_leaves, n_outputs, shape.actor_widths(), shape)
-        critic = kind(critic_key, obs_leaves, n_outputs, shape.critic_widths(), shape)
+        critic = critic_class(critic_key, obs_leaves, n_outputs, shape.critic_widths(), shape)
         targets = copy(actor), copy(critic)
         return State(actor, critic, *targets, optimizer.init(actor), optimizer.init(critic), jnp.int32(0))
 

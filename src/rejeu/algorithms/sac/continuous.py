@@ -216,15 +216,15 @@ def drawn(parts: SoftCritic, config: Config) -> SoftCritic:
 
 
 def networks(
-    config: Config, observation_space: spaces.Space, n_outputs: int, kind: Any, *sizes: int
+    config: Config, observation_space: spaces.Space, n_outputs: int, critic_class: Any, *sizes: int
 ) -> tuple[Callable[[Array], Any], Callable[[Array], Any]]:
     """Returns functions of a key that build an actor of ``n_outputs``, and ``config.n_critics`` critics.
 
-    A critic is of the class ``kind``, with ``sizes`` where it takes numbers of actions and outputs. With gSDE the actor has
-    half as many outputs, the means.
+    A critic is a ``critic_class``, with ``sizes`` where it takes numbers of actions and outputs. With gSDE the actor has half
+    as many outputs, the means.
     """
     inputs = network_inputs(config, observation_space)
-    actor, critics = actor_and_critics(inputs, n_outputs, config.n_critics, kind, *sizes)
+    actor, critics = actor_and_critics(inputs, n_outputs, config.n_critics, critic_class, *sizes)
     return (
         partial(SdeActor, inputs=inputs, action_dim=n_outputs // 2, config=config) if config.use_sde else actor
     ), critics
@@ -239,12 +239,12 @@ def explorer_of(config: Config, action_dim: int) -> Explorer | None:
 
 def check_discrete(config: Config) -> None:
     """Raises ``ValueError`` for exploration and entropies that only Box actions have."""
-    given = {
+    settings = {
         "use_sde=True": config.use_sde,
         f"noise_repeat={config.noise_repeat}": config.noise_repeat > 1,
         f"target_entropy={config.target_entropy!r}": str(config.target_entropy).startswith("std_"),
     }
-    if wrong := [setting for setting, is_given in given.items() if is_given]:
+    if wrong := [setting for setting, is_given in settings.items() if is_given]:
         raise ValueError(f"{wrong[0]} needs Box actions: noise cannot be added to discrete actions; leave it out")
 
 

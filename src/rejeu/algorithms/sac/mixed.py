@@ -59,15 +59,19 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
 
     def joined(choice: Array, box: Array) -> Array:
         """Returns combinations ``(batch,)`` and Box components as actions ``(batch, action_width)``."""
-        each = [one.astype(jnp.float32)[:, None] for one in jnp.unravel_index(choice, choices)] if choices else []
+        each = (
+            [component.astype(jnp.float32)[:, None] for component in jnp.unravel_index(choice, choices)]
+            if choices
+            else []
+        )
         return jnp.concatenate([box, *each], axis=-1)[:, order]
 
     def parted(action: Array) -> tuple[Array, Array]:
         """Returns the combinations and Box components of actions."""
         is_choice = np.array(sizes) > 0
         strides = np.cumprod([1, *choices[:0:-1]])[::-1].astype(np.int32)[: len(choices)]
-        chosen = action[:, is_choice].astype(jnp.int32) * strides[None]
-        return jnp.sum(chosen, axis=-1, dtype=jnp.int32), action[:, ~is_choice]
+        weighted_choices = action[:, is_choice].astype(jnp.int32) * strides[None]
+        return jnp.sum(weighted_choices, axis=-1, dtype=jnp.int32), action[:, ~is_choice]
 
     def explore(actor: Network, obs: PyTree, key: Array, clock: Clock) -> Array:
         choice_key, box_key = jax.random.split(key)
@@ -104,7 +108,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
 def column_sizes(space: spaces.Space) -> list[int]:
     """Returns the number of possibilities of each number of an action, 0 for the components of a Box."""
     if isinstance(space, spaces.Dict | spaces.Tuple):
-        return [size for part in members(space) for size in column_sizes(part)]
+        return [size for member in members(space) for size in column_sizes(member)]
     if isinstance(space, spaces.Box):
         return [0] * action_width(check_box_action(space, Config.name))
     if isinstance(space, spaces.Discrete):
