@@ -65,7 +65,7 @@ def target_of(path: Path, to: str | None) -> str:
     Raises:
         ValueError: if there is no such format.
     """
-    suffixes = {one.suffix: name for name, one in FORMATS.items()}
+    suffixes = {export_format.suffix: name for name, export_format in FORMATS.items()}
     target = to if to is not None else suffixes.get(path.suffix)
     if target not in FORMATS:
         wrong = f"to={to!r}" if to is not None else f"the suffix of {str(path)!r}"

@@ -50,23 +50,23 @@ def filled(template: str, **texts: Any) -> bytes:
 def write(policy: Policy, card: dict[str, Any], stem: str) -> tuple[bytes, bytes]:
     """Returns the C file of a policy and its header; ``stem`` is the name of the files without suffix."""
     printer, names = Printer(C), names_of(policy)
-    found = printer.run(policy.program, list(names.values()))
+    stored_arrays = printer.run(policy.program, list(names.values()))
     action, after = policy.outputs[0], policy.of("state")
-    last = [printer.stored(one) if one.name in names.values() else one for one in found[1:]]
-    printer.copy(found[0], memory("action", found[0].shape, action.dtype))
-    for port, one in zip(after, last, strict=True):
-        printer.copy(one, memory(names[port.name], one.shape, port.dtype))
-    given = [port for port in policy.inputs if port.role not in ("state", "episode_start")]
+    last = [printer.stored(value) if value.name in names.values() else value for value in stored_arrays[1:]]
+    printer.copy(stored_arrays[0], memory("action", stored_arrays[0].shape, action.dtype))
+    for port, value in zip(after, last, strict=True):
+        printer.copy(value, memory(names[port.name], value.shape, port.dtype))
+    input_ports = [port for port in policy.inputs if port.role not in ("state", "episode_start")]
     code = "\n".join(printer.lines)
-    body = [f"(void){names[port.name]};" for port in given if not re.search(rf"\b{names[port.name]}\[", code)]
+    body = [f"(void){names[port.name]};" for port in input_ports if not re.search(rf"\b{names[port.name]}\[", code)]
     starts = [names[port.name] for port in policy.of("episode_start")]
-    arrays = [array(one, data) for one, data in printer.constants.items()]
+    arrays = [array(constant, data) for constant, data in printer.constants.items()]
     arrays += [declaration(port, names[port.name], "static ") + ";" for port in after]
-    arrays += [f"static uint8_t {one}[1] = {{1}};" for one in starts]
-    arrays += [f"static {TYPES[dtype]} {one}[{n}];" for one, dtype, n in printer.buffers]
+    arrays += [f"static uint8_t {start}[1] = {{1}};" for start in starts]
+    arrays += [f"static {TYPES[dtype]} {buffer}[{n}];" for buffer, dtype, n in printer.buffers]
     name = identifier(stem)
-    takes = [declaration(port, names[port.name], "const ") for port in given]
-    upper, sizes = name.upper(), [*((names[port.name], size(port)) for port in given), ("action", size(action))]
+    takes = [declaration(port, names[port.name], "const ") for port in input_ports]
+    upper, sizes = name.upper(), [*((names[port.name], size(port)) for port in input_ports), ("action", size(action))]
     texts = {
         "name": name,
         "stem": stem,
@@ -74,9 +74,9 @@ def write(policy: Policy, card: dict[str, Any], stem: str) -> tuple[bytes, bytes
         "card": json.dumps(card, indent=1).replace("*/", "* /").replace("/*", "/ *"),
         "signature": f"void {name}_act({', '.join([*takes, declaration(action, 'action')])})",
         "arrays": "\n".join(arrays),
-        "body": indented([*body, *printer.lines, *(f"{one}[0] = 0;" for one in starts)]),
-        "resets": "".join(f"\t{one}[0] = 1;\n" for one in starts),
-        "sizes": "\n".join(f"#define {upper}_{one.upper()}_SIZE {n}" for one, n in sizes),
+        "body": indented([*body, *printer.lines, *(f"{start}[0] = 0;" for start in starts)]),
+        "resets": "".join(f"\t{start}[0] = 1;\n" for start in starts),
+        "sizes": "\n".join(f"#define {upper}_{port_name.upper()}_SIZE {n}" for port_name, n in sizes),
     }
     return filled("policy.c", **texts), filled("policy.h", **texts, rejeu=card["rejeu"], weights=card["weights"])
 
@@ -100,7 +100,7 @@ def c_run(policy: Policy, source: bytes, header: bytes, stem: str, compiler: str
     Raises:
         RuntimeError: if it does not compile without warnings.
     """
-    compiler = compiler or next((one for one in COMPILERS if shutil.which(one)), None)
+    compiler = compiler or next((command for command in COMPILERS if shutil.which(command)), None)
     if compiler is None:
         return None
 
@@ -112,17 +112,21 @@ def c_run(policy: Policy, source: bytes, header: bytes, stem: str, compiler: str
             (folder / "main.c").write_bytes(main_of(policy, stem))
             options = ["-O2", "-std=c99", "-Wall", "-Wextra", "-Werror", "-c", "policy.c"]
             for arguments in (options, ["-O2", "main.c", "policy.o", "-lm", "-o", "main"]):
-                made = subprocess.run([compiler, *arguments], cwd=folder, capture_output=True, text=True, check=False)
-                if made.returncode:
-                    raise RuntimeError(f"{compiler} does not compile the C file: {made.stderr[:1000]}")
-            given = [port for port in policy.inputs if port.role != "state"]
+                compilation = subprocess.run(
+                    [compiler, *arguments], cwd=folder, capture_output=True, text=True, check=False
+                )
+                if compilation.returncode:
+                    raise RuntimeError(f"{compiler} does not compile the C file: {compilation.stderr[:1000]}")
+            input_ports = [port for port in policy.inputs if port.role != "state"]
             n = len(next(iter(inputs.values())))
-            parts = [np.ascontiguousarray(inputs[p.name].reshape(n, -1), p.dtype).view(np.uint8) for p in given]
+            parts = [np.ascontiguousarray(inputs[p.name].reshape(n, -1), p.dtype).view(np.uint8) for p in input_ports]
             rows = np.concatenate(parts, axis=1)
-            found = subprocess.run([folder / "main"], input=rows.tobytes(), capture_output=True, check=True).stdout
+            output_bytes = subprocess.run(
+                [folder / "main"], input=rows.tobytes(), capture_output=True, check=True
+            ).stdout
         action = policy.outputs[0]
         made_of = np.dtype([("action", action.dtype, action.shape), ("seconds", "f8")])
-        result = np.frombuffer(found, made_of)
+        result = np.frombuffer(output_bytes, made_of)
         return result["action"], result["seconds"]
 
     return run
@@ -130,23 +134,23 @@ def c_run(policy: Policy, source: bytes, header: bytes, stem: str, compiler: str
 
 def main_of(policy: Policy, stem: str) -> bytes:
     """Returns a program that reads inputs from standard input, and writes actions and times to standard output."""
-    given = [port for port in policy.inputs if port.role != "state"]
-    starts = [i for i, port in enumerate(given) if port.role == "episode_start"]
-    arrays = [declaration(port, f"a{i}", "static ") + ";" for i, port in enumerate(given)]
+    input_ports = [port for port in policy.inputs if port.role != "state"]
+    starts = [i for i, port in enumerate(input_ports) if port.role == "episode_start"]
+    arrays = [declaration(port, f"a{i}", "static ") + ";" for i, port in enumerate(input_ports)]
     return filled(
         "main.c",
         stem=stem,
         name=identifier(stem),
         arrays="\n".join([*arrays, declaration(policy.outputs[0], "action", "static ") + ";"]),
-        reads=" && ".join(f"fread(a{i}, sizeof a{i}, 1, stdin)" for i in range(len(given))),
+        reads=" && ".join(f"fread(a{i}, sizeof a{i}, 1, stdin)" for i in range(len(input_ports))),
         starts=" ".join(f"if (a{i}[0]) {identifier(stem)}_reset();" for i in starts),
-        arguments=", ".join([*(f"a{i}" for i in range(len(given)) if i not in starts), "action"]),
+        arguments=", ".join([*(f"a{i}" for i in range(len(input_ports)) if i not in starts), "action"]),
     )
 
 
-def declaration(port: Port, name: str, kind: str = "") -> str:
+def declaration(port: Port, name: str, qualifier: str = "") -> str:
     """Returns the declaration of an input or output."""
-    return f"{kind}{TYPES[port.dtype]} {name}[{size(port)}]"
+    return f"{qualifier}{TYPES[port.dtype]} {name}[{size(port)}]"
 
 
 def size(port: Port) -> int:
@@ -156,18 +160,18 @@ def size(port: Port) -> int:
 
 def names_of(policy: Policy) -> dict[str, str]:
     """Returns names of C for the inputs, by their own; those that are taken already get an underscore."""
-    result, taken = {}, {"ACTION", "X", "SUM", "BEST"}
+    result, used_names = {}, {"ACTION", "X", "SUM", "BEST"}
     for port in policy.inputs:
         name = identifier(port.name)
-        while name.upper() in taken or re.fullmatch(r"[vci]\d+|u?int\w*_t|[A-Z0-9_]*[A-Z0-9]", name):
+        while name.upper() in used_names or re.fullmatch(r"[vci]\d+|u?int\w*_t|[A-Z0-9_]*[A-Z0-9]", name):
             name += "_"
-        taken.add(name.upper())  # of the macro with its size
+        used_names.add(name.upper())  # of the macro with its size
         result[port.name] = name
     return result
 
 
 def array(name: str, data: np.ndarray) -> str:
     """Returns the declaration of a constant array."""
-    numbers = [C.literal(one) for one in data.ravel()]
+    numbers = [C.literal(number) for number in data.ravel()]
     text = ",\n".join(", ".join(numbers[i : i + 8]) for i in range(0, len(numbers), 8))
     return f"static const {TYPES[str(data.dtype)]} {name}[{data.size}] = {{\n{text}}};"

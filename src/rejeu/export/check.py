@@ -79,14 +79,14 @@ def compare(policy: Policy, recording: SeenSteps, run: Run) -> Check:
         differing = (actions != expected).reshape(len(actions), -1).any(axis=1)
         ties = [is_tie(policy, recording.inputs, int(i)) for i in np.flatnonzero(differing)]
         return Check(len(actions), recording.source, 0.0 if all(ties) else 1.0, sum(ties), p50, p99)
-    low, high = (np.asarray(one, np.float64) for one in (policy.outputs[0].low, policy.outputs[0].high))
+    low, high = (np.asarray(bound, np.float64) for bound in (policy.outputs[0].low, policy.outputs[0].high))
     with np.errstate(invalid="ignore"):
         half = np.where(np.isfinite(low) & np.isfinite(high), 0.5 * (high - low), np.abs(expected))
-    far = lambda one, other: float((np.abs(one - other.astype(np.float64)) / np.maximum(half, 1.0)).max(initial=0.0))  # noqa: E731
+    far = lambda x, y: float((np.abs(x - y.astype(np.float64)) / np.maximum(half, 1.0)).max(initial=0.0))  # noqa: E731
     difference, allowed = far(actions, expected), LARGEST_DIFFERENCE
     if difference > LARGEST_DIFFERENCE:  # where large numbers cancel, or are clipped
-        found = [one_by_one(policy, computed(policy, wide))(recording.inputs)[0] for wide in (False, True)]
-        allowed = max(allowed, ROUNDING * far(*found))
+        computed_actions = [one_by_one(policy, computed(policy, wide))(recording.inputs)[0] for wide in (False, True)]
+        allowed = max(allowed, ROUNDING * far(*computed_actions))
     return Check(len(actions), recording.source, difference, 0, p50, p99, allowed)
 
 
@@ -94,19 +94,20 @@ def computed(policy: Policy, in_double: bool) -> Callable[[dict[str, np.ndarray]
     """Returns a policy as a function from inputs to outputs by name, in double precision or as it is."""
     wide = lambda x: x.astype(np.float64) if in_double and x.dtype == np.float32 else x  # noqa: E731
     operations = []
-    for one in policy.program.operations:
-        params = {k: np.dtype("f8") if in_double and is_float32(v) else v for k, v in one.params.items()}
+    for operation in policy.program.operations:
+        params = {k: np.dtype("f8") if in_double and is_float32(v) else v for k, v in operation.params.items()}
         inputs = tuple(
-            value if value.data is None else Value(value.shape, value.dtype, wide(value.data)) for value in one.inputs
+            value if value.data is None else Value(value.shape, value.dtype, wide(value.data))
+            for value in operation.inputs
         )
-        operations.append(one._replace(inputs=inputs, params=params))
+        operations.append(operation._replace(inputs=inputs, params=params))
     program = policy.program._replace(operations=tuple(operations))
     run = jax.jit(lambda *arrays: program(*arrays))
 
     def call(inputs: dict[str, np.ndarray]) -> Mapping[str, Any]:
         with jax.enable_x64(in_double):
-            found = run(*(wide(inputs[port.name]) for port in policy.inputs))
-            return {port.name: np.asarray(one) for port, one in zip(policy.outputs, found, strict=True)}
+            results = run(*(wide(inputs[port.name]) for port in policy.inputs))
+            return {port.name: np.asarray(result) for port, result in zip(policy.outputs, results, strict=True)}
 
     return call
 
@@ -121,11 +122,11 @@ def is_tie(policy: Policy, inputs: Mapping[str, np.ndarray], row: int) -> bool:
 
     A policy with memory is taken at the start of an episode, so there only such ties are seen.
     """
-    decisive = [one for one in policy.program.operations if one.name in DECISIVE]
-    given = {name: array[row][None] for name, array in inputs.items()}
-    arrays = [given.get(port.name, np.zeros((1, *port.shape), port.dtype)) for port in policy.inputs]
-    found = policy.program.ending_in([operation.inputs[0] for operation in decisive])(*arrays)
-    for operation, value in zip(decisive, map(np.asarray, found), strict=True):
+    decisive = [step for step in policy.program.operations if step.name in DECISIVE]
+    observation = {name: array[row][None] for name, array in inputs.items()}
+    arrays = [observation.get(port.name, np.zeros((1, *port.shape), port.dtype)) for port in policy.inputs]
+    inputs_of_decisions = policy.program.ending_in([operation.inputs[0] for operation in decisive])(*arrays)
+    for operation, value in zip(decisive, map(np.asarray, inputs_of_decisions), strict=True):
         allowed = LARGEST_DIFFERENCE * max(1.0, float(np.abs(value[np.abs(value) < 1e8]).max(initial=0.0)))
         if operation.name == "argmax":
             first, second = np.moveaxis(np.sort(value, axis=operation.params["axes"][0]), -1, 0)[[-1, -2]]
@@ -146,13 +147,13 @@ def one_by_one(policy: Policy, call: Callable[[dict[str, np.ndarray]], Mapping[s
         actions, seconds = [], []
         n = len(next(iter(inputs.values())))
         for i in range(-1, n):  # the first once more, to compile
-            given = {name: array[max(i, 0)][None] for name, array in inputs.items()}
+            row = {name: array[max(i, 0)][None] for name, array in inputs.items()}
             start = time.perf_counter()
-            found = {name: np.asarray(one) for name, one in call(given | memory).items()}
+            results = {name: np.asarray(result) for name, result in call(row | memory).items()}
             if i >= 0:
                 seconds.append(time.perf_counter() - start)
-                actions.append(found["action"][0])
-                memory = {port.name: found[f"next_{port.name}"] for port in state}
+                actions.append(results["action"][0])
+                memory = {port.name: results[f"next_{port.name}"] for port in state}
         return np.array(actions), np.array(seconds)
 
     return run

@@ -76,7 +76,9 @@ class FrameStack(NamedTuple):
         frames = [i for i, axis in enumerate(self.axes) if axis is not None]
         empty = self._replace(zeros=True)
         return all(
-            np.array_equal(empty.pushed(i, one, self.newest(i, one), True), one) for i in frames for one in arrays[i]
+            np.array_equal(empty.pushed(i, first, self.newest(i, first), True), first)
+            for i in frames
+            for first in arrays[i]
         )
 
 
@@ -174,18 +176,18 @@ def policy_of(
     parts = [*spaces.parts(observation_space, observation_space)]
     if stack:
         for i in stacked:
-            low, high = (np.asarray(stack.newest(i, one)) for one in (parts[i].low, parts[i].high))
+            low, high = (np.asarray(stack.newest(i, array)) for array in (parts[i].low, parts[i].high))
             parts[i] = gym.spaces.Box(low, high, dtype=parts[i].dtype)
     scale = spaces.action_scaler(action_space, jnp)
 
     def act(obs: list[Array], mask: Array | None, memory: list[Array], start: Any, key: Any) -> list[Array]:
         stacks = [
-            stack.pushed(i, one, obs[i], start) for i, one in zip(stacked, memory[n_carry:], strict=True) if stack
+            stack.pushed(i, value, obs[i], start) for i, value in zip(stacked, memory[n_carry:], strict=True) if stack
         ]
-        obs = [stacks[stacked.index(i)] if i in stacked else one for i, one in enumerate(obs)]
-        arrays: PyTree = jax.tree.unflatten(structure, [one[None] for one in obs])
+        obs = [stacks[stacked.index(i)] if i in stacked else value for i, value in enumerate(obs)]
+        arrays: PyTree = jax.tree.unflatten(structure, [value[None] for value in obs])
         arrays = arrays if mask is None else Masked(arrays, mask[None])
-        before = jax.tree.unflatten(carry_structure, [one[None] for one in memory[:n_carry]])
+        before = jax.tree.unflatten(carry_structure, [value[None] for value in memory[:n_carry]])
         after: PyTree = ()
         if noise:
             ended = jnp.ones(1, bool) if start is None else start[None]
@@ -194,16 +196,16 @@ def policy_of(
             action, after = algorithm.recall(before, actor, arrays, start[None])  # type: ignore[misc]
         else:
             action = algorithm.exploit(actor, arrays)
-        return [scale(action)[0], *(one[0] for one in jax.tree.leaves(after) if has_memory), *stacks]
+        return [scale(action)[0], *(value[0] for value in jax.tree.leaves(after) if has_memory), *stacks]
 
     example = lambda shape, dtype: ShapeDtypeStruct((size, *shape), dtype)  # noqa: E731
     arguments = (
         [
-            example(part.shape if i in stacked else leaf.shape, leaf.dtype)
-            for i, (leaf, part) in enumerate(zip(leaves, parts, strict=True))
+            example(space.shape if i in stacked else leaf.shape, leaf.dtype)
+            for i, (leaf, space) in enumerate(zip(leaves, parts, strict=True))
         ],
         None if mask is None else example(mask.shape, bool),
-        [example(one.shape[1:], one.dtype) for one in memory],
+        [example(array.shape[1:], array.dtype) for array in memory],
         example((), bool) if has_state else None,
         example((2,), np.uint32) if noise else None,
     )
@@ -211,39 +213,39 @@ def policy_of(
     if noise and not program.draws:
         raise ValueError("noise=True is for policies that are sampled from; this one always returns the same action")
     inputs = [
-        Port(leaf.path or "observation", "observation", tuple(example.shape[1:]), leaf.dtype, *bounds(part))
-        for leaf, part, example in zip(leaves, parts, arguments[0], strict=True)
+        Port(leaf.path or "observation", "observation", tuple(example.shape[1:]), leaf.dtype, *bounds(space))
+        for leaf, space, example in zip(leaves, parts, arguments[0], strict=True)
     ]
-    state = [Port(f"state_{i}", "state", one.shape[1:], str(one.dtype)) for i, one in enumerate(memory)]
+    state = [Port(f"state_{i}", "state", array.shape[1:], str(array.dtype)) for i, array in enumerate(memory)]
     inputs += [] if mask is None else [Port("action_mask", "action_mask", mask.shape, "bool")]
     inputs += [*state, Port("episode_start", "episode_start", (), "bool")] if has_state else []
-    for i, (kind, value) in enumerate(program.draws):
-        inputs.append(Port(f"noise_{i}", "noise", value.shape[1:], str(value.dtype), drawn=kind))
+    for i, (draw_name, value) in enumerate(program.draws):
+        inputs.append(Port(f"noise_{i}", "noise", value.shape[1:], str(value.dtype), drawn=draw_name))
     is_integer = isinstance(action_space, gym.spaces.Discrete | gym.spaces.MultiDiscrete)
     dtype = "int64" if is_integer else str(program.outputs[0].dtype)
     action = Port("action", "action", action_space.shape or (), dtype, *bounds(action_space))
-    outputs = (action, *(one._replace(name=f"next_{one.name}") for one in state))
-    return Policy(program, distinct(inputs, {one.name for one in outputs}), outputs, batch)
+    outputs = (action, *(array._replace(name=f"next_{array.name}") for array in state))
+    return Policy(program, distinct(inputs, {array.name for array in outputs}), outputs, batch)
 
 
-def distinct(ports: Sequence[Port], taken: set[str]) -> tuple[Port, ...]:
+def distinct(ports: Sequence[Port], used_names: set[str]) -> tuple[Port, ...]:
     """Returns ports, observations first, whose names differ from each other and from those taken, by underscores."""
     result = []
     for port in ports:
         name = port.name
-        while name in taken:
+        while name in used_names:
             name += "_"
-        taken.add(name)
+        used_names.add(name)
         result.append(port._replace(name=name))
     return tuple(result)
 
 
 def bounds(space: gym.Space) -> tuple[Any, Any]:
     """Returns the smallest and the largest values of an array of a space, in JSON values."""
-    ((kind, body),) = spaces.describe(space).items()
-    if kind == "Box":
+    ((space_name, body),) = spaces.describe(space).items()
+    if space_name == "Box":
         return body["low"], body["high"]
-    if kind == "MultiBinary":
+    if space_name == "MultiBinary":
         return 0, 1
-    start, n = np.asarray(body["start"]), np.asarray(body["n" if kind == "Discrete" else "nvec"])
+    start, n = np.asarray(body["start"]), np.asarray(body["n" if space_name == "Discrete" else "nvec"])
     return start.tolist(), (start + n - 1).tolist()

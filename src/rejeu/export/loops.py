@@ -46,12 +46,12 @@ class Language(NamedTuple):
 
     def literal(self, number: np.ndarray) -> str:
         """Returns how a number is written."""
-        one = number.reshape(()).item()
-        if not math.isfinite(one):
+        value = number.reshape(()).item()
+        if not math.isfinite(value):
             names = ("NAN", "INFINITY") if self.name == "C" else ("NaN", "Infinity")
-            return names[0] if math.isnan(one) else f"({'-' * (one < 0)}{names[1]})"
+            return names[0] if math.isnan(value) else f"({'-' * (value < 0)}{names[1]})"
         is_float = number.dtype.kind == "f" and self.name == "C"
-        text = as_float(one) + "f" if is_float else repr(int(one) if number.dtype.kind != "f" else one)
+        text = as_float(value) + "f" if is_float else repr(int(value) if number.dtype.kind != "f" else value)
         return f"({text})" if text.startswith("-") else text
 
 
@@ -98,7 +98,7 @@ class Printer:
         """Adds the statements of a program whose arguments have these names, and returns its outputs."""
         for value, name in zip(program.arguments, arguments, strict=True):
             self.known[value] = memory(name, value.shape, value.dtype)
-        uses = Counter(one for operation in program.operations for one in operation.inputs)
+        uses = Counter(argument for operation in program.operations for argument in operation.inputs)
         for operation in program.operations:
             out = operation.outputs[0]
             if operation.name in MAPS:
@@ -106,8 +106,8 @@ class Printer:
                     self.view(operation.inputs[0]), out.shape, partial(MAPS[operation.name], operation)
                 )
             elif (text := self.expression(operation)) is not None:
-                made = self.computed(operation, text)
-                self.known[out] = made if uses[out] == 1 else self.stored(made)
+                computed = self.computed(operation, text)
+                self.known[out] = computed if uses[out] == 1 else self.stored(computed)
             elif operation.name in STATEMENTS:
                 STATEMENTS[operation.name](self, operation)
             else:
@@ -117,7 +117,7 @@ class Printer:
     def expression(self, operation: Operation) -> str | None:
         """Returns the expression of an operation on each element by itself; None for another."""
         name, is_c = operation.name, self.language.name == "C"
-        source, dtype = (str(one[0].dtype) for one in (operation.inputs or operation.outputs, operation.outputs))
+        source, dtype = (str(values[0].dtype) for values in (operation.inputs or operation.outputs, operation.outputs))
         if name == "convert_element_type":
             return self.language.cast(source, dtype)
         if is_c and name == "rem" and "int" in source:
@@ -132,14 +132,14 @@ class Printer:
         """Returns the result of an operation on each element by itself."""
         counts = [text.count(f"{{{i}}}") for i in range(len(operation.inputs))]
         pairs = zip(operation.inputs, counts, strict=True)
-        operands = [self.view(one) if count > 1 else self.read(one) for one, count in pairs]
+        operands = [self.view(argument) if count > 1 else self.read(argument) for argument, count in pairs]
         out = operation.outputs[0]
 
         def read(index: Sequence[str]) -> str:
             at = [
-                [i if n != 1 else "0" for i, n in zip(index, one.shape, strict=False)] for one in operands
+                [i if n != 1 else "0" for i, n in zip(index, operand.shape, strict=False)] for operand in operands
             ]  # or repeated
-            return text.format(*(one.read(i) for one, i in zip(operands, at, strict=True)))
+            return text.format(*(operand.read(i) for operand, i in zip(operands, at, strict=True)))
 
         return Array(out.shape, str(out.dtype), read, is_stored=False)
 
@@ -158,10 +158,10 @@ class Printer:
 
     def view(self, value: Value) -> Array:
         """Returns an array whose elements are in memory, or constant."""
-        found = self.read(value)
-        if not found.is_stored:
-            found = self.known[value] = self.stored(found)
-        return found
+        array = self.read(value)
+        if not array.is_stored:
+            array = self.known[value] = self.stored(array)
+        return array
 
     def buffer(self, shape: Sequence[int], dtype: Any) -> Array:
         """Returns a new array."""
@@ -169,23 +169,23 @@ class Printer:
         self.buffers.append((name, str(np.dtype(dtype)), max(math.prod(shape), 1)))
         return memory(name, shape, dtype)
 
-    def stored(self, found: Array) -> Array:
+    def stored(self, array: Array) -> Array:
         """Returns a new array of the elements of another one."""
-        out = self.buffer(found.shape, found.dtype)
-        self.copy(found, out)
+        out = self.buffer(array.shape, array.dtype)
+        self.copy(array, out)
         return out
 
-    def copy(self, found: Array, out: Array) -> None:
+    def copy(self, array: Array, out: Array) -> None:
         """Adds loops that copy elements to an array of the same shape."""
-        with self.block(found.shape) as index:
-            self.lines.append(f"{out.read(index)} = {found.read(index)};")
+        with self.block(array.shape) as index:
+            self.lines.append(f"{out.read(index)} = {array.read(index)};")
 
     @contextmanager
     def block(self, sizes: Sequence[int]) -> Iterator[list[str]]:
         """Context of nested loops over axes of these lengths; it gives their indices."""
         index = ["0" if size == 1 else f"i{self._depth + axis}" for axis, size in enumerate(sizes)]
-        pairs, kind = zip(index, sizes, strict=True), self.language.declaration("index")
-        loops = [f"for ({kind} {i} = 0; {i} < {size}; ++{i}) {{" for i, size in pairs if i != "0"] or ["{"]
+        pairs, index_type = zip(index, sizes, strict=True), self.language.declaration("index")
+        loops = [f"for ({index_type} {i} = 0; {i} < {size}; ++{i}) {{" for i, size in pairs if i != "0"] or ["{"]
         self.lines += loops
         self._depth += len(sizes)
         yield index
@@ -217,9 +217,9 @@ def as_float(number: float) -> str:
     return text if re.search(r"[.en]", text) else f"{text}.0"
 
 
-def moved(found: Array, shape: tuple[int, ...], index_of: Callable[[Sequence[str]], list[str]]) -> Array:
+def moved(array: Array, shape: tuple[int, ...], index_of: Callable[[Sequence[str]], list[str]]) -> Array:
     """Returns an array whose elements are those of another one, at other indices."""
-    return found._replace(shape=shape, read=lambda index: found.read(index_of(index)), name="")
+    return array._replace(shape=shape, read=lambda index: array.read(index_of(index)), name="")
 
 
 def shifted(index: str, start: int, step: int = 1) -> str:
@@ -247,7 +247,7 @@ def broadcast(operation: Operation, index: Sequence[str]) -> list[str]:
 def sliced(operation: Operation, index: Sequence[str]) -> list[str]:
     """Of a part of an array."""
     starts, steps = operation.params["start_indices"], operation.params["strides"] or (1,) * len(index)
-    return [shifted(*one) for one in zip(index, starts, steps, strict=True)]
+    return [shifted(*shift) for shift in zip(index, starts, steps, strict=True)]
 
 
 def transposed(operation: Operation, index: Sequence[str]) -> list[str]:
@@ -267,33 +267,33 @@ def placed(*groups: tuple[Sequence[int], Sequence[str]]) -> list[str]:
 
 def reshape(printer: Printer, operation: Operation) -> None:
     """The same memory in another shape; a copy if it is not stored in order."""
-    found, out = printer.view(operation.inputs[0]), operation.outputs[0]
-    name = found.name or printer.stored(found).name
-    printer.known[out] = memory(name, out.shape, found.dtype)
+    array, out = printer.view(operation.inputs[0]), operation.outputs[0]
+    name = array.name or printer.stored(array).name
+    printer.known[out] = memory(name, out.shape, array.dtype)
 
 
 def concatenate(printer: Printer, operation: Operation) -> None:
     """Arrays one after the other."""
     out, axis, start = operation.outputs[0], operation.params["dimension"], 0
     whole = printer.buffer(out.shape, out.dtype)
-    for one in operation.inputs:
-        found = printer.read(one)
-        with printer.block(found.shape) as index:
-            printer.lines.append(f"{whole.read(along(axis, start, index))} = {found.read(index)};")
-        start += one.shape[axis]
+    for value in operation.inputs:
+        array = printer.read(value)
+        with printer.block(array.shape) as index:
+            printer.lines.append(f"{whole.read(along(axis, start, index))} = {array.read(index)};")
+        start += value.shape[axis]
     printer.known[out] = whole
 
 
 def reduce(printer: Printer, operation: Operation) -> None:
     """A sum, or the like, over axes."""
-    axes, out, found = operation.params["axes"], operation.outputs[0], printer.view(operation.inputs[0])
-    kept = [axis for axis in range(len(found.shape)) if axis not in axes]
+    axes, out, array = operation.params["axes"], operation.outputs[0], printer.view(operation.inputs[0])
+    remaining_axes = [axis for axis in range(len(array.shape)) if axis not in axes]
     whole = printer.buffer(out.shape, out.dtype)
     with printer.block(out.shape) as index:
-        first = found.read(placed((kept, index), (axes, ["0"] * len(axes))))
+        first = array.read(placed((remaining_axes, index), (axes, ["0"] * len(axes))))
         printer.declare("sum", whole.dtype, "0" if operation.name == "reduce_sum" else first)
-        with printer.block([found.shape[axis] for axis in axes]) as inner:
-            element = found.read(placed((kept, index), (axes, inner)))
+        with printer.block([array.shape[axis] for axis in axes]) as inner:
+            element = array.read(placed((remaining_axes, index), (axes, inner)))
             printer.lines.append(f"sum = {REDUCTIONS[operation.name].format('sum', element)};")
         printer.lines.append(f"{whole.read(index)} = sum;")
     printer.known[out] = whole
@@ -301,13 +301,15 @@ def reduce(printer: Printer, operation: Operation) -> None:
 
 def argmax(printer: Printer, operation: Operation) -> None:
     """The index of the first of the largest elements along an axis."""
-    axes, out, found = operation.params["axes"], operation.outputs[0], printer.view(operation.inputs[0])
-    kept = [axis for axis in range(len(found.shape)) if axis not in axes]
+    axes, out, array = operation.params["axes"], operation.outputs[0], printer.view(operation.inputs[0])
+    remaining_axes = [axis for axis in range(len(array.shape)) if axis not in axes]
     whole = printer.buffer(out.shape, out.dtype)
     with printer.block(out.shape) as index:
         printer.declare("best", "index", "0")
-        with printer.block([found.shape[axes[0]]]) as (i,):
-            element, best = (found.read(placed((kept, index), (axes, [one]))) for one in (i, "best"))
+        with printer.block([array.shape[axes[0]]]) as (i,):
+            element, best = (
+                array.read(placed((remaining_axes, index), (axes, [element_index]))) for element_index in (i, "best")
+            )
             printer.lines.append(f"if ({element} > {best}) best = {i};")
         printer.lines.append(f"{whole.read(index)} = best;")
     printer.known[out] = whole
@@ -315,14 +317,14 @@ def argmax(printer: Printer, operation: Operation) -> None:
 
 def product(printer: Printer, operation: Operation) -> None:
     """A product of matrices, row by row of the right one."""
-    left, right = (printer.view(one) for one in operation.inputs)
+    first, right = (printer.view(value) for value in operation.inputs)
     out = printer.buffer(operation.outputs[0].shape, operation.outputs[0].dtype)
     *outer, shared, width = right.shape
-    with printer.block([*outer, left.shape[-2]]) as rows:
+    with printer.block([*outer, first.shape[-2]]) as rows:
         with printer.block([width]) as columns:
             printer.lines.append(f"{out.read([*rows, *columns])} = 0;")
         with printer.block([shared]) as inner:
-            printer.declare("x", left.dtype, left.read([*rows, *inner]))
+            printer.declare("x", first.dtype, first.read([*rows, *inner]))
             with printer.block([width]) as columns:
                 weight = right.read([*rows[:-1], *inner, *columns])
                 printer.lines.append(f"{out.read([*rows, *columns])} += x * {weight};")

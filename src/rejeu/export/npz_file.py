@@ -22,16 +22,18 @@ def described(program: TracedProgram) -> tuple[dict[str, Any], list[np.ndarray]]
     Raises:
         ValueError: if NumPy has no function for one of its operations.
     """
-    values = [*program.arguments, *(one for step in program.operations for one in (*step.inputs, *step.outputs))]
-    constants = [*dict.fromkeys(one for one in (*values, *program.outputs) if one.data is not None)]
-    numbers = {one: i for i, one in enumerate(dict.fromkeys([*constants, *values]))}
+    values = [*program.arguments, *(value for step in program.operations for value in (*step.inputs, *step.outputs))]
+    constants = [*dict.fromkeys(value for value in (*values, *program.outputs) if value.data is not None)]
+    numbers = {value: i for i, value in enumerate(dict.fromkeys([*constants, *values]))}
 
     def listed(values: Any) -> list[int]:
-        return [numbers[one] for one in values]
+        return [numbers[value] for value in values]
 
-    steps = [[name_of(one), listed(one.inputs), listed(one.outputs), parameters(one)] for one in program.operations]
+    steps = [
+        [name_of(value), listed(value.inputs), listed(value.outputs), parameters(value)] for value in program.operations
+    ]
     description = {"inputs": listed(program.arguments), "operations": steps, "outputs": listed(program.outputs)}
-    return description, [one.data for one in constants if one.data is not None]
+    return description, [value.data for value in constants if value.data is not None]
 
 
 def name_of(operation: Operation) -> str:
@@ -44,13 +46,13 @@ def parameters(operation: Operation) -> dict[str, Any]:
     rounding = operation.params.get("rounding_method", 1)
     if name_of(operation) not in FUNCTIONS or int(rounding) != 1:
         raise unsupported(operation, "npz")
-    return {key: value for key, one in operation.params.items() if (value := plain(one)) is not None}
+    return {key: value for key, param in operation.params.items() if (value := plain(param)) is not None}
 
 
 def plain(param: Any) -> Any:
     """Returns a parameter as JSON values; None for others."""
     if isinstance(param, tuple | list):
-        return [plain(one) for one in param]
+        return [plain(item) for item in param]
     if isinstance(param, np.dtype | type):
         return np.dtype(param).name
     if is_symbolic_dim(param):
@@ -71,7 +73,7 @@ def files(source: Exportable) -> tuple[tuple[bytes, ...], Run]:
     content, constants = content_of(source)
     text = np.frombuffer(json.dumps(content, allow_nan=False).encode(), np.uint8)
     file, ports = io.BytesIO(), source.policy.inputs
-    np.savez(file, **{POLICY: text}, **{f"c{i}": one for i, one in enumerate(constants)})  # type: ignore[arg-type]
+    np.savez(file, **{POLICY: text}, **{f"c{i}": constant for i, constant in enumerate(constants)})  # type: ignore[arg-type]
     policy = parse(file.getvalue())
     names = [port.name for port in source.policy.outputs]
 

@@ -41,9 +41,9 @@ def sliced(n: int, params: Params, x: np.ndarray) -> np.ndarray:
     return x[tuple(map(slice, params["start_indices"], ends, strides))]
 
 
-def selected(n: int, params: Params, which: np.ndarray, *cases: np.ndarray) -> np.ndarray:
+def selected(n: int, params: Params, index: np.ndarray, *cases: np.ndarray) -> np.ndarray:
     """For each element one of several cases."""
-    return np.where(which, *reversed(cases)) if which.dtype == bool else np.choose(which, cases)
+    return np.where(index, *reversed(cases)) if index.dtype == bool else np.choose(index, cases)
 
 
 def reduction(function: Function) -> Function:
@@ -91,8 +91,8 @@ def count(name: str, params: Params, inputs: Sequence[np.ndarray]) -> int:
     if name == "matmul":
         return inputs[0].size * inputs[1].shape[-1] // 256  # multiplications are cheap
     if name in ELEMENTWISE:
-        return math.prod(np.broadcast_shapes(*(one.shape for one in inputs)))
-    return sum(one.size for one in inputs)
+        return math.prod(np.broadcast_shapes(*(array.shape for array in inputs)))
+    return sum(array.size for array in inputs)
 
 
 class ArrayOperation(NamedTuple):
@@ -103,9 +103,9 @@ class ArrayOperation(NamedTuple):
     outputs: list[int]
     params: dict[str, Any]
 
-    def run(self, n: int, known: dict[int, np.ndarray]) -> None:
+    def run(self, n: int, values: dict[int, np.ndarray]) -> None:
         """Adds the outputs for ``n`` observations to the known arrays."""
-        known[self.outputs[0]] = FUNCTIONS[self.name](n, self.params, *[known[i] for i in self.inputs])
+        values[self.outputs[0]] = FUNCTIONS[self.name](n, self.params, *[values[i] for i in self.inputs])
 
 
 class NumpyProgram:
@@ -123,25 +123,25 @@ class NumpyProgram:
         """
         self._inputs, self._outputs = description["inputs"], description["outputs"]
         self._constants, self._steps = dict(enumerate(constants)), []
-        known, left = self._known(examples), MOST_NUMBERS
-        for step in (ArrayOperation(*one) for one in description["operations"]):
-            left -= count(step.name, step.params, [known[i] for i in step.inputs])
-            if left < 0:
+        values, numbers_left = self._known(examples), MOST_NUMBERS
+        for step in (ArrayOperation(*fields) for fields in description["operations"]):
+            numbers_left -= count(step.name, step.params, [values[i] for i in step.inputs])
+            if numbers_left < 0:
                 raise ValueError(f"it computes more than {MOST_NUMBERS} numbers for one observation")
             with np.errstate(all="ignore"):
-                step.run(1, known)
+                step.run(1, values)
             if self._constants.keys() >= {*step.inputs} and -1 not in step.params.get("shape", ()):
-                self._constants |= {i: known[i] for i in step.outputs}
+                self._constants |= {i: values[i] for i in step.outputs}
             else:
                 self._steps.append(step)
 
     def __call__(self, n: int, arrays: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Returns the outputs for ``n`` observations."""
-        known = self._known(arrays)
+        values = self._known(arrays)
         with np.errstate(all="ignore"):
             for step in self._steps:
-                step.run(n, known)
-        return [known[i] for i in self._outputs]
+                step.run(n, values)
+        return [values[i] for i in self._outputs]
 
     def _known(self, arrays: Sequence[np.ndarray]) -> dict[int, np.ndarray]:
         return self._constants | dict(zip(self._inputs, arrays, strict=True))
@@ -157,10 +157,10 @@ class NumpyPolicy:
         self.observation_space, self.action_space = (
             spaces.rebuild(content[key], largest) for key in ("observation_space", "action_space")
         )
-        roles = [one["role"] for one in self.card["inputs"]]
+        roles = [port["role"] for port in self.card["inputs"]]
         self.takes_masks = "action_mask" in roles
         self._leaves, self._n_states = spaces.leaves(self.observation_space), roles.count("state")
-        zeros = [np.zeros((1, *one["shape"]), one["dtype"]) for one in self.card["inputs"]]
+        zeros = [np.zeros((1, *port["shape"]), port["dtype"]) for port in self.card["inputs"]]
         n_leaves = len(self._leaves)
         self._state = zeros[n_leaves + self.takes_masks :][: self._n_states]
         self.program = NumpyProgram(content["program"], constants, zeros)
@@ -199,7 +199,7 @@ class NumpyPolicy:
             arrays.append(np.broadcast_to(np.asarray(True if action_masks is None else action_masks, bool), shape))
         if self._n_states:
             start = state is None if episode_start is None else episode_start
-            arrays += [np.repeat(one, n, axis=0) for one in self._state] if state is None else state
+            arrays += [np.repeat(memory, n, axis=0) for memory in self._state] if state is None else state
             arrays.append(np.broadcast_to(np.asarray(start, bool), n))
         action, *after = self.program(n, arrays)
         action = action.astype(self.action_space.dtype)
@@ -213,7 +213,7 @@ def parse(content: bytes) -> NumpyPolicy:
         ValueError: if it is not valid, or others of :data:`rejeu.core.records.WRONG`.
     """
     with zipfile.ZipFile(io.BytesIO(content)) as file:
-        if any(one.compress_type != zipfile.ZIP_STORED for one in file.infolist()):
+        if any(member.compress_type != zipfile.ZIP_STORED for member in file.infolist()):
             raise ValueError("it is compressed")
     with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
         description = parse_json(arrays[POLICY].tobytes())

@@ -38,10 +38,10 @@ class Graph:
         """Name of the size of the batch, ``int64 (1,)``; empty until it is needed."""
         self._constants: dict[bytes, str] = {}
 
-    def node(self, kind: str, inputs: Sequence[str], **attributes: Any) -> str:
+    def node(self, operator: str, inputs: Sequence[str], **attributes: Any) -> str:
         """Adds a node and returns the name of its output."""
         name = f"/v{len(self.nodes)}"  # which no key of an observation is called
-        self.nodes.append(helper.make_node(kind, inputs, [name], **attributes))
+        self.nodes.append(helper.make_node(operator, inputs, [name], **attributes))
         return name
 
     def constant(self, array: Any) -> str:
@@ -91,14 +91,14 @@ def add(graph: Graph, operation: Operation) -> None:
             sizes[axis] = size
         graph.narrow[outputs[0]] = graph.reshape(graph.name(inputs[0]), sizes)
     elif name in PRIMITIVES or name == "convert_element_type":
-        has_shape = any(one.shape == outputs[0].shape and one not in graph.narrow for one in inputs)
-        names = [graph.loose(one) if has_shape else graph.name(one) for one in inputs]
+        has_shape = any(value.shape == outputs[0].shape and value not in graph.narrow for value in inputs)
+        names = [graph.loose(value) if has_shape else graph.name(value) for value in inputs]
         graph.names[outputs[0]] = elementwise(graph, operation, names)
     elif name in REDUCTIONS:
         axes = graph.constant(np.array(operation.params["axes"], np.int64))
         graph.names[outputs[0]] = graph.node(REDUCTIONS[name], [graph.name(inputs[0]), axes], keepdims=0)
     elif name in STRUCTURAL:
-        graph.names[outputs[0]] = STRUCTURAL[name](graph, operation, [graph.name(one) for one in inputs])
+        graph.names[outputs[0]] = STRUCTURAL[name](graph, operation, [graph.name(value) for value in inputs])
     else:
         raise unsupported(operation, "ONNX")
 
@@ -112,13 +112,13 @@ def elementwise(graph: Graph, operation: Operation, names: list[str]) -> str:
     name, params = operation.name, operation.params
     if name == "convert_element_type":
         return graph.cast(names[0], params["new_dtype"])
-    kind = PRIMITIVES[name].get("onnx")
+    operator = PRIMITIVES[name].get("onnx")
     if name == "select_n":
         names[1:] = reversed(names[1:])
     is_other = name == "select_n" and (len(names) != 3 or operation.inputs[0].dtype != bool)
-    if kind is None or is_other or (name == "round" and int(params["rounding_method"]) != 1):
+    if operator is None or is_other or (name == "round" and int(params["rounding_method"]) != 1):
         raise unsupported(operation, "ONNX")
-    return graph.node(kind, names, **({"fmod": 1} if name == "rem" else {}))
+    return graph.node(operator, names, **({"fmod": 1} if name == "rem" else {}))
 
 
 def sliced(graph: Graph, operation: Operation, names: list[str]) -> str:
@@ -127,13 +127,13 @@ def sliced(graph: Graph, operation: Operation, names: list[str]) -> str:
     ends = [TO_THE_END if size == -1 else end for size, end in zip(shape, params["limit_indices"], strict=True)]
     steps = params["strides"] or [1] * len(ends)
     parts = (params["start_indices"], ends, range(len(ends)), steps)
-    return graph.node("Slice", [names[0], *(graph.constant(np.array([*part], np.int64)) for part in parts)])
+    return graph.node("Slice", [names[0], *(graph.constant(np.array([*bounds], np.int64)) for bounds in parts)])
 
 
 def argmax(graph: Graph, operation: Operation, names: list[str]) -> str:
     """The index of the first of the largest elements."""
-    found = graph.node("ArgMax", names, axis=operation.params["axes"][0], keepdims=0)
-    return graph.cast(found, operation.params["index_dtype"])
+    index = graph.node("ArgMax", names, axis=operation.params["axes"][0], keepdims=0)
+    return graph.cast(index, operation.params["index_dtype"])
 
 
 def reshaped(graph: Graph, operation: Operation, names: list[str]) -> str:
@@ -174,20 +174,20 @@ def write(policy: Policy, card: dict[str, Any]) -> bytes:
     inputs = []
     for port, value in zip(policy.inputs, program.arguments, strict=True):
         graph.names[value] = port.name
-        kind = helper.np_dtype_to_tensor_dtype(np.dtype(port.dtype))
-        inputs.append(helper.make_tensor_value_info(port.name, kind, [size, *port.shape]))
+        dtype = helper.np_dtype_to_tensor_dtype(np.dtype(port.dtype))
+        inputs.append(helper.make_tensor_value_info(port.name, dtype, [size, *port.shape]))
     shape = graph.node("Shape", [policy.inputs[0].name])
     graph.batch = graph.node("Slice", [shape, *(graph.constant(np.array([i], np.int64)) for i in (0, 1))])
     for operation in program.operations:
         add(graph, operation)
     outputs = []
     for port, value in zip(policy.outputs, program.outputs, strict=True):
-        kind = helper.np_dtype_to_tensor_dtype(np.dtype(port.dtype))
-        graph.nodes.append(helper.make_node("Cast", [graph.name(value)], [port.name], to=kind))
-        outputs.append(helper.make_tensor_value_info(port.name, kind, [size, *port.shape]))
-    made = helper.make_graph(graph.nodes, "policy", inputs, outputs, graph.initializers)
+        dtype = helper.np_dtype_to_tensor_dtype(np.dtype(port.dtype))
+        graph.nodes.append(helper.make_node("Cast", [graph.name(value)], [port.name], to=dtype))
+        outputs.append(helper.make_tensor_value_info(port.name, dtype, [size, *port.shape]))
+    onnx_graph = helper.make_graph(graph.nodes, "policy", inputs, outputs, graph.initializers)
     opset = [helper.make_opsetid("", OPSET)]
-    model = helper.make_model(made, opset_imports=opset, ir_version=IR_VERSION, producer_name="rejeu")
+    model = helper.make_model(onnx_graph, opset_imports=opset, ir_version=IR_VERSION, producer_name="rejeu")
     helper.set_model_props(model, {"rejeu": json.dumps(card)})
     onnx.checker.check_model(model, full_check=True)
     return model.SerializeToString()

@@ -25,9 +25,9 @@ DRAWS = {"_normal": "normal", "_uniform": "uniform", "_randint": "uniform"}
 
 def power(params: Any, x: Any) -> Any:
     """A power with a whole exponent, as products."""
-    y, one = params["y"], x.dtype.type(1)
+    y, unit = params["y"], x.dtype.type(1)
     result = math.prod([x] * (abs(y) - 1), start=x) if y else jnp.ones_like(x)
-    return one / result if y < 0 else result
+    return unit / result if y < 0 else result
 
 
 def padded(params: Any, x: Any, value: Any) -> Any:
@@ -35,39 +35,39 @@ def padded(params: Any, x: Any, value: Any) -> Any:
     for axis, (low, high, _) in enumerate(params["padding_config"]):
         border = lambda n, axis=axis: jnp.broadcast_to(value, [*x.shape[:axis], n, *x.shape[axis + 1 :]])  # noqa: B023, E731
         parts = (border(low) if low else None, x, border(high) if high else None)
-        x = jnp.concatenate([one for one in parts if one is not None], axis)
+        x = jnp.concatenate([piece for piece in parts if piece is not None], axis)
     return x
 
 
 def convolution(params: Any, x: Any, kernel: Any) -> Any:
     """A convolution, as the product of a matrix of patches."""
-    left, right, out = params["dimension_numbers"]
-    x = x.transpose(left[0], *left[2:], left[1])
+    lhs, right, out = params["dimension_numbers"]
+    x = x.transpose(lhs[0], *lhs[2:], lhs[1])
     x = jnp.pad(x, [(0, 0), *params["padding"], (0, 0)])
     kernel = kernel.transpose(*right[2:], right[1], right[0])
     steps, gaps = params["window_strides"], params["rhs_dilation"]
     patches = []
     for tap in np.ndindex(*kernel.shape[:-2]):
-        part = x
+        patch = x
         for axis, (i, n, step, gap) in enumerate(zip(tap, kernel.shape, steps, gaps, strict=False), 1):
-            part = jax.lax.slice_in_dim(part, i * gap, x.shape[axis] - (n - 1 - i) * gap, step, axis)
-        patches.append(part)
-    found = jnp.concatenate(patches, -1) @ kernel.reshape(-1, kernel.shape[-1])
-    return found.transpose(np.argsort([out[0], *out[2:], out[1]]))
+            patch = jax.lax.slice_in_dim(patch, i * gap, x.shape[axis] - (n - 1 - i) * gap, step, axis)
+        patches.append(patch)
+    result = jnp.concatenate(patches, -1) @ kernel.reshape(-1, kernel.shape[-1])
+    return result.transpose(np.argsort([out[0], *out[2:], out[1]]))
 
 
 def product(params: Any, x: Any, y: Any) -> Any:
     """A product along any axes, as one of matrices."""
-    (left, right), (left_batch, right_batch) = params["dimension_numbers"]
-    n, n_shared = len(left_batch), len(left)
-    free = [i for i in range(x.ndim) if i not in (*left_batch, *left)]
-    x = x.transpose(*left_batch, *free, *left)
+    (lhs_axes, right), (left_batch, right_batch) = params["dimension_numbers"]
+    n, n_shared = len(left_batch), len(lhs_axes)
+    free = [i for i in range(x.ndim) if i not in (*left_batch, *lhs_axes)]
+    x = x.transpose(*left_batch, *free, *lhs_axes)
     y = y.transpose(*right_batch, *right, *(i for i in range(y.ndim) if i not in (*right_batch, *right)))
     shape, rows, columns = x.shape[:n], x.shape[n : n + len(free)], y.shape[n + n_shared :]
     shared = math.prod(y.shape[n : n + n_shared])
     x, y = x.reshape(*shape, math.prod(rows), shared), y.reshape(*shape, shared, math.prod(columns))
-    found = jax.lax.dot_general(x, y, of_matrices(n), params["precision"], params["preferred_element_type"])
-    return found.reshape(*shape, *rows, *columns)
+    result = jax.lax.dot_general(x, y, of_matrices(n), params["precision"], params["preferred_element_type"])
+    return result.reshape(*shape, *rows, *columns)
 
 
 def of_matrices(n: int) -> Any:
@@ -98,7 +98,7 @@ REWRITTEN: dict[str, Callable[..., Any]] = {
     "split": parts,
     "square": lambda _, x: x * x,
     "stack": lambda params, *parts: jnp.concatenate(
-        [jnp.expand_dims(one, params["axis"]) for one in parts], params["axis"]
+        [jnp.expand_dims(array, params["axis"]) for array in parts], params["axis"]
     ),
 }
 """Primitives that are written with others, so that no format needs them."""
@@ -108,7 +108,7 @@ def is_rewritten(name: str, params: Any, inputs: Sequence[Value]) -> bool:
     """Returns whether a primitive is written with others; transposed or grouped convolutions and gaps are not."""
     if name == "dot_general":
         n = len(params["dimension_numbers"][1][0])
-        return params["dimension_numbers"] != of_matrices(n) or {len(one.shape) for one in inputs} != {n + 2}
+        return params["dimension_numbers"] != of_matrices(n) or {len(array.shape) for array in inputs} != {n + 2}
     if name == "conv_general_dilated":
         return params["feature_group_count"] * params["batch_group_count"] * max(params["lhs_dilation"]) == 1
     if name == "pad":
@@ -155,13 +155,13 @@ class TracedProgram(NamedTuple):
 
     def __call__(self, *arrays: Any) -> list[Any]:
         """Returns the outputs for inputs and draws, computed by JAX; it may be compiled."""
-        known: dict[Value, Any] = dict(zip(self.arguments, arrays, strict=True))
+        values: dict[Value, Any] = dict(zip(self.arguments, arrays, strict=True))
         for operation in self.operations:
-            inputs = [known[one] if one.data is None else jnp.asarray(one.data) for one in operation.inputs]
-            found = operation.primitive.bind(*inputs, **operation.params)
-            outputs = found if operation.primitive.multiple_results else [found]
-            known |= zip(operation.outputs, outputs, strict=True)
-        return [known[one] if one.data is None else jnp.asarray(one.data) for one in self.outputs]
+            inputs = [values[value] if value.data is None else jnp.asarray(value.data) for value in operation.inputs]
+            results = operation.primitive.bind(*inputs, **operation.params)
+            outputs = results if operation.primitive.multiple_results else [results]
+            values |= zip(operation.outputs, outputs, strict=True)
+        return [values[value] if value.data is None else jnp.asarray(value.data) for value in self.outputs]
 
     @property
     def arguments(self) -> tuple[Value, ...]:
@@ -170,13 +170,13 @@ class TracedProgram(NamedTuple):
 
     def ending_in(self, outputs: Sequence[Value]) -> TracedProgram:
         """Returns the program of other outputs, without the operations that these do not need."""
-        needed, kept = {*outputs}, []
+        needed, operations = {*outputs}, []
         for operation in reversed(self.operations):
             if not needed.isdisjoint(operation.outputs):
                 needed |= {*operation.inputs}
-                kept.append(operation)
-        draws = tuple((kind, value) for kind, value in self.draws if value in needed)
-        return TracedProgram(self.inputs, draws, tuple(reversed(kept)), tuple(outputs))
+                operations.append(operation)
+        draws = tuple((draw_name, value) for draw_name, value in self.draws if value in needed)
+        return TracedProgram(self.inputs, draws, tuple(reversed(operations)), tuple(outputs))
 
 
 def unsupported(operation: Operation, target: str, detail: str = "") -> ValueError:
@@ -202,8 +202,8 @@ def trace(function: Callable[..., Any], *examples: Any, draws: bool = False) -> 
     """
     closed = jax.make_jaxpr(function)(*examples)
     tracing = _Tracing()
-    leaves = [Value(one.aval.shape, one.aval.dtype) for one in closed.jaxpr.invars]
-    constants = [Value(np.shape(one), one.dtype, np.asarray(one)) for one in closed.consts]
+    leaves = [Value(variable.aval.shape, variable.aval.dtype) for variable in closed.jaxpr.invars]
+    constants = [Value(np.shape(variable), variable.dtype, np.asarray(variable)) for variable in closed.consts]
     outputs = tracing.inline(closed.jaxpr, [*constants, *leaves])
     inputs = tuple(leaves[:-1] if draws else leaves)
     program = TracedProgram(inputs, tuple(tracing.draws), tuple(tracing.operations), ()).ending_in(outputs)
@@ -224,14 +224,14 @@ class _Tracing:
 
     def inline(self, jaxpr: Any, arguments: Sequence[Value]) -> list[Value]:
         """Adds the operations of a jaxpr with these constants and arguments, and returns its outputs."""
-        known: dict[Any, Value] = dict(zip([*jaxpr.constvars, *jaxpr.invars], arguments, strict=True))
+        values: dict[Any, Value] = dict(zip([*jaxpr.constvars, *jaxpr.invars], arguments, strict=True))
 
         def read(atom: Any) -> Value:
-            return _constant(atom) if isinstance(atom, core.Literal) else known[atom]
+            return _constant(atom) if isinstance(atom, core.Literal) else values[atom]
 
         for equation in jaxpr.eqns:
             outputs = self.add(equation, [read(atom) for atom in equation.invars])
-            known |= zip(equation.outvars, outputs, strict=True)
+            values |= zip(equation.outvars, outputs, strict=True)
         return [read(atom) for atom in jaxpr.outvars]
 
     def add(self, equation: Any, inputs: Sequence[Value]) -> Sequence[Value]:
@@ -243,43 +243,45 @@ class _Tracing:
             return self.draw(DRAWS[params["name"]], equation.outvars[0].aval, inputs[1:])
         inner = next((params[key] for key in INLINED if key in params), None)
         if is_rewritten(name, params, inputs):
-            examples = [jax.ShapeDtypeStruct(one.shape, one.dtype) for one in inputs]
+            examples = [jax.ShapeDtypeStruct(value.shape, value.dtype) for value in inputs]
             inner = jax.make_jaxpr(partial(REWRITTEN[name], params))(*examples)
         before, where = self.where, _line(equation.source_info) or self.where
         if inner is not None and name not in ("scan", "while", "cond"):
-            constants = [Value(np.shape(one), one.dtype, np.asarray(one)) for one in getattr(inner, "consts", ())]
+            constants = [
+                Value(np.shape(value), value.dtype, np.asarray(value)) for value in getattr(inner, "consts", ())
+            ]
             self.where = where
-            found = self.inline(getattr(inner, "jaxpr", inner), [*constants, *inputs])
+            outputs_of_inner = self.inline(getattr(inner, "jaxpr", inner), [*constants, *inputs])
             self.where = before
-            return found
-        avals = [one.aval for one in equation.outvars]
+            return outputs_of_inner
+        avals = [value.aval for value in equation.outvars]
         sizes = [aval.size for aval in avals]
         is_static = all(isinstance(size, int) for size in sizes) and not any("random" in str(a.dtype) for a in avals)
-        if is_static and all(one.data is not None for one in inputs):
-            largest = max([LARGEST_FOLD, *(one.data.size for one in inputs)])  # type: ignore[union-attr]
+        if is_static and all(value.data is not None for value in inputs):
+            largest = max([LARGEST_FOLD, *(value.data.size for value in inputs)])  # type: ignore[union-attr]
             if all(size <= largest for size in sizes) and not str(name).startswith("random"):
-                found = equation.primitive.bind(*[jnp.asarray(one.data) for one in inputs], **params)
-                arrays = found if equation.primitive.multiple_results else [found]
+                outputs_of_inner = equation.primitive.bind(*[jnp.asarray(value.data) for value in inputs], **params)
+                arrays = outputs_of_inner if equation.primitive.multiple_results else [outputs_of_inner]
                 return [Value(array.shape, array.dtype, np.asarray(array)) for array in arrays]
         outputs = tuple(Value(aval.shape, _dtype(aval)) for aval in avals)
         self.operations.append(Operation(equation.primitive, tuple(inputs), outputs, params, where))
         return outputs
 
-    def draw(self, kind: str, aval: Any, bounds: Sequence[Value]) -> Sequence[Value]:
+    def draw(self, draw_name: str, aval: Any, bounds: Sequence[Value]) -> Sequence[Value]:
         """Returns an input in the place of numbers that are drawn; uniform ones are scaled to their bounds."""
         drawn = Value([size for i, size in enumerate(aval.shape) if i == 0 or size != 1], np.float32)
-        self.draws.append((kind, drawn))
+        self.draws.append((draw_name, drawn))
 
         def scaled(u: Any, *bounds: Any) -> Any:
             u = u.reshape(aval.shape)
-            if kind == "normal":
+            if draw_name == "normal":
                 return u
-            low, high = (jnp.broadcast_to(one, aval.shape).astype(jnp.float32) for one in bounds)
+            low, high = (jnp.broadcast_to(value, aval.shape).astype(jnp.float32) for value in bounds)
             number = low + u * (high - low)
             return number if aval.dtype == number.dtype else jnp.floor(number).astype(aval.dtype)
 
-        bounds = bounds if kind == "uniform" else ()
-        examples = [jax.ShapeDtypeStruct(one.shape, one.dtype) for one in (drawn, *bounds)]
+        bounds = bounds if draw_name == "uniform" else ()
+        examples = [jax.ShapeDtypeStruct(value.shape, value.dtype) for value in (drawn, *bounds)]
         return self.inline(jax.make_jaxpr(scaled)(*examples).jaxpr, [drawn, *bounds])
 
 
@@ -295,9 +297,9 @@ def _dtype(aval: Any) -> Any:
 
 def _line(source_info: Any) -> str:
     """Returns the innermost line outside of installed packages and rejeu that made an operation."""
-    own = Path(__file__).resolve().parents[1]
+    package = Path(__file__).resolve().parents[1]
     for frame in getattr(source_info.traceback, "frames", ()):
         path = Path(frame.file_name)
-        if "site-packages" not in path.parts and own not in path.parents and path.is_file():
+        if "site-packages" not in path.parts and package not in path.parents and path.is_file():
             return f"{path.name}, line {frame.line_num}, in {frame.function_name}"
     return ""

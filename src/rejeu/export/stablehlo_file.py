@@ -27,23 +27,23 @@ def write(policy: Policy, card: dict[str, Any]) -> bytes:
     """
 
     def act(inputs: dict[str, Array]) -> dict[str, Array]:
-        found = policy.program(*(inputs[port.name] for port in policy.inputs))
-        return {port.name: one for port, one in zip(policy.outputs, found, strict=True)}
+        results = policy.program(*(inputs[port.name] for port in policy.inputs))
+        return {port.name: result for port, result in zip(policy.outputs, results, strict=True)}
 
     examples = {
         port.name: ShapeDtypeStruct(value.shape, value.dtype)
         for port, value in zip(policy.inputs, policy.program.arguments, strict=True)
     }
     try:
-        made = export.export(jax.jit(act), platforms=["cpu", "cuda", "tpu"])(examples)
+        exported = export.export(jax.jit(act), platforms=["cpu", "cuda", "tpu"])(examples)
     except NotImplementedError as error:
         raise ValueError(
             f"the policy cannot be exported to stablehlo ({error}); write the part that calls Python with operations of JAX"
         ) from None
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as file:
-        file.writestr(MODULE, made.mlir_module_serialized)
-        file.writestr(EXPORTED, bytes(made.serialize()))
+        file.writestr(MODULE, exported.mlir_module_serialized)
+        file.writestr(EXPORTED, bytes(exported.serialize()))
         file.writestr(CARD, json.dumps(card, indent=1))
     return content.getvalue()
 
@@ -51,8 +51,8 @@ def write(policy: Policy, card: dict[str, Any]) -> bytes:
 def read(content: bytes) -> Callable[[dict[str, np.ndarray]], dict[str, Array]]:
     """Returns the policy of a zip file, as a function from inputs by name to outputs by name."""
     with zipfile.ZipFile(io.BytesIO(content)) as file:
-        made = export.deserialize(bytearray(file.read(EXPORTED)))
-    return jax.jit(made.call)
+        exported = export.deserialize(bytearray(file.read(EXPORTED)))
+    return jax.jit(exported.call)
 
 
 def files(source: Exportable) -> tuple[tuple[bytes, ...], Run]:

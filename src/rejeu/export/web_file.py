@@ -51,8 +51,10 @@ def environment(env_id: str | None, kwargs: Mapping[str, Any]) -> FunctionalEnv:
     name = env_id if env_id in ENVIRONMENTS.values() else ENVIRONMENTS.get(env_id or "")
     if name is None or kwargs.get("dimension", 2) != 2:
         unnamed = "an environment that was given as an object (name it: agent.set_env(ID), --env ID)"
-        said = f"{env_id}{dict(kwargs) or ''}" if env_id else unnamed
-        raise ValueError(f"a page cannot contain {said}; it can contain {', '.join(ENVIRONMENTS)} in two dimensions")
+        description = f"{env_id}{dict(kwargs) or ''}" if env_id else unnamed
+        raise ValueError(
+            f"a page cannot contain {description}; it can contain {', '.join(ENVIRONMENTS)} in two dimensions"
+        )
     try:
         return functional.make(name, **kwargs)
     except TypeError:
@@ -70,13 +72,13 @@ def script(policy: Policy, env: FunctionalEnv, card: dict[str, Any]) -> str:
         raise ValueError("a page cannot contain a policy with wrappers around its environment, frame stacks or masks")
     action = policy.outputs[0]
     state, obs = jax.eval_shape(env.reset, KEY)
-    taken = ShapeDtypeStruct(action.shape, spaces.narrow(action.dtype))
+    action_input = ShapeDtypeStruct(action.shape, spaces.narrow(action.dtype))
 
     def step(state: Any, action: Array, key: Array) -> Any:
         return env.step(key, state, action)
 
-    reset, stepped = trace(env.reset, KEY, draws=True), trace(step, state, taken, KEY, draws=True)
-    about = {
+    reset, stepped = trace(env.reset, KEY, draws=True), trace(step, state, action_input, KEY, draws=True)
+    description = {
         "environment": type(env).__name__,
         "card": card,
         "n_state": len(jax.tree.leaves(state)),
@@ -85,7 +87,7 @@ def script(policy: Policy, env: FunctionalEnv, card: dict[str, Any]) -> str:
         "reset_draws": draws_of(reset),
         "step_draws": draws_of(stepped),
     }
-    constant = json.dumps(about).replace("<", "\\u003c")
+    constant = json.dumps(description).replace("<", "\\u003c")
     functions = (("policy", policy.program), ("resetWorld", reset), ("stepWorld", stepped))
     parts = [function(name, program) for name, program in functions]
     shared = (TEMPLATES / "web.js").read_text(encoding="utf-8")
@@ -110,9 +112,9 @@ def node_run(policy: Policy, script: str) -> Run | None:
 
     def run(inputs: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         n = len(next(iter(inputs.values())))
-        given = [port.name for port in policy.inputs if port.role == "observation"]
+        observation_ports = [port.name for port in policy.inputs if port.role == "observation"]
         starts = next((inputs[port.name] for port in policy.of("episode_start")), np.zeros(n, bool)).tolist()
-        rows = [([inputs[name][i].ravel().tolist() for name in given], starts[i]) for i in range(n)]
+        rows = [([inputs[name][i].ravel().tolist() for name in observation_ports], starts[i]) for i in range(n)]
         actions, seconds = node(script + (TEMPLATES / "node.js").read_text(encoding="utf-8"), rows)
         action = policy.outputs[0]
         return np.array(actions, action.dtype).reshape(n, *action.shape), np.array(seconds)
@@ -120,29 +122,31 @@ def node_run(policy: Policy, script: str) -> Run | None:
     return run
 
 
-def node(script: str, given: Any) -> Any:
+def node(script: str, message: Any) -> Any:
     """Returns what a script writes as JSON, which reads JSON, both by standard input and output."""
     with tempfile.TemporaryDirectory() as name:
         path = Path(name) / "main.js"
         path.write_text(script, encoding="utf-8")
-        found = subprocess.run(["node", path], input=json.dumps(given), capture_output=True, text=True, check=True)
-    return json.loads(found.stdout)
+        completed = subprocess.run(
+            ["node", path], input=json.dumps(message), capture_output=True, text=True, check=True
+        )
+    return json.loads(completed.stdout)
 
 
 def draws_of(program: TracedProgram) -> list[tuple[str, int]]:
     """Returns distribution and number of the random numbers that a program takes."""
-    return [(kind, math.prod(value.sizes)) for kind, value in program.draws]
+    return [(draw_name, math.prod(value.sizes)) for draw_name, value in program.draws]
 
 
 def function(name: str, program: TracedProgram) -> str:
     """Returns a function from arrays to arrays."""
     printer, arguments = Printer(JAVASCRIPT), [f"a{i}" for i in range(len(program.arguments))]
     results: list[str] = []
-    for value, one in zip(program.outputs, printer.run(program, arguments), strict=True):
-        out = memory(f"out{len(results)}", one.shape, value.dtype)
+    for value, result in zip(program.outputs, printer.run(program, arguments), strict=True):
+        out = memory(f"out{len(results)}", result.shape, value.dtype)
         results.append(out.name)
         printer.lines.append(f"const {out.name} = {array(out.dtype, max(math.prod(out.shape), 1))};")
-        printer.copy(one, out)
+        printer.copy(result, out)
     lines = [
         f"const {name} = (() => {{",
         *(f"const {key} = {array(str(data.dtype), numbers(data))};" for key, data in printer.constants.items()),
@@ -164,4 +168,4 @@ def array(dtype: str, content: int | Sequence[float]) -> str:
 def numbers(data: np.ndarray) -> list[float]:
     """Returns the elements of an array, with as many digits as float32 needs."""
     is_float = data.dtype.kind == "f"
-    return [float(f"{one:.9g}") if is_float else int(one) for one in data.ravel().tolist()]
+    return [float(f"{number:.9g}") if is_float else int(number) for number in data.ravel().tolist()]
