@@ -81,8 +81,8 @@ def window_of(n: int) -> int:
 
 def smooth(episodes: Table, values: np.ndarray, is_rate: bool = False, window: int | None = None) -> Smoothed:
     """Returns the moving means of one column with 95 % confidence intervals, those of rates after Wilson; NaN is ignored."""
-    known = usable(values)
-    step, seconds, values = episodes.column("step")[known], episodes.column("seconds")[known], values[known]
+    is_known = usable(values)
+    step, seconds, values = episodes.column("step")[is_known], episodes.column("seconds")[is_known], values[is_known]
     n = len(values)
     window = window_of(n) if window is None else window
     at = thinned(n) if n <= MAX_DOTS else np.unique(np.linspace(window - 1, n - 1, MAX_POINTS).astype(int))
@@ -100,22 +100,22 @@ def normal(mean: np.ndarray, variance: np.ndarray, count: np.ndarray) -> tuple[n
     return mean - half, mean + half
 
 
-def thinned(n: int, most: int = MAX_POINTS) -> np.ndarray:
-    """Returns up to ``most`` row numbers, evenly spaced, with the first and the last."""
-    return np.unique(np.linspace(0, n - 1, min(n, most)).round().astype(int)) if n else np.zeros(0, int)
+def thinned(n: int, limit: int = MAX_POINTS) -> np.ndarray:
+    """Returns up to ``limit`` row numbers, evenly spaced, with the first and the last."""
+    return np.unique(np.linspace(0, n - 1, min(n, limit)).round().astype(int)) if n else np.zeros(0, int)
 
 
-def series(kind: str, name: str, color: str, step: Any, minutes: Any, y: Any = (), **more: Any) -> Series:
+def series(form: str, name: str, color: str, step: Any, minutes: Any, y: Any = (), **more: Any) -> Series:
     """Returns a series for JSON."""
-    own = {key: plain(value) if isinstance(value, np.ndarray) else value for key, value in more.items()}
+    columns = {key: plain(value) if isinstance(value, np.ndarray) else value for key, value in more.items()}
     return {
-        "kind": kind,
+        "kind": form,
         "name": name,
         "color": color,
         "x": steps(step),
         "t": plain(minutes),
         "y": plain(y),
-        **own,
+        **columns,
     }
 
 
@@ -148,35 +148,35 @@ def episode_chart(episodes: Table, evaluations: Table, column: str, window: int 
         window: episodes in the moving mean; None for :func:`window_of` their number.
     """
     values = episodes.column(column)
-    known, is_rate = usable(values), column == "success"
+    is_known, is_rate = usable(values), column == "success"
     evaluated = evaluation_points(evaluations, column)
-    if not known.any() and evaluated is None:
+    if not is_known.any() and evaluated is None:
         return None
-    n = int(known.sum())
-    found: list[Series] = []
+    n = int(is_known.sum())
+    shown_series: list[Series] = []
     if n:
         curve = smooth(episodes, values, is_rate, window)
-        ends = (values[known].min(), values[known].max()) if column == "length" else (-HUGE, HUGE)
+        ends = (values[is_known].min(), values[is_known].max()) if column == "length" else (-HUGE, HUGE)
         curve = curve._replace(low=np.clip(curve.low, *ends), high=np.clip(curve.high, *ends))
         at = curve.step, curve.minutes
         if curve.spread is not None and not is_rate:
             low, high = curve.spread
-            found.append(series("band", "5 % to 95 % of episodes", "dots", *at, low=low, high=high))
+            shown_series.append(series("band", "5 % to 95 % of episodes", "dots", *at, low=low, high=high))
         elif not is_rate:
-            where = episodes.column("step")[known], episodes.column("seconds")[known] / 60
-            found.append(series("dots", "episodes", "dots", *where, values[known]))
-        found.append(series("band", "95 % interval", "line", *at, low=curve.low, high=curve.high))
-        found.append(series("line", f"mean of {window or window_of(n):,} episodes", "line", *at, curve.mean))
+            where = episodes.column("step")[is_known], episodes.column("seconds")[is_known] / 60
+            shown_series.append(series("dots", "episodes", "dots", *where, values[is_known]))
+        shown_series.append(series("band", "95 % interval", "line", *at, low=curve.low, high=curve.high))
+        shown_series.append(series("line", f"mean of {window or window_of(n):,} episodes", "line", *at, curve.mean))
     if evaluated is not None:
-        found.append(evaluated)
-    own = np.array(
+        shown_series.append(evaluated)
+    evaluated_values = np.array(
         [] if evaluated is None else [y for end in ("y", "low", "high") for y in evaluated[end] if y is not None]
     )
     return {
         "y": {"return": "return", "success": "success rate", "length": "steps"}[column],
         "percent": is_rate,
-        "range": [-0.03, 1.03] if is_rate else fit(values, own),
-        "series": found,
+        "range": [-0.03, 1.03] if is_rate else fit(values, evaluated_values),
+        "series": shown_series,
         "note": "" if n <= MAX_DOTS else f"{n:,} episodes; each of {MAX_POINTS} points stands for {window_of(n):,}",
     }
 
@@ -240,8 +240,8 @@ def metric_charts(table: Table) -> dict[str, Chart]:
     """Returns the chart of every metric with a finite value, by name."""
     names = [name for name in table.columns if name != "step" and not name.startswith("time/") and name not in LEFT_OUT]
     names += [name for name in ("time/fps",) if name in table.columns]
-    known = {name: np.flatnonzero(usable(table.columns[name])) for name in names[:MAX_METRICS]}
-    return {name: metric_chart(table, table.columns[name], at) for name, at in known.items() if len(at)}
+    rows_of = {name: np.flatnonzero(usable(table.columns[name])) for name in names[:MAX_METRICS]}
+    return {name: metric_chart(table, table.columns[name], at) for name, at in rows_of.items() if len(at)}
 
 
 def metric_chart(table: Table, values: np.ndarray, at: np.ndarray) -> Chart:
@@ -249,13 +249,13 @@ def metric_chart(table: Table, values: np.ndarray, at: np.ndarray) -> Chart:
     step, minutes = table.column("step"), table.column("time/time_elapsed") / 60
     note = ""
     if len(at) <= MAX_POINTS:
-        kind = "line" if len(at) > 1 else "points"
-        found = [series(kind, "", "line", step[at], minutes[at], values[at])]
+        form = "line" if len(at) > 1 else "points"
+        shown_series = [series(form, "", "line", step[at], minutes[at], values[at])]
     else:
         rows = np.array_split(at, MAX_POINTS)
         last = np.array([row[-1] for row in rows])
         mean, low, high = (np.array([f(values[row]) for row in rows]) for f in (np.mean, np.min, np.max))
-        found = [
+        shown_series = [
             series("band", "range", "line", step[last], minutes[last], low=low, high=high),
             series("line", "mean", "line", step[last], minutes[last], mean),
         ]
@@ -264,7 +264,7 @@ def metric_chart(table: Table, values: np.ndarray, at: np.ndarray) -> Chart:
         "y": "",
         "percent": False,
         "range": fit(values[at], np.zeros(0)),
-        "series": found,
+        "series": shown_series,
         "note": note,
         "small": True,
     }
@@ -273,16 +273,16 @@ def metric_chart(table: Table, values: np.ndarray, at: np.ndarray) -> Chart:
 def time_chart(table: Table) -> Chart | None:
     """Returns the shares of time as stacked areas; None if they are unknown."""
     shares = {name: table.column(f"time/{name}_share") for name in SHARES}
-    known = np.flatnonzero(np.isfinite(list(shares.values())).all(0))
-    if not len(known):
+    rows = np.flatnonzero(np.isfinite(list(shares.values())).all(0))
+    if not len(rows):
         return None
-    at = known[thinned(len(known), MAX_POINTS // 2)]
+    at = rows[thinned(len(rows), MAX_POINTS // 2)]
     where = table.column("step")[at], table.column("time/time_elapsed")[at] / 60
-    found = [
+    shown_series = [
         series("area", SHARES[name], f"area{i}", *where, np.clip(shares[name][at], 0, 1))
         for i, name in enumerate(SHARES)
     ]
-    return {"y": "", "percent": True, "range": [0, 1], "series": found, "note": ""}
+    return {"y": "", "percent": True, "range": [0, 1], "series": shown_series, "note": ""}
 
 
 def histogram(
@@ -298,27 +298,30 @@ def histogram(
         command: how to see the episode of seed ``N``, if the columns contain seeds.
         listed: most episodes of a bar that are listed, evenly spaced in time.
     """
-    known = np.flatnonzero(usable(values))
-    if not len(known):
+    rows_known = np.flatnonzero(usable(values))
+    if not len(rows_known):
         return None
-    low, high = np.quantile(values[known], (0.005, 0.995)) if len(known) > 400 else np.array([0, 0])
+    low, high = np.quantile(values[rows_known], (0.005, 0.995)) if len(rows_known) > 400 else np.array([0, 0])
     if low == high:
-        low, high = values[known].min(), values[known].max()
+        low, high = values[rows_known].min(), values[rows_known].max()
     if low == high:
         low, high = low - 0.5, high + 0.5
-    n_bars = min(BARS, max(round(2 * math.sqrt(len(known))), 5))
+    n_bars = min(BARS, max(round(2 * math.sqrt(len(rows_known))), 5))
     edges = np.linspace(low, high, n_bars + 1)
-    bar = np.clip(np.searchsorted(edges, values[known], "right") - 1, 0, n_bars - 1)
-    members = [known[bar == i] for i in range(n_bars)]
-    chosen = [one[thinned(len(one), listed)] for one in members]
-    rows = [[plain(row) for row in np.array([column[one] for column in columns.values()]).T] for one in chosen]
+    bar = np.clip(np.searchsorted(edges, values[rows_known], "right") - 1, 0, n_bars - 1)
+    members = [rows_known[bar == i] for i in range(n_bars)]
+    listed_rows = [rows_of_bar[thinned(len(rows_of_bar), listed)] for rows_of_bar in members]
+    rows = [
+        [plain(row) for row in np.array([column[rows_of_bar] for column in columns.values()]).T]
+        for rows_of_bar in listed_rows
+    ]
     return {
         "edges": plain(edges),
-        "counts": [len(one) for one in members],
+        "counts": [len(rows_of_bar) for rows_of_bar in members],
         "columns": [*columns],
         "rows": rows,
-        "least": plain([values[known].min()])[0],
-        "most": plain([values[known].max()])[0],
+        "least": plain([values[rows_known].min()])[0],
+        "most": plain([values[rows_known].max()])[0],
         "command": command,
     }
 
@@ -330,29 +333,35 @@ def goal_chart(episodes: Table) -> Chart | None:
         episodes: with the columns ``goal_0``, ``goal_1`` and ``success``.
     """
     x, y, success = (episodes.column(name) for name in ("goal_0", "goal_1", "success"))
-    known = usable(x) & usable(y) & np.isfinite(success)
-    if not known.any():
+    is_known = usable(x) & usable(y) & np.isfinite(success)
+    if not is_known.any():
         return None
-    found = []
+    shown_series = []
     for name, color, at in (
-        ("reached", "good", known & (success > 0.5)),
-        ("not reached", "bad", known & (success <= 0.5)),
+        ("reached", "good", is_known & (success > 0.5)),
+        ("not reached", "bad", is_known & (success <= 0.5)),
     ):
         if at.any():
             where = {"x": plain(x[at]), "t": plain(x[at]), "y": plain(y[at])}
-            found.append({"kind": "points", "name": f"{name} ({at.sum():,})", "color": color, **where})
-    own = {"x": "first number of the goal", "y": "second number", "percent": False}
-    return {**own, "range": fit(y[:0], y[known]), "x_range": fit(x[:0], x[known]), "series": found, "note": ""}
+            shown_series.append({"kind": "points", "name": f"{name} ({at.sum():,})", "color": color, **where})
+    axes = {"x": "first number of the goal", "y": "second number", "percent": False}
+    return {
+        **axes,
+        "range": fit(y[:0], y[is_known]),
+        "x_range": fit(x[:0], x[is_known]),
+        "series": shown_series,
+        "note": "",
+    }
 
 
 def value_chart(values: np.ndarray, to_go: np.ndarray) -> Chart:
     """Returns what the critic expected along an episode, and the discounted return that followed; either may be empty."""
-    named = {"discounted return from here on": ("line", to_go), "what the critic expects": ("accent", values)}
-    found = []
-    for name, (color, line) in named.items():
+    lines = {"discounted return from here on": ("line", to_go), "what the critic expects": ("accent", values)}
+    shown_series = []
+    for name, (color, line) in lines.items():
         at = thinned(len(line))
-        found += [series("line", name, color, at, at, line[at])] if len(at) else []
-    return {"x": "step of the episode", "y": "", "percent": False, "range": None, "series": found, "note": ""}
+        shown_series += [series("line", name, color, at, at, line[at])] if len(at) else []
+    return {"x": "step of the episode", "y": "", "percent": False, "range": None, "series": shown_series, "note": ""}
 
 
 GROUP_COLORS = (
@@ -369,26 +378,26 @@ GROUP_COLORS = (
 NAMES = {"iqm": "interquartile mean", "mean": "mean", "median": "median"}
 
 
-def group_chart(kind: str, comparison: Any, env_id: str | None = None) -> Chart:
+def group_chart(form: str, comparison: Any, env_id: str | None = None) -> Chart:
     """Returns the curves, or the performance profiles, of the groups of a comparison.
 
     Args:
-        kind: "curve" or "profile".
+        form: "curve" or "profile".
         comparison: a :class:`rejeu.lab.reporting.comparison.Comparison`.
         env_id: only the groups of this environment; None for all.
     """
     labels = list(dict.fromkeys(group.label for group in comparison.groups))
     groups = [group for group in comparison.groups if env_id in (None, group.env_id)]
-    found = []
+    shown_series = []
     for group in groups:
         color = f"group{labels.index(group.label) % len(GROUP_COLORS)}"
-        x, (value, low, high) = (group.x, group.curve) if kind == "curve" else (group.levels, group.profile)
+        x, (value, low, high) = (group.x, group.curve) if form == "curve" else (group.levels, group.profile)
         common = {"color": color, "x": plain(x), "t": plain(x)}
-        found.append({**common, "kind": "band", "name": "", "low": plain(low), "high": plain(high)})
-        found.append({**common, "kind": "line", "name": f"{group.label} ({len(group.runs)})", "y": plain(value)})
-    if kind == "profile":
+        shown_series.append({**common, "kind": "band", "name": "", "low": plain(low), "high": plain(high)})
+        shown_series.append({**common, "kind": "line", "name": f"{group.label} ({len(group.runs)})", "y": plain(value)})
+    if form == "profile":
         low, high = plain(groups[0].levels[[0, -1]])
-        own = {"x": "final score", "y": "share of runs above it", "percent": True, "range": [0, 1.02]}
-        return {**own, "x_range": None if low == high else [low, high], "series": found}
+        axes = {"x": "final score", "y": "share of runs above it", "percent": True, "range": [0, 1.02]}
+        return {**axes, "x_range": None if low == high else [low, high], "series": shown_series}
     x_title = {"steps": "environment steps", "time": "seconds of training"}[comparison.axis]
-    return {"x": x_title, "y": f"return, {NAMES[comparison.statistic]}", "series": found}
+    return {"x": x_title, "y": f"return, {NAMES[comparison.statistic]}", "series": shown_series}

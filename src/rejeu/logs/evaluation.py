@@ -72,8 +72,8 @@ class Evaluation:
     @property
     def success_rate(self) -> float:
         """Share of successes among the episodes where success is known, NaN if it never is."""
-        known = self.successes[np.isfinite(self.successes)]
-        return float(np.mean(known)) if len(known) else math.nan
+        successes = self.successes[np.isfinite(self.successes)]
+        return float(np.mean(successes)) if len(successes) else math.nan
 
     @property
     def success_interval(self) -> tuple[float, float]:
@@ -127,8 +127,8 @@ class Evaluation:
         (low, high), rows = self.return_interval, []
         interval = "" if math.isnan(low) else f"{low:,.2f} to {high:,.2f}"
         if not math.isnan(self.success_rate):
-            least, most = self.success_interval
-            rows.append(("success", f"{self.success_rate:.1%}", f"{least:.1%} to {most:.1%}", ""))
+            least, highest = self.success_interval
+            rows.append(("success", f"{self.success_rate:.1%}", f"{least:.1%} to {highest:.1%}", ""))
         rows += [
             ("return", f"{self.mean_return:,.2f}", interval, f"{self.std_return:,.2f}"),
             ("length", f"{self.mean_length:,.1f}", "", f"{self.std_length:,.1f}"),
@@ -168,8 +168,8 @@ def evaluate(
         raise ValueError("evaluate needs episodes or seconds")
     if episodes is not None and episodes < 1:
         raise ValueError(f"episodes={episodes} must be at least 1")
-    n_envs, most = env.n_envs, np.iinfo(np.int64).max
-    to_play = np.full(n_envs, most) if episodes is None else (episodes + np.arange(n_envs)) // n_envs
+    n_envs, no_limit = env.n_envs, np.iinfo(np.int64).max
+    to_play = np.full(n_envs, no_limit) if episodes is None else (episodes + np.arange(n_envs)) // n_envs
     end = math.inf if seconds is None else xla.clock() + seconds
     total, length = np.zeros(env.n_envs), np.zeros(env.n_envs, int)
     longest = max(MOST_STEPS, env.max_episode_steps or 0)

@@ -65,7 +65,7 @@ def number(value: float) -> str:
 def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """Returns a Markdown table."""
     lines = [head, ["---"] * len(head), *rows]
-    return "\n".join("| " + " | ".join(cell(one) for one in line) + " |" for line in lines)
+    return "\n".join("| " + " | ".join(cell(text) for text in line) + " |" for line in lines)
 
 
 def cell(value: str) -> str:
@@ -78,7 +78,10 @@ def cell(value: str) -> str:
 def csv_text(rows: Iterable[Mapping[str, Any]]) -> str:
     """Returns rows as CSV. Text that a spreadsheet would take for a formula gets an apostrophe."""
     rows = [
-        {key: "'" + one if str(one)[:1] in FORMULA and isinstance(one, str) else one for key, one in row.items()}
+        {
+            key: "'" + value if str(value)[:1] in FORMULA and isinstance(value, str) else value
+            for key, value in row.items()
+        }
         for row in rows
     ]
     out = io.StringIO()

@@ -133,8 +133,8 @@ class History:
     def moving_average(self, column: str = "return", window: int = 50) -> np.ndarray:
         """Returns the mean of each value and up to ``window - 1`` values before it, ignoring NaN, ``(n_episodes,)``."""
         values = self[column]
-        known = np.isfinite(values)
-        totals = np.cumsum([np.where(known, values, 0.0), known], axis=1)
+        is_known = np.isfinite(values)
+        totals = np.cumsum([np.where(is_known, values, 0.0), is_known], axis=1)
         totals[:, window:] -= totals[:, :-window]
         return totals[0] / np.where(totals[1], totals[1], np.nan)
 
@@ -247,11 +247,11 @@ class Summary:
         spread = "{:,.2f} \N{PLUS-MINUS SIGN} {:,.2f}".format
         rows = [
             ["", "all", f"last {self.last.n:,}"],
-            ["return", *(spread(part.mean_return, part.std_return) for part in parts)],
-            ["length", *(spread(part.mean_length, part.std_length) for part in parts)],
+            ["return", *(spread(quarter.mean_return, quarter.std_return) for quarter in parts)],
+            ["length", *(spread(quarter.mean_length, quarter.std_length) for quarter in parts)],
         ]
         if not math.isnan(self.all.success_rate):
-            rates = ("-" if math.isnan(part.success_rate) else f"{part.success_rate:.1%}" for part in parts)
+            rates = ("-" if math.isnan(quarter.success_rate) else f"{quarter.success_rate:.1%}" for quarter in parts)
             rows.append(["success", *rates])
         return rows
 

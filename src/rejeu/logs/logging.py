@@ -348,8 +348,8 @@ class Logger:
 
     def take(self) -> dict[str, float]:
         """Returns and clears the recorded metrics."""
-        taken, self.name_to_value, self.name_to_count = self.name_to_value, {}, {}
-        return taken
+        values, self.name_to_value, self.name_to_count = self.name_to_value, {}, {}
+        return values
 
     def dump(self, step: int = 0) -> None:
         """Writes the recorded metrics as a row, and clears them."""
@@ -390,8 +390,8 @@ def configure(folder: str | Path | None = None, format_strings: Sequence[str] | 
         MissingExtra: if its package is not installed.
     """
     folder = Path("." if folder is None else folder)
-    kinds = ["stdout"] if format_strings is None else check_logs("format_strings", format_strings, ("stdout", *LOGS))
-    return Logger(folder, [Console() if kind == "stdout" else open_log(kind, folder) for kind in kinds])
+    names = ["stdout"] if format_strings is None else check_logs("format_strings", format_strings, ("stdout", *LOGS))
+    return Logger(folder, [Console() if name == "stdout" else open_log(name, folder) for name in names])
 
 
 def check_logs(name: str, value: str | Iterable[str], among: Sequence[str] = LOGS) -> tuple[str, ...]:
@@ -400,28 +400,28 @@ def check_logs(name: str, value: str | Iterable[str], among: Sequence[str] = LOG
     Raises:
         ValueError: for an unknown one.
     """
-    kinds = tuple(dict.fromkeys([value] if isinstance(value, str) else value))
-    for kind in kinds:
-        if kind not in among:
-            raise ValueError(f"{name} contains {kind!r}, expected any of {', '.join(map(repr, among))}")
-    return kinds
+    names = tuple(dict.fromkeys([value] if isinstance(value, str) else value))
+    for log_name in names:
+        if log_name not in among:
+            raise ValueError(f"{name} contains {log_name!r}, expected any of {', '.join(map(repr, among))}")
+    return names
 
 
-def require(kinds: Iterable[str]) -> None:
+def require(names: Iterable[str]) -> None:
     """Imports what the logs need.
 
     Raises:
         MissingExtra: if a package is not installed, with the command that installs it.
     """
-    for kind in kinds:
-        if kind == "tensorboard":
+    for name in names:
+        if name == "tensorboard":
             import_tensorboard()
-        elif kind in TRACKERS:
-            trackers.imported(kind)
+        elif name in TRACKERS:
+            trackers.imported(name)
 
 
 def open_log(
-    kind: str,
+    log_name: str,
     folder: Path,
     name: str | None = None,
     run_id: str | None = None,
@@ -431,7 +431,7 @@ def open_log(
     """Returns the output of a name in ``LOGS``.
 
     Args:
-        kind: the name.
+        log_name: the name.
         folder: folder of its files.
         name: name of the run in a tracker.
         run_id: identifies the run in a tracker.
@@ -441,15 +441,15 @@ def open_log(
     Raises:
         MissingExtra: if its package is not installed.
     """
-    if kind == "csv":
+    if log_name == "csv":
         return CsvFile(folder / f"{stem}.csv", up_to)
-    if kind == "json":
+    if log_name == "json":
         return JsonLines(folder / f"{stem}.json", up_to)
-    if kind == "tensorboard":
+    if log_name == "tensorboard":
         return TensorBoard(folder)
-    if kind == "wandb":
+    if log_name == "wandb":
         return WandB(name, run_id, folder)
-    return MLflow(name, run_id) if kind == "mlflow" else Trackio(name)
+    return MLflow(name, run_id) if log_name == "mlflow" else Trackio(name)
 
 
 def _number(key: str, value: Any) -> float:

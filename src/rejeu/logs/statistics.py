@@ -25,7 +25,7 @@ Statistic = Callable[[Scores], np.ndarray]
 
 def mean(scores: Scores) -> np.ndarray:
     """Returns the mean over environments of the mean over runs."""
-    return np.mean([one.mean(axis=0) for one in scores], axis=0)
+    return np.mean([runs.mean(axis=0) for runs in scores], axis=0)
 
 
 def median(scores: Scores) -> np.ndarray:
@@ -35,7 +35,7 @@ def median(scores: Scores) -> np.ndarray:
     """
     if len(scores) == 1:
         return np.median(scores[0], axis=0)
-    return np.median([one.mean(axis=0) for one in scores], axis=0)
+    return np.median([runs.mean(axis=0) for runs in scores], axis=0)
 
 
 def iqm(scores: Scores) -> np.ndarray:
@@ -69,20 +69,20 @@ def improvement(scores: Scores, others: Scores) -> np.ndarray:
     0.625
     """
     shares = []
-    for one, other in zip(scores, others, strict=True):
-        wins, ties = one[:, None] > other[None], one[:, None] == other[None]
+    for first, second in zip(scores, others, strict=True):
+        wins, ties = first[:, None] > second[None], first[:, None] == second[None]
         shares.append((wins + 0.5 * ties).mean(axis=(0, 1)))
     return np.mean(shares, axis=0)
 
 
 def draw(scores: Scores, n_samples: int, rng: np.random.Generator) -> list[np.ndarray]:
     """Returns bootstrap samples of a group: each draws as many runs of each environment as there are."""
-    return [rng.integers(len(one), size=(n_samples, len(one))) for one in scores]
+    return [rng.integers(len(runs), size=(n_samples, len(runs))) for runs in scores]
 
 
 def resampled(scores: Scores, draws: Draws) -> list[np.ndarray]:
     """Returns the scores of bootstrap samples, for each environment ``(n_runs, n_samples, ...)``."""
-    return [np.moveaxis(one[rows], 1, 0) for one, rows in zip(scores, draws, strict=True)]
+    return [np.moveaxis(runs[rows], 1, 0) for runs, rows in zip(scores, draws, strict=True)]
 
 
 def student(mean: ArrayLike, std: ArrayLike, n: ArrayLike) -> tuple[np.ndarray, np.ndarray]:

@@ -62,8 +62,8 @@ def evaluation_table(evaluations: Iterable[tuple[int, Any]], episodes: Table = E
     steps = np.array([step for step, _ in pairs], np.float64)
     results = [result for _, result in pairs]
     names = ("success_rate", "mean_return", "std_return", "mean_length")
-    columns = {name: np.array([getattr(one, name) for one in results], np.float64) for name in names}
-    columns["episodes"] = np.array([len(one.returns) for one in results], np.float64)
+    columns = {name: np.array([getattr(evaluated, name) for evaluated in results], np.float64) for name in names}
+    columns["episodes"] = np.array([len(evaluated.returns) for evaluated in results], np.float64)
     if len(episodes):
         columns["seconds"] = np.interp(steps, episodes.column("step"), episodes.column("seconds"))
     return Table({"step": steps, **columns})
@@ -128,7 +128,7 @@ def read_table(path: Path, only: Collection[str] | None = None, skip_lines: int 
         return Table({}, (*notes, f"the header of {name} is damaged"))
     if len(names) > MAX_COLUMNS or len({*names}) < len(names):
         return Table({}, (*notes, f"{name} has {len(names)} columns, expected up to {MAX_COLUMNS} of different names"))
-    wanted = [i for i, one in enumerate(names) if only is None or one in only]
+    wanted = [i for i, column_name in enumerate(names) if only is None or column_name in only]
     columns, n_bad = numbers(file, len(names), wanted)
     if n_bad:
         notes.append(f"left out of {name}: {counted(n_bad, 'damaged row')}")

@@ -135,9 +135,9 @@ class MLflow:
     def write_config(self, config: Mapping[str, Any]) -> None:
         """Writes the configuration of the run; MLflow does not replace values that are there already."""
         client = self._started()
-        known = client.get_run(self._id).data.params
+        logged = client.get_run(self._id).data.params
         param = self._mlflow.entities.Param
-        params = [param(name, str(value)[:500]) for name, value in flat(config) if name not in known]
+        params = [param(name, str(value)[:500]) for name, value in flat(config) if name not in logged]
         for i in range(0, len(params), 100):  # the most that MLflow takes at once
             client.log_batch(self._id, params=params[i : i + 100])
 
@@ -154,8 +154,12 @@ class MLflow:
     def _started(self) -> Any:
         if self._client is None:
             client = self._mlflow.MlflowClient()
-            found = client.get_experiment_by_name(self.experiment)
-            experiment = client.create_experiment(self.experiment) if found is None else found.experiment_id
+            known_experiment = client.get_experiment_by_name(self.experiment)
+            experiment = (
+                client.create_experiment(self.experiment)
+                if known_experiment is None
+                else known_experiment.experiment_id
+            )
             tags = {} if self.run_id is None else {"rejeu.run_id": self.run_id}
             earlier = client.search_runs([experiment], f"tags.`rejeu.run_id` = '{self.run_id}'") if tags else []
             if earlier:
@@ -190,16 +194,16 @@ class Trackio(Logged):
         return self._package.init(self.project, self.name, config=dict(config), resume=resume, embed=False)
 
 
-def imported(kind: str) -> Any:
+def imported(name: str) -> Any:
     """Returns the package of a tracker: ``"wandb"``, ``"mlflow"`` or ``"trackio"``.
 
     Raises:
         MissingExtra: if it is not installed.
     """
-    with requires(f"the log {kind!r}", kind, kind):
-        if kind == "wandb":
+    with requires(f"the log {name!r}", name, name):
+        if name == "wandb":
             import wandb as package
-        elif kind == "mlflow":
+        elif name == "mlflow":
             import mlflow as package
         else:
             import trackio as package

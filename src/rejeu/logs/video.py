@@ -112,9 +112,9 @@ class VideoFile:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self, error_type: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if kind is None:
+        if error_type is None:
             self.close()
         else:
             self.discard()
@@ -194,8 +194,8 @@ def record_video(
     episodes, steps_left = whole("episodes", episodes, least=1), whole("max_steps", max_steps, least=1)
     fps = None if fps is None else number("fps", fps, above=0)
     ffmpeg()
-    given = isinstance(env, gym.Env)
-    playing_env = for_agent(agent, env if given else rendering_env(agent, env))
+    is_open = isinstance(env, gym.Env)
+    playing_env = for_agent(agent, env if is_open else rendering_env(agent, env))
     try:
         check_renders(playing_env)
         with Interrupt() as stop, VideoFile(path, playback_fps(playing_env) if fps is None else fps) as video:
@@ -216,7 +216,7 @@ def record_video(
                 for _ in range(round(HOLD_SECONDS * video.fps)):
                     video.write(frame)
     finally:
-        if not given:
+        if not is_open:
             playing_env.close()
     return video.path
 
@@ -226,13 +226,13 @@ def rendering_env(agent: Any, env: Any) -> gym.Env:
     if isinstance(env, str):
         return make_rendering_env(partial(make_env, env), env)
     if env is not None:
-        made = env() if callable(env) else env
-        if not isinstance(made, gym.Env):
+        rendering = env() if callable(env) else env
+        if not isinstance(rendering, gym.Env):
             raise TypeError(
                 "env must be an id, a Gymnasium environment, a function that makes one or None, got "
-                f"{type(made).__name__}"
+                f"{type(rendering).__name__}"
             )
-        return made
+        return rendering
     vector = agent.run.env
     if vector is None:
         raise ValueError("this agent has no environment; pass one: record_video(agent, path, env='parking-v0')")
@@ -263,7 +263,7 @@ def rendering_env(agent: Any, env: Any) -> gym.Env:
 
 def without_recorder(spec: gym.envs.registration.EnvSpec) -> gym.envs.registration.EnvSpec:
     """Returns a spec without ``RecordVideo``, which would overwrite the videos of the first environment."""
-    wrappers = tuple(one for one in spec.additional_wrappers if one.entry_point != RECORDER)
+    wrappers = tuple(wrapper for wrapper in spec.additional_wrappers if wrapper.entry_point != RECORDER)
     return dataclasses.replace(spec, additional_wrappers=wrappers)
 
 
@@ -299,8 +299,8 @@ def show_videos(folder: str | Path = "videos", prefix: str = "") -> Html:
     files.sort(key=lambda path: by_number(path.name))
     text = "\n".join(_player(path) for path in files)
     if not files:
-        named = f" whose name starts with {prefix}" if prefix else ""
-        text = f"<p>No mp4 file{html.escape(named)} in {html.escape(str(folder))}.</p>"
+        description = f" whose name starts with {prefix}" if prefix else ""
+        text = f"<p>No mp4 file{html.escape(description)} in {html.escape(str(folder))}.</p>"
     return Html(text)
 
 
@@ -310,7 +310,7 @@ def by_number(name: str) -> list[tuple[int, int, str]]:
     >>> sorted(["episode-10.mp4", "episode-9.mp4", "a.mp4"], key=by_number)
     ['a.mp4', 'episode-9.mp4', 'episode-10.mp4']
     """
-    return [(1, int(part), "") if part.isdecimal() else (0, 0, part) for part in re.split(r"(\d+)", name)]
+    return [(1, int(piece), "") if piece.isdecimal() else (0, 0, piece) for piece in re.split(r"(\d+)", name)]
 
 
 def _player(path: Path) -> str:

@@ -98,57 +98,57 @@ class DeviceReplay:
         return env * self.rows + time % self.rows
 
     def add(
-        self, ring: DeviceRing, action: Array, reward: Array, terminated: Array, next_obs: PyTree, kept: Array
+        self, ring: DeviceRing, action: Array, reward: Array, terminated: Array, next_obs: PyTree, is_stored: Array
     ) -> DeviceRing:
-        """Returns the ring after one step of the environments where ``kept``; see :meth:`Ring.add`."""
+        """Returns the ring after one step of the environments where ``is_stored``; see :meth:`Ring.add`."""
         envs = jnp.arange(self.n_envs)
-        index = jnp.where(kept, self.positions(envs, ring.head), len(ring.kind))
-        kind = jnp.where(terminated, TERMINATED, STEP).astype(jnp.uint8)
+        index = jnp.where(is_stored, self.positions(envs, ring.head), len(ring.kind))
+        kinds_of_rows = jnp.where(terminated, TERMINATED, STEP).astype(jnp.uint8)
         ring = ring._replace(
             action=put(ring.action, index, action),
             reward=put(ring.reward, index, reward),
-            kind=put(ring.kind, index, kind),
+            kind=put(ring.kind, index, kinds_of_rows),
         )
-        ring = self._advance(ring, next_obs, kept)
+        ring = self._advance(ring, next_obs, is_stored)
         if ring.priorities is None:
             return ring
-        following = jnp.where(kept, self.positions(envs, ring.head), device_priorities.NOWHERE)
-        index = jnp.where(kept, index, device_priorities.NOWHERE)
+        following = jnp.where(is_stored, self.positions(envs, ring.head), device_priorities.NOWHERE)
+        index = jnp.where(is_stored, index, device_priorities.NOWHERE)
         return ring._replace(priorities=device_priorities.add(ring.priorities, index, following))
 
-    def begin(self, ring: DeviceRing, obs: PyTree, which: Array) -> DeviceRing:
-        """Returns the ring after episodes began with ``obs`` in the environments ``which``; see :meth:`Ring.begin`.
+    def begin(self, ring: DeviceRing, obs: PyTree, begins: Array) -> DeviceRing:
+        """Returns the ring after episodes began with ``obs`` in the environments ``begins``; see :meth:`Ring.begin`.
 
         These environments must have begun an episode before, which ends.
         """
         envs = jnp.arange(self.n_envs)
-        index = jnp.where(which, self.positions(envs, ring.head), len(ring.kind))
+        index = jnp.where(begins, self.positions(envs, ring.head), len(ring.kind))
         ring = ring._replace(kind=put(ring.kind, index, jnp.full(self.n_envs, LAST, jnp.uint8)))
         if self.strategy is not None:
             outside = len(ring.ends)
-            old = jnp.where(which, self.positions(envs, ring.n_begun - 1), outside)
-            new = jnp.where(which, self.positions(envs, ring.n_begun), outside)
+            old = jnp.where(begins, self.positions(envs, ring.n_begun - 1), outside)
+            new = jnp.where(begins, self.positions(envs, ring.n_begun), outside)
             ends = put(put(ring.ends, old, ring.head), new, jnp.full(self.n_envs, RUNNING, jnp.int32))
             ring = ring._replace(ends=ends, begins=put(ring.begins, new, ring.head + 1))
-        ring = ring._replace(n_begun=ring.n_begun + which.astype(jnp.int32))
-        ring = self._advance(ring, obs, which)
+        ring = ring._replace(n_begun=ring.n_begun + begins.astype(jnp.int32))
+        ring = self._advance(ring, obs, begins)
         if ring.priorities is None:
             return ring
-        index = jnp.where(which, self.positions(envs, ring.head), device_priorities.NOWHERE)
+        index = jnp.where(begins, self.positions(envs, ring.head), device_priorities.NOWHERE)
         return ring._replace(priorities=device_priorities.changed(ring.priorities, index, jnp.zeros(self.n_envs)))
 
-    def _advance(self, ring: DeviceRing, obs: PyTree, which: Array) -> DeviceRing:
-        """Returns the ring with a further row for the observations of the environments ``which``."""
+    def _advance(self, ring: DeviceRing, obs: PyTree, advances: Array) -> DeviceRing:
+        """Returns the ring with a further row for the observations of the environments that advance."""
         envs = jnp.arange(self.n_envs)
-        head = ring.head + which.astype(jnp.int32)
-        index = jnp.where(which, self.positions(envs, head), len(ring.kind))
+        head = ring.head + advances.astype(jnp.int32)
+        index = jnp.where(advances, self.positions(envs, head), len(ring.kind))
         stores = [
             put(store, index, leaf.astype(store.dtype))
             for store, leaf in zip(ring.obs, jax.tree.leaves(obs), strict=True)
         ]
-        kind = put(ring.kind, index, jnp.full(self.n_envs, STEP, jnp.uint8))
+        kinds_of_rows = put(ring.kind, index, jnp.full(self.n_envs, STEP, jnp.uint8))
         episode = put(ring.episode, index, ring.n_begun - 1) if self.strategy is not None else ring.episode
-        return ring._replace(obs=stores, kind=kind, episode=episode, head=head)
+        return ring._replace(obs=stores, kind=kinds_of_rows, episode=episode, head=head)
 
     def oldest(self, ring: DeviceRing) -> Array:
         """Returns the absolute time of the oldest row that is kept, by environment, ``(n_envs,)``."""
@@ -181,8 +181,8 @@ class DeviceReplay:
 
         def again(carry: tuple[Array, DeviceRows, Array]) -> tuple[Array, DeviceRows, Array]:
             i, rows, is_last = carry
-            place = jnp.cumsum(is_last) - 1
-            bits = jax.random.bits(jax.random.fold_in(key, i), (n,), jnp.uint32)[place]
+            number = jnp.cumsum(is_last) - 1
+            bits = jax.random.bits(jax.random.fold_in(key, i), (n,), jnp.uint32)[number]
             rows = jax.tree.map(lambda new, old: jnp.where(is_last, new, old), self._rows_of(ring, bits), rows)
             return i + 1, rows, ring.kind[rows.position] == LAST
 
@@ -300,10 +300,10 @@ def put(store: Array, index: Array, values: Array) -> Array:
     if len(index) > 1:
         return store.at[index].set(values, mode="drop", unique_indices=True)
     # A slice of one row, which XLA on a CPU writes faster than it scatters.
-    place = jnp.minimum(index[0], len(store) - 1)
-    before = jax.lax.dynamic_slice_in_dim(store, place, 1)
+    row_index = jnp.minimum(index[0], len(store) - 1)
+    before = jax.lax.dynamic_slice_in_dim(store, row_index, 1)
     row = jnp.where(index[0] < len(store), values, before)
-    return jax.lax.dynamic_update_slice_in_dim(store, row, place, 0)
+    return jax.lax.dynamic_update_slice_in_dim(store, row, row_index, 0)
 
 
 def uploaded(replay: DeviceReplay, ring: Ring) -> DeviceRing:

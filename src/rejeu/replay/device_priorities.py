@@ -111,13 +111,13 @@ def find(priorities: DevicePriorities, fraction: Array) -> tuple[Array, Array]:
     ends = jnp.cumsum(groups)
     segment = ends[-1] / len(fraction)
     begin, within = jnp.arange(len(fraction), dtype=jnp.float32) * segment, fraction * segment
-    chosen, before = pick(groups[None], ends[None], begin + within)
+    group, before = pick(groups[None], ends[None], begin + within)
     mass = (begin - before) + within  # in this order the sum has the digits that the segment has
     for level in (priorities.sums, priorities.values):
-        row = level.reshape(-1, WIDTH)[chosen]
-        place, before = pick(row, jnp.cumsum(row, axis=1), mass)
-        chosen, mass = chosen * WIDTH + place, mass - before
-    return chosen, ends[-1]
+        row = level.reshape(-1, WIDTH)[group]
+        column, before = pick(row, jnp.cumsum(row, axis=1), mass)
+        group, mass = group * WIDTH + column, mass - before
+    return group, ends[-1]
 
 
 def pick(row: Array, ends: Array, mass: Array) -> tuple[Array, Array]:
@@ -125,12 +125,12 @@ def pick(row: Array, ends: Array, mass: Array) -> tuple[Array, Array]:
 
     ``row`` and its cumulative sums ``ends`` are ``(n, width)``, or ``(1, width)`` for all. Places with 0 are never picked.
     """
-    place = jnp.arange(row.shape[1], dtype=jnp.int32)[None]
-    first = jnp.min(jnp.where((row > 0) & (ends > mass[:, None]), place, row.shape[1]), axis=1)
-    last = jnp.max(jnp.where(row > 0, place, 0), axis=1)  # the sums may round to less than mass
-    chosen = jnp.minimum(first, last)
+    columns = jnp.arange(row.shape[1], dtype=jnp.int32)[None]
+    first = jnp.min(jnp.where((row > 0) & (ends > mass[:, None]), columns, row.shape[1]), axis=1)
+    last = jnp.max(jnp.where(row > 0, columns, 0), axis=1)  # the sums may round to less than mass
+    column = jnp.minimum(first, last)
     before = jnp.broadcast_to(ends - row, (len(mass), row.shape[1]))
-    return chosen, jnp.take_along_axis(before, chosen[:, None], axis=1)[:, 0]
+    return column, jnp.take_along_axis(before, column[:, None], axis=1)[:, 0]
 
 
 def noted(pending: Pending, number: Array, position: Array, time: Array, td_error: Array) -> Pending:
@@ -155,10 +155,10 @@ def updated(
         priority = (pending.td_error[i] + jnp.float32(config.epsilon)) ** jnp.float32(config.alpha)
         finite = jnp.isfinite(priority)
         priority = jnp.where(finite, jnp.clip(priority, LEAST, MOST), LEAST)
-        known = pending.time[i] > head[position // rows] - rows
-        kept = known & (priorities.values[position] > 0) & finite
-        again = ((position[None] == position[:, None]) & kept[None] & later).any(axis=1)  # the last one counts
-        after = changed(priorities, jnp.where(kept & ~again, position, NOWHERE), priority)
+        is_stored = pending.time[i] > head[position // rows] - rows
+        is_updated = is_stored & (priorities.values[position] > 0) & finite
+        again = ((position[None] == position[:, None]) & is_updated[None] & later).any(axis=1)  # the last one counts
+        after = changed(priorities, jnp.where(is_updated & ~again, position, NOWHERE), priority)
         return after._replace(largest=jnp.maximum(priorities.largest, jnp.max(jnp.where(finite, priority, 0))))
 
     return jax.lax.fori_loop(0, n_pending, one, priorities)
@@ -172,16 +172,16 @@ def uploaded(
     n = ring.rows * ring.n_envs
     n_blocks = -(-n // WIDTH)
     values, sums = np.zeros(n_blocks * WIDTH, np.float32), np.zeros(-(-n_blocks // WIDTH) * WIDTH, np.float32)
-    given = priorities.tree[np.arange(n)]
-    values[:n] = np.where(given > 0, np.clip(given, LEAST, MOST), 0)
+    leaves = priorities.tree[np.arange(n)]
+    values[:n] = np.where(leaves > 0, np.clip(leaves, LEAST, MOST), 0)
     sums[:n_blocks] = added_up(values.reshape(-1, WIDTH))
     shape = (most_updates, batch_size)
     pending = Pending(np.zeros(shape, np.int32), np.zeros(shape, np.int32), np.zeros(shape, np.float32))  # type: ignore[arg-type]
     first = 0
     for draw, td_error in td_errors:
         size = len(draw.position)
-        for array, part in zip(pending, (draw.position, draw.time, np.asarray(td_error)), strict=True):
-            array.reshape(-1)[first : first + size] = part.reshape(-1)
+        for array, content in zip(pending, (draw.position, draw.time, np.asarray(td_error)), strict=True):
+            array.reshape(-1)[first : first + size] = content.reshape(-1)
         first += size
     largest = np.clip(np.float32(priorities.largest), LEAST, MOST)
     host = DevicePriorities(values, sums, np.int32(np.count_nonzero(values)), largest, pending)  # type: ignore[arg-type]

@@ -180,7 +180,7 @@ def register_goal_strategy(name: str) -> Callable[[GoalStrategy], GoalStrategy]:
 
 def name_of(strategy: str | Callable[..., Any]) -> str | Callable[..., Any]:
     """Returns the name of a strategy, or the function itself if it has none."""
-    names = [name for name, known in STRATEGIES.items() if known is strategy]
+    names = [name for name, registered in STRATEGIES.items() if registered is strategy]
     return names[0] if names else strategy
 
 
@@ -346,8 +346,10 @@ class HerReplayBuffer(BaseReplayBuffer):
     ) -> None:
         """Records one step of each environment; see :meth:`Ring.add`."""
         if self.infos is not None:
-            which, last = self.ring.all_envs if envs is None else envs, self.last_infos()
-            for position, env in zip(self.ring.index(which, self.ring.head[which]), which, strict=True):
+            env_numbers, last = self.ring.all_envs if envs is None else envs, self.last_infos()
+            for position, env in zip(
+                self.ring.index(env_numbers, self.ring.head[env_numbers]), env_numbers, strict=True
+            ):
                 self.infos[position] = deepcopy(last[env]) if last else {}
         super().add(action, reward, terminated, next_obs, envs)
 
@@ -361,17 +363,19 @@ class HerReplayBuffer(BaseReplayBuffer):
         ring = self.ring
         rows, weight, drawn = self.draw_rows(rng, math.prod(shape), progress)
         read = ring.read(rows.position)
-        which = relabeled_positions(shape, self.config.n_sampled_goal)
-        index = self.goal_index(rng, rows.env[which], rows.time[which], read[0][which])
+        relabeled = relabeled_positions(shape, self.config.n_sampled_goal)
+        index = self.goal_index(rng, rows.env[relabeled], rows.time[relabeled], read[0][relabeled])
         strategies = mixed(self.config.goal_selection_strategy)
         goal = strategies.goals(index, *(partial(ring.read_leaf, leaf) for leaf in (self.achieved, self.desired)))
         reward, terminated = self.goals
         if self.infos is not None:
-            kept = self.infos[ring.index(rows.env[which, None], rows.time[which, None] + np.arange(self.n_steps))]
+            infos_of_rows = self.infos[
+                ring.index(rows.env[relabeled, None], rows.time[relabeled, None] + np.arange(self.n_steps))
+            ]
             # After the end of an episode there is none, and what a function returns there does not count.
-            infos = [(info or row[0] or {}) for row in kept for info in row]
+            infos = [(info or row[0] or {}) for row in infos_of_rows for info in row]
             reward, terminated = partial(reward, infos=infos), terminated and partial(terminated, infos=infos)
-        goals = NewGoals(which, goal, (self.achieved, self.desired), reward, terminated)
+        goals = NewGoals(relabeled, goal, (self.achieved, self.desired), reward, terminated)
         return self.batch(shape, rows, read, weight, goals), drawn
 
     def goal_index(self, rng: np.random.Generator, env: np.ndarray, time: np.ndarray, step: np.ndarray) -> np.ndarray:
@@ -429,9 +433,9 @@ def relabeled_positions(shape: tuple[int, ...], k: int) -> slice | np.ndarray:
     n = int(shape[-1] * k / (k + 1))
     if math.prod(shape) == shape[-1]:
         return slice(n)
-    chosen = np.zeros(shape, bool)
-    chosen[..., :n] = True
-    return np.flatnonzero(chosen)
+    is_relabeled = np.zeros(shape, bool)
+    is_relabeled[..., :n] = True
+    return np.flatnonzero(is_relabeled)
 
 
 def stored(steps: HindsightSteps, times: Any) -> Any:

@@ -87,11 +87,11 @@ class SumTree:
         node = np.ones(len(mass), np.int64)
         mass = mass.copy()
         while node[0] < self.n_leaves:
-            left = 2 * node
-            weight = self.nodes[left]
-            goes_right = (mass >= weight) & (self.nodes[left + 1] > 0)
+            left_child = 2 * node
+            weight = self.nodes[left_child]
+            goes_right = (mass >= weight) & (self.nodes[left_child + 1] > 0)
             mass -= np.where(goes_right, weight, 0.0)
-            node = left + goes_right
+            node = left_child + goes_right
         return node - self.n_leaves
 
 
@@ -144,9 +144,9 @@ class Priorities:
             priority = (np.asarray(td_error, np.float64).ravel() + self.config.epsilon) ** self.config.alpha
             head = self.ring.head[index // self.ring.rows]
             finite = np.isfinite(priority)
-            kept = (time > head - self.ring.rows) & (self.tree[index] > 0) & finite
-            if kept.any():
-                self.tree.set(index[kept], priority[kept])
+            is_updated = (time > head - self.ring.rows) & (self.tree[index] > 0) & finite
+            if is_updated.any():
+                self.tree.set(index[is_updated], priority[is_updated])
             self.largest = max(self.largest, float(priority.max(where=finite, initial=0.0)))
 
     def load(self, values: np.ndarray, largest: float) -> None:
@@ -171,8 +171,8 @@ class Priorities:
             if values.shape != (self.ring.rows * self.ring.n_envs,) or values.dtype != np.float64:
                 raise ValueError("the priorities are of another replay buffer")
             largest = float(state["largest"])
-            most = float(np.finfo(np.float64).max) / self.tree.n_leaves  # so that their sum is finite
-            if not ((values >= 0) & (values <= most)).all() or not 0 < largest <= most:
+            largest_leaf = float(np.finfo(np.float64).max) / self.tree.n_leaves  # so that their sum is finite
+            if not ((values >= 0) & (values <= largest_leaf)).all() or not 0 < largest <= largest_leaf:
                 raise ValueError("the priorities are not finite, or not positive")
             if not np.array_equal(np.flatnonzero(values > 0), np.sort(steps)):
                 raise ValueError("the priorities do not belong to the steps of this replay buffer")
@@ -198,9 +198,9 @@ class Priorities:
     def _step_positions(self) -> np.ndarray:
         """Returns the positions of the ring that contain steps, ordered by environment."""
         ring = self.ring
-        found = []
+        positions = []
         for env in range(ring.n_envs):
             times = np.arange(ring.oldest()[env], ring.head[env])
             index = ring.index(np.full(len(times), env), times)
-            found.append(index[ring.kind[index] != LAST])
-        return np.concatenate(found)
+            positions.append(index[ring.kind[index] != LAST])
+        return np.concatenate(positions)

@@ -87,20 +87,20 @@ class ReplayMemory:
             ValueError: if an observation or the action does not match its space, or the reward is not finite.
         """
         before, after = self._parts(obs, "obs"), self._parts(next_obs, "next_obs")
-        taken = np.asarray(action)
-        if taken.shape != (self.action_space.shape or ()):
-            raise ValueError(f"action has the shape {taken.shape}, expected {self.action_space.shape or ()}")
+        action_array = np.asarray(action)
+        if action_array.shape != (self.action_space.shape or ()):
+            raise ValueError(f"action has the shape {action_array.shape}, expected {self.action_space.shape or ()}")
         if isinstance(self.action_space, gym.spaces.Discrete):
-            spaces.check_env_actions(self.action_space, taken, "push")
-        if not np.isfinite(taken).all() or not abs(reward) <= np.finfo(np.float32).max:
+            spaces.check_env_actions(self.action_space, action_array, "push")
+        if not np.isfinite(action_array).all() or not abs(reward) <= np.finfo(np.float32).max:
             raise ValueError(f"action={action!r} and reward={reward!r} must be finite as float32")
-        if not all(np.isfinite(part).all() for part in (*before, *after)):
+        if not all(np.isfinite(array).all() for array in (*before, *after)):
             raise ValueError("obs and next_obs must be finite")
         i = self._n_pushed % self.capacity
         for stores, parts in ((self._obs, before), (self._next_obs, after)):
-            for store, part in zip(stores, parts, strict=True):
-                store[i] = part
-        self._action[i] = spaces.unscale_action(self.action_space, taken[None])[0]
+            for store, array in zip(stores, parts, strict=True):
+                store[i] = array
+        self._action[i] = spaces.unscale_action(self.action_space, action_array[None])[0]
         self._reward[i] = reward
         self._discount[i] = 0.0 if terminated else self.gamma
         self._n_pushed += 1
@@ -138,7 +138,7 @@ class ReplayMemory:
         """
         try:
             parts = jax.tree.leaves(spaces.plain(self.observation_space, obs), is_leaf=lambda x: isinstance(x, list))
-            arrays = [np.asarray(part) for part in parts]
+            arrays = [np.asarray(value) for value in parts]
         except (KeyError, IndexError, TypeError) as error:
             raise ValueError(f"{name} is no observation of {self.observation_space}: {error}") from None
         shapes = [array.shape for array in arrays]

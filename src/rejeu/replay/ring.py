@@ -68,8 +68,8 @@ class Ring:
         self.rows = max(capacity // n_envs, 2, 0 if frame_stack is None else frame_stack + 1)
         self.stacked = stacked_leaves(obs_leaves, frame_stack)
         self._names = [f"obs.{i}" for i in range(len(obs_leaves))]
-        kept = {*counters, *(() if frame_stack is None else ("since_start",))}
-        self.counters = tuple(name for name in COUNTERS if name in kept)
+        counter_names = {*counters, *(() if frame_stack is None else ("since_start",))}
+        self.counters = tuple(name for name in COUNTERS if name in counter_names)
         """Which of ``COUNTERS`` are kept."""
         record = record_dtype(obs_leaves, self.stacked, action_shape, action_dtype, self.counters)
         frames = [leaf.nbytes // leaf.shape[0] for leaf, is_ in zip(obs_leaves, self.stacked, strict=True) if is_]
@@ -82,9 +82,9 @@ class Ring:
             for i, leaf in enumerate(obs_leaves)
         ]
         self.action, self.reward = self.records["action"], self.records["reward"]
-        self.since_start = self.records["since_start"] if "since_start" in kept else None
+        self.since_start = self.records["since_start"] if "since_start" in counter_names else None
         """Steps since the row's episode began, or since its oldest row in a file; None if not kept."""
-        self.until_end = self.records["until_end"] if "until_end" in kept else None
+        self.until_end = self.records["until_end"] if "until_end" in counter_names else None
         """Steps to the ``LAST`` row of the episode; 0 while it runs, and in that row itself; None if not kept."""
         self.memory = np.zeros((n, memory_size), np.float32)
         """What was remembered before each row's observation, ``(n, memory_size)``."""
@@ -141,16 +141,16 @@ class Ring:
 
         Returns the positions of the steps and of the rows after them.
         """
-        which = self._all if envs is None else envs
-        index = self.base[which] + self.head[which] % self.rows
-        self.action[index] = action[which]
-        self.reward[index] = reward[which]
-        self.kind[index] = terminated[which]
-        following = self._advance(which)
-        self.n_steps[which] += 1
+        env_numbers = self._all if envs is None else envs
+        index = self.base[env_numbers] + self.head[env_numbers] % self.rows
+        self.action[index] = action[env_numbers]
+        self.reward[index] = reward[env_numbers]
+        self.kind[index] = terminated[env_numbers]
+        following = self._advance(env_numbers)
+        self.n_steps[env_numbers] += 1
         if self.since_start is not None:
-            self.since_start[following] = self.head[which] - self.start[which]
-        self._write_obs(following, next_obs, which)
+            self.since_start[following] = self.head[env_numbers] - self.start[env_numbers]
+        self._write_obs(following, next_obs, env_numbers)
         return index, following
 
     def remember(self, memory: np.ndarray, ended: np.ndarray, envs: np.ndarray | None = None) -> None:
@@ -208,8 +208,8 @@ class Ring:
         """
         records = self.records.take(index)
         frames: Any = None if self.frame_stack is None else self._frames(index, records["since_start"])
-        kinds = zip(self.obs, self.stacked, self._names, strict=True)
-        return records, [leaf.take(frames, axis=0) if stacked else records[name] for leaf, stacked, name in kinds]
+        stores = zip(self.obs, self.stacked, self._names, strict=True)
+        return records, [leaf.take(frames, axis=0) if stacked else records[name] for leaf, stacked, name in stores]
 
     def read_leaf(self, leaf: int, index: np.ndarray) -> np.ndarray:
         """Returns one observation leaf, which is no stack, of the rows at positions ``index``; see :meth:`read`."""
@@ -286,9 +286,9 @@ class Ring:
         self.n_steps, self.start = np.zeros(self.n_envs, np.int64), np.zeros(self.n_envs, np.int64)
         for env in np.flatnonzero(head >= 0):
             index = self.base[env] + np.arange(max(int(head[env]) - self.rows + 1, 0), head[env] + 1) % self.rows
-            kind = self.kind[index]
-            self.n_steps[env] = np.count_nonzero(kind[:-1] != LAST)
-            since_start, until_end = episode_counters(kind)
+            kinds_of_rows = self.kind[index]
+            self.n_steps[env] = np.count_nonzero(kinds_of_rows[:-1] != LAST)
+            since_start, until_end = episode_counters(kinds_of_rows)
             self.start[env] = head[env] - since_start[-1]
             if self.since_start is not None:
                 self.since_start[index] = since_start
@@ -296,7 +296,7 @@ class Ring:
                 self.until_end[index] = until_end
 
 
-def episode_counters(kind: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def episode_counters(kinds_of_rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Returns ``since_start`` and ``until_end`` of successive rows of one environment by their kinds, ``int64 (n,)``.
 
     The first counts the steps from the row at which the row's episode began, or from the first row given if that is later;
@@ -306,7 +306,7 @@ def episode_counters(kind: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     >>> since_start.tolist(), until_end.tolist()
     ([0, 1, 0, 1, 2, 0, 1], [1, 0, 2, 1, 0, 0, 0])
     """
-    places, ends = np.arange(len(kind)), np.flatnonzero(kind == LAST)
+    places, ends = np.arange(len(kinds_of_rows)), np.flatnonzero(kinds_of_rows == LAST)
     episode = np.searchsorted(ends, places)
     until_end = np.where(episode < len(ends), np.append(ends, 0)[episode] - places, 0)
     return places - np.append(0, ends + 1)[episode], until_end
@@ -326,10 +326,10 @@ def stacked_leaves(leaves: tuple[Leaf, ...], frame_stack: int | None) -> tuple[b
         for is_image, leaf in zip(images, leaves, strict=True)
     )
     if frame_stack is not None and not any(stacked):
-        given = ", ".join(f"{leaf.path or 'observation'} {leaf.dtype}{list(leaf.shape)}" for leaf in leaves)
+        descriptions = ", ".join(f"{leaf.path or 'observation'} {leaf.dtype}{list(leaf.shape)}" for leaf in leaves)
         raise ValueError(
             f"frame_stack={frame_stack} needs uint8 observations ({frame_stack}, height, width[, channels]), got "
-            f"{given}; wrap the environment with gymnasium.wrappers.FrameStackObservation(env, {frame_stack})"
+            f"{descriptions}; wrap the environment with gymnasium.wrappers.FrameStackObservation(env, {frame_stack})"
         )
     return stacked
 

@@ -37,33 +37,33 @@ def restore(ring: Ring, arrays: Mapping[str, np.ndarray]) -> None:
     ring.version += 1
 
 
-def check(ring: Ring, found: Mapping[str, Any]) -> None:
+def check(ring: Ring, saved: Mapping[str, Any]) -> None:
     """Checks that arrays, or their specs, can be the result of :func:`arrays` for a ring like this one.
 
     Raises:
         ValueError: if names, shapes or dtypes are others, or there are more rows than this ring has.
     """
-    own = ring.stored()
-    if differing := {*found} ^ {*own, "head", "n_steps"}:
+    stored = ring.stored()
+    if differing := {*saved} ^ {*stored, "head", "n_steps"}:
         raise ValueError(f"the replay file and this buffer differ in the arrays {', '.join(sorted(differing))[:200]}")
-    head, n_steps = found["head"], found["n_steps"]
+    head, n_steps = saved["head"], saved["n_steps"]
     if head.shape != (ring.n_envs,) or n_steps.shape != (ring.n_envs,):
         raise ValueError(
             f"the replay file is of {head.size} environments and this agent has {ring.n_envs}; make them equal"
         )
     if head.dtype != np.int64 or n_steps.dtype != np.int64:
         raise ValueError("the replay file's counters are damaged")
-    n_envs, used = ring.n_envs, min((*found["kind"].shape, 0, 0)[1], ring.rows)
-    expected = {name: ((n_envs, used, *array.shape[1:]), array.dtype) for name, array in own.items()}
-    check_specs(found, expected, "the replay file")
+    n_envs, used = ring.n_envs, min((*saved["kind"].shape, 0, 0)[1], ring.rows)
+    expected = {name: ((n_envs, used, *array.shape[1:]), array.dtype) for name, array in stored.items()}
+    check_specs(saved, expected, "the replay file")
 
 
-def check_specs(found: Mapping[str, Any], expected: Mapping[str, tuple[Any, Any]], where: str) -> None:
+def check_specs(saved: Mapping[str, Any], expected: Mapping[str, tuple[Any, Any]], where: str) -> None:
     """Raises ``ValueError`` unless arrays, or their specs, have the shapes and dtypes that a ring has for them."""
     for name, (shape, dtype) in expected.items():
-        if found[name].shape != shape or found[name].dtype != dtype:
+        if saved[name].shape != shape or saved[name].dtype != dtype:
             raise ValueError(
-                f"{name} in {where} is {found[name].dtype}{list(found[name].shape)} and this buffer expects "
+                f"{name} in {where} is {saved[name].dtype}{list(saved[name].shape)} and this buffer expects "
                 f"{dtype}{list(shape)}; it was saved with another environment or buffer_size"
             )
 
@@ -88,8 +88,8 @@ def put_rows(ring: Ring, parts: Sequence[Mapping[str, np.ndarray]]) -> None:
     """
     ring.recount(np.full(ring.n_envs, -1, np.int64))
     ring.version += 1
-    own = ring.stored()
-    known = newest = ring.head
+    stored = ring.stored()
+    written = newest = ring.head
     for rows in parts:
         check_rows(ring, rows)
         first, head = rows["first"], rows["head"]
@@ -97,29 +97,29 @@ def put_rows(ring: Ring, parts: Sequence[Mapping[str, np.ndarray]]) -> None:
             raise ValueError(f"rows of the replay buffer are {len(rows['kind'])}, and {n} by their counters")
         spans = [np.arange(first[env], head[env] + 1) for env in range(ring.n_envs)]
         index = np.concatenate([ring.index(np.full(len(span), env), span) for env, span in enumerate(spans)])
-        for name, array in own.items():
+        for name, array in stored.items():
             array[index] = rows[name]
-        known, newest = np.where(first > newest, first, np.minimum(known, first)), head
-    if ((newest >= 0) & (known > np.maximum(newest - ring.rows + 1, 0))).any():
+        written, newest = np.where(first > newest, first, np.minimum(written, first)), head
+    if ((newest >= 0) & (written > np.maximum(newest - ring.rows + 1, 0))).any():
         raise ValueError("rows of the replay buffer are missing")
     ring.recount(newest.copy())
 
 
-def check_rows(ring: Ring, found: Mapping[str, Any]) -> None:
+def check_rows(ring: Ring, saved: Mapping[str, Any]) -> None:
     """Checks that arrays, or their specs, can be the result of :func:`rows_since`.
 
     Raises:
         ValueError: if names, shapes or dtypes are others, or there are more rows than the ring has.
     """
-    own = ring.stored()
-    if {*found} != {*own, "first", "head"}:
+    stored = ring.stored()
+    if {*saved} != {*stored, "first", "head"}:
         raise ValueError(
-            f"rows of the replay buffer hold {', '.join(sorted(found))[:200]}, expected "
-            f"{', '.join(sorted({*own, 'first', 'head'}))}"
+            f"rows of the replay buffer hold {', '.join(sorted(saved))[:200]}, expected "
+            f"{', '.join(sorted({*stored, 'first', 'head'}))}"
         )
-    n = found["kind"].shape[0] if found["kind"].shape else 0
-    expected = {name: ((n, *array.shape[1:]), array.dtype) for name, array in own.items()}
+    n = saved["kind"].shape[0] if saved["kind"].shape else 0
+    expected = {name: ((n, *array.shape[1:]), array.dtype) for name, array in stored.items()}
     expected |= dict.fromkeys(("first", "head"), ((ring.n_envs,), np.dtype(np.int64)))
-    check_specs(found, expected, "rows of the replay buffer")
+    check_specs(saved, expected, "rows of the replay buffer")
     if n > ring.rows * ring.n_envs:
         raise ValueError(f"there are {n:,} rows, and the replay buffer has {ring.rows * ring.n_envs:,}")

@@ -156,21 +156,21 @@ class RolloutBuffer:
             ValueError: if names, shapes or dtypes do not match this buffer, or if it would be full, which cannot happen
                 between two steps. The buffer is then unchanged.
         """
-        own = self._stores()
-        if {*own} != {*arrays}:
-            raise ValueError(f"the file and this buffer differ in the arrays {sorted({*own} ^ {*arrays})}")
+        stores = self._stores()
+        if {*stores} != {*arrays}:
+            raise ValueError(f"the file and this buffer differ in the arrays {sorted({*stores} ^ {*arrays})}")
         n = len(arrays["reward"])
-        for name, array in own.items():
-            given = arrays[name]
-            if given.shape[1:] != array.shape[1:] or given.dtype != array.dtype or len(given) != n or n > self.n_steps:
+        for name, array in stores.items():
+            saved = arrays[name]
+            if saved.shape[1:] != array.shape[1:] or saved.dtype != array.dtype or len(saved) != n or n > self.n_steps:
                 raise ValueError(
-                    f"{name} in the file is {given.dtype}{list(given.shape)}, expected {array.dtype} and at most "
+                    f"{name} in the file is {saved.dtype}{list(saved.shape)}, expected {array.dtype} and at most "
                     f"{list(array.shape)}"
                 )
         if n == self.n_steps:
             raise ValueError(
                 f"the rollout has {n} steps, and {self.n_steps} are learned from as soon as they are complete"
             )
-        for name, array in own.items():
+        for name, array in stores.items():
             array[:n] = arrays[name]
         self.length = n

@@ -203,13 +203,13 @@ class ReplayBuffer(BaseReplayBuffer):
         # One final observation is passed without a loss of steps.
         times = start.time[:, None] + np.arange(-burn_in, length + 1 + self.n_steps)[None]
         position = ring.index(env, times.clip(oldest, head))
-        kind = ring.kind[position]
-        is_step = ((kind != LAST) & (times < head))[:, burn_in : burn_in + length + 1]
+        kinds_of_rows = ring.kind[position]
+        is_step = ((kinds_of_rows != LAST) & (times < head))[:, burn_in : burn_in + length + 1]
         steps_first = np.argsort(~is_step, axis=1, kind="stable")
-        which = np.arange(length)[None] % is_step.sum(axis=1, keepdims=True)
-        reads = burn_in + np.take_along_axis(steps_first, which, axis=1)
+        step_numbers = np.arange(length)[None] % is_step.sum(axis=1, keepdims=True)
+        reads = burn_in + np.take_along_axis(steps_first, step_numbers, axis=1)
         _, obs = ring.read(position)
-        begins = np.pad(kind[:, :-1] == LAST, ((0, 0), (1, 0)))
+        begins = np.pad(kinds_of_rows[:, :-1] == LAST, ((0, 0), (1, 0)))
         n_absent = (times[:, :burn_in] < oldest).sum(axis=1, dtype=np.int32)
         memory = ring.memory[position[:, 0]]
         tree, mask = unmasked(ring.tree(obs))
@@ -248,11 +248,11 @@ def look_ahead(xp: Any, ring: Any, index: Callable[..., Any], rows: Any, n: int)
     """Returns the up to ``n`` steps from each of ``rows`` to its episode's end or to the newest step."""
     times = rows.time[:, None] + xp.arange(n)[None]
     position = index(rows.env[:, None], times)
-    kind = ring.kind[position]
-    is_step = (kind != LAST) & (times < ring.head[rows.env][:, None])
-    continues = xp.cumprod(is_step & (kind != TERMINATED), axis=1).astype(bool)
+    kinds_of_rows = ring.kind[position]
+    is_step = (kinds_of_rows != LAST) & (times < ring.head[rows.env][:, None])
+    continues = xp.cumprod(is_step & (kinds_of_rows != TERMINATED), axis=1).astype(bool)
     valid = xp.concatenate([is_step[:, :1], is_step[:, 1:] & continues[:, :-1]], axis=1)
-    return StepWindow(position, valid, (kind == TERMINATED) & valid)
+    return StepWindow(position, valid, (kinds_of_rows == TERMINATED) & valid)
 
 
 class NewGoals(NamedTuple):
@@ -269,14 +269,14 @@ class NewGoals(NamedTuple):
     terminated: Any
     """Whether they end the episode, a function as ``reward``; None if the steps keep their own flags."""
 
-    def ends(self, reached: Any, goal: Any, own: Any, ended: Any) -> Any:
+    def ends(self, reached: Any, goal: Any, previous_goal: Any, ended: Any) -> Any:
         """Returns which steps end an episode: those that reach ``goal``, and those that ended otherwise, as in a crash.
 
-        ``ended`` says which of them ended with the goals ``own``.
+        ``ended`` says which of them ended with ``previous_goal``.
         """
         ends = self.terminated(reached, goal).astype(bool)
         none_ended = isinstance(ended, np.ndarray) and not ended.any()  # functions of single goals take long
-        return ends if none_ended else ends | (ended & ~self.terminated(reached, own).astype(bool))
+        return ends if none_ended else ends | (ended & ~self.terminated(reached, previous_goal).astype(bool))
 
 
 class Outcome(NamedTuple):
@@ -295,33 +295,36 @@ def outcome(
 ) -> Outcome:
     """Returns what ``rows`` lead to in up to ``n_steps`` steps, with new goals if there are any."""
     if goals is not None:
-        which, times = goals.which, rows.time[goals.which, None] + 1 + xp.arange(n_steps)[None]
-        position = index(rows.env[which, None], times).reshape(-1)
-        reached, own = (ring.obs[leaf][position] for leaf in goals.leaves)
+        relabeled, times = goals.which, rows.time[goals.which, None] + 1 + xp.arange(n_steps)[None]
+        position = index(rows.env[relabeled, None], times).reshape(-1)
+        reached, previous_goal = (ring.obs[leaf][position] for leaf in goals.leaves)
     if n_steps == 1:
         rewards, terminated = ring.reward[rows.position], ring.kind[rows.position]  # which is STEP or TERMINATED
         if goals is not None:
-            rewards = replaced(rewards, which, goals.reward(reached, goals.goal))
+            rewards = replaced(rewards, relabeled, goals.reward(reached, goals.goal))
             if goals.terminated is not None:
-                ended = goals.ends(reached, goals.goal, own, terminated[which] == TERMINATED)
-                terminated = replaced(terminated, which, ended)
+                ended = goals.ends(reached, goals.goal, previous_goal, terminated[relabeled] == TERMINATED)
+                terminated = replaced(terminated, relabeled, ended)
         return Outcome(rewards, 1, terminated)
     position, valid, terminal = look_ahead(xp, ring, index, rows, n_steps)
     rewards = ring.reward[position]
     if goals is not None:
         each = xp.repeat(goals.goal, n_steps, axis=0)
-        rewards = replaced(rewards, which, goals.reward(reached, each).reshape(-1, n_steps))
+        rewards = replaced(rewards, relabeled, goals.reward(reached, each).reshape(-1, n_steps))
         if goals.terminated is not None:
-            ends = goals.ends(reached, each, own, terminal[which].reshape(-1)).reshape(-1, n_steps) & valid[which]
+            ends = (
+                goals.ends(reached, each, previous_goal, terminal[relabeled].reshape(-1)).reshape(-1, n_steps)
+                & valid[relabeled]
+            )
             goes_on = xp.cumsum(ends, axis=1)[:, :-1] == 0
-            valid = replaced(valid, (which, slice(1, None)), valid[which][:, 1:] & goes_on)
-            terminal = replaced(terminal, which, ends) & valid
+            valid = replaced(valid, (relabeled, slice(1, None)), valid[relabeled][:, 1:] & goes_on)
+            terminal = replaced(terminal, relabeled, ends) & valid
     return Outcome(xp.where(valid, rewards, xp.float32(0)), valid.sum(axis=1), terminal.any(axis=1))
 
 
-def replaced(array: Any, which: Any, values: Any) -> Any:
-    """Returns ``array`` with ``values`` at ``which``; an array of NumPy is mutated."""
+def replaced(array: Any, index: Any, values: Any) -> Any:
+    """Returns ``array`` with ``values`` at ``index``; an array of NumPy is mutated."""
     if isinstance(array, np.ndarray):
-        array[which] = values
+        array[index] = values
         return array
-    return array.at[which].set(values.astype(array.dtype))
+    return array.at[index].set(values.astype(array.dtype))

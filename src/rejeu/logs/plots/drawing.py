@@ -32,13 +32,13 @@ LEGEND_COLUMNS = 4
 """Maximum number of columns of a legend."""
 
 
-def make_figure(what: str, width: float = WIDTH, height: float = 4.2) -> Picture:
+def make_figure(drawing: str, width: float = WIDTH, height: float = 4.2) -> Picture:
     """Returns an empty figure with a size in inches.
 
     Raises:
-        MissingExtra: if matplotlib is not installed. The message says that ``what`` needs it.
+        MissingExtra: if matplotlib is not installed. The message says that ``drawing`` needs it.
     """
-    with requires(what, "matplotlib", "plot"):
+    with requires(drawing, "matplotlib", "plot"):
         import matplotlib.figure  # noqa: F401 - also where our own module was imported before
 
         from rejeu.logs.plots.picture import Picture
@@ -64,7 +64,7 @@ def draw(panel: Axes, chart: Chart, along: str = "x", unit: float = 1.0) -> None
         along: "x" for steps, "t" for minutes.
         unit: factor of the horizontal axis, such as 60 for seconds.
     """
-    seen: list[str] = []
+    labels_drawn: list[str] = []
     for series in chart["series"]:
         x = np.array(series[along], np.float64) * unit
         y, low, high = (np.array(series.get(name, ()), np.float64) for name in ("y", "low", "high"))
@@ -75,17 +75,17 @@ def draw(panel: Axes, chart: Chart, along: str = "x", unit: float = 1.0) -> None
         elif series["kind"] == "marks":
             panel.plot(x, y, "^", markersize=4.5, color=color, label=label, zorder=3)
         elif series["kind"] == "band":
-            known = np.isfinite(low) & np.isfinite(high)
-            panel.fill_between(x[known], low[known], high[known], color=color, alpha=0.15, linewidth=0)
+            is_known = np.isfinite(low) & np.isfinite(high)
+            panel.fill_between(x[is_known], low[is_known], high[is_known], color=color, alpha=0.15, linewidth=0)
         elif series["kind"] == "points":
             reach = np.nan_to_num(np.stack([y - low, high - y]).clip(0))
             panel.errorbar(x, y, reach, fmt="none", ecolor=color, elinewidth=1.2, alpha=0.6, zorder=3)
             edge: dict[str, Any] = {"markeredgecolor": "white", "markeredgewidth": 0.8, "zorder": 4}
             panel.plot(x, y, "o", markersize=5, color=color, label=label, clip_on=False, **edge)
         else:
-            dash = "--" if seen.count(color) else "-"  # more groups than colors
+            dash = "--" if labels_drawn.count(color) else "-"  # more groups than colors
             panel.plot(x, y, dash, label=label, **{**LINE, "color": color})
-            seen.append(color)
+            labels_drawn.append(color)
     if chart.get("range") is not None:
         panel.set_ylim(*chart["range"])
     panel.set_ylabel(chart["y"])
@@ -133,14 +133,14 @@ def add_title_and_legend(panel: Axes, title: str) -> None:
         return
     labels = [textwrap.fill(label, round(LEGEND_CHARACTERS * width)) for label in labels]
     style: dict[str, Any] = {"frameon": False, "fontsize": 8.5, "labelcolor": INK, "handlelength": 1.2}
-    place: dict[str, Any] = {"loc": "lower left", "bbox_to_anchor": (-0.01, 1.0), "borderaxespad": 0.2}
+    position: dict[str, Any] = {"loc": "lower left", "bbox_to_anchor": (-0.01, 1.0), "borderaxespad": 0.2}
     heading: dict[str, Any] = {
         "title": title,
         "alignment": "left",
         "title_fontproperties": {"size": 12, "weight": "bold"},
     }
     legend = panel.legend(
-        handles, labels, ncols=legend_columns(labels, width), columnspacing=1.4, **style, **place, **heading
+        handles, labels, ncols=legend_columns(labels, width), columnspacing=1.4, **style, **position, **heading
     )
     legend.get_title().set_color(INK)
     for line in legend.get_lines():  # as large whatever the number of episodes

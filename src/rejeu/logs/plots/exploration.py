@@ -53,13 +53,13 @@ def noise(
         MissingExtra: if matplotlib is not installed.
         TypeError: for other objects than action noise.
     """
-    given = [noises] if isinstance(noises, ActionNoise) else list(noises)
+    processes = [noises] if isinstance(noises, ActionNoise) else list(noises)
     n_steps, n_processes = whole("n_steps", n_steps, least=1), whole("n_processes", n_processes, least=1)
-    paths = [_actions(one, n_steps, n_processes, action, seed) - np.asarray(action) for one in given]
-    figure = drawing.make_figure("drawing noise", height=1.2 + 2.4 * len(given))
-    panels = figure.subplots(len(given), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
-    for panel, one, values in zip(panels, given, paths, strict=True):
-        _sample_paths(panel, values.reshape(n_steps, -1), "noise", _describe(one))
+    paths = [_actions(process, n_steps, n_processes, action, seed) - np.asarray(action) for process in processes]
+    figure = drawing.make_figure("drawing noise", height=1.2 + 2.4 * len(processes))
+    panels = figure.subplots(len(processes), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
+    for panel, process, values in zip(panels, processes, paths, strict=True):
+        _sample_paths(panel, values.reshape(n_steps, -1), "noise", _describe(process))
     return _finished(figure, n_steps, title, path)
 
 
@@ -145,13 +145,13 @@ def saturation(
     action = number("action", action, least=-1, most=1)
     figure = drawing.make_figure("drawing saturation", height=5.6)
     panels = figure.subplots(2, 1, sharex=True, sharey=True)
-    for panel, one in zip(panels, (replace(noise, repulsive=(0.0,)), noise), strict=True):
-        taken = _actions(one, n_steps, max(n_processes, N_MEASURED), action, seed)[:, :, 0].clip(-1.0, 1.0)
-        share = (abs(taken[:, :N_MEASURED]) == 1.0).mean()
-        text = f"repulsive {one.repulsive[0]:g}: {share:.1%} of the actions of {N_MEASURED} sample paths at a bound"
+    for panel, process in zip(panels, (replace(noise, repulsive=(0.0,)), noise), strict=True):
+        actions = _actions(process, n_steps, max(n_processes, N_MEASURED), action, seed)[:, :, 0].clip(-1.0, 1.0)
+        share = (abs(actions[:, :N_MEASURED]) == 1.0).mean()
+        text = f"repulsive {process.repulsive[0]:g}: {share:.1%} of the actions of {N_MEASURED} sample paths at a bound"
         panel.axhline(action, color=drawing.MUTED, linewidth=1.0, linestyle=(0, (4, 3)))
-        _sample_paths(panel, taken[:, :n_processes], "action taken", text)
-        at_bound = np.where(abs(taken[:, :n_processes]) == 1.0, taken[:, :n_processes], np.nan)
+        _sample_paths(panel, actions[:, :n_processes], "action taken", text)
+        at_bound = np.where(abs(actions[:, :n_processes]) == 1.0, actions[:, :n_processes], np.nan)
         panel.plot(np.arange(1, n_steps + 1), at_bound, color=drawing.BAD_COLOR, linewidth=3.0)
         panel.set_ylim(-1.08, 1.08)
     return _finished(figure, n_steps, title, path)
@@ -181,10 +181,10 @@ def _actions(noise: ActionNoise, n_steps: int, n_processes: int, action: ArrayLi
         raise TypeError(f"{noise!r} is not action noise; use NormalActionNoise or OrnsteinUhlenbeckActionNoise")
     rng = np.random.default_rng(seed)
     fixed = np.broadcast_to(np.asarray(action, np.float32), (n_processes, len(noise.mean)))
-    state, taken = noise.init(n_processes), np.empty((n_steps, *fixed.shape), np.float32)
+    state, actions = noise.init(n_processes), np.empty((n_steps, *fixed.shape), np.float32)
     for t in range(n_steps):
-        state, taken[t] = noise.advance(state, fixed, rng.standard_normal(fixed.shape, np.float32))
-    return taken
+        state, actions[t] = noise.advance(state, fixed, rng.standard_normal(fixed.shape, np.float32))
+    return actions
 
 
 def _describe(noise: ActionNoise) -> str:

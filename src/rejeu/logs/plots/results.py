@@ -62,20 +62,22 @@ def learning_curve(
     episodes = Table(history.to_dict())
     table = evaluation_table(evaluations, episodes)
     empty: charts.Chart = {"y": "return", "series": []}
-    found = [charts.episode_chart(episodes, table, "return", window) or empty]
+    shown_charts = [charts.episode_chart(episodes, table, "return", window) or empty]
     if np.isfinite(history["success"]).any():
-        found.append(charts.episode_chart(episodes, table, "success", window) or empty)
+        shown_charts.append(charts.episode_chart(episodes, table, "success", window) or empty)
     rows = history.record_rows
     if len(rows):
         records = history["step"][rows], history["seconds"][rows] / 60, history["return"][rows]
-        found[0]["series"].insert(1, charts.series("marks", "records", "good", *records))
-        found[0]["range"] = charts.widened(found[0]["range"], history.best_return)
+        shown_charts[0]["series"].insert(1, charts.series("marks", "records", "good", *records))
+        shown_charts[0]["range"] = charts.widened(shown_charts[0]["range"], history.best_return)
 
-    figure = drawing.make_figure("drawing a learning curve", height=6.4 if len(found) > 1 else 4.2)
-    panels = figure.subplots(len(found), sharex=True, squeeze=False, height_ratios=[3, 2][: len(found)])[:, 0]
-    for panel, chart in zip(panels, found, strict=True):
+    figure = drawing.make_figure("drawing a learning curve", height=6.4 if len(shown_charts) > 1 else 4.2)
+    panels = figure.subplots(len(shown_charts), sharex=True, squeeze=False, height_ratios=[3, 2][: len(shown_charts)])[
+        :, 0
+    ]
+    for panel, chart in zip(panels, shown_charts, strict=True):
         drawing.draw(panel, chart, along, unit)
-    last = max((x for series in found[0]["series"] for x in series[along] if x is not None), default=0) * unit
+    last = max((x for series in shown_charts[0]["series"] for x in series[along] if x is not None), default=0) * unit
     panels[-1].set_xlabel(x_title)
     panels[-1].set_xlim(0, (last or 1.0) * (1 + RIGHT_MARGIN))
     drawing.add_title_and_legend(panels[0], title)
@@ -107,14 +109,14 @@ def evaluation(evaluation: Any, path: str | Path | None = None, title: str = "")
         zorder=3,
         **drawing.LINE,
     )
-    for chosen, marker, color, label in (
+    for mask, marker, color, label in (
         (np.isnan(successes), "o", drawing.DOT_COLOR, "episodes"),
         (successes == 1, "o", drawing.GOOD_COLOR, f"success ({np.sum(successes == 1):,})"),
         (successes == 0, "X", drawing.BAD_COLOR, f"no success ({np.sum(successes == 0):,})"),
     ):
-        if chosen.any():
+        if mask.any():
             size = drawing.dot_size(len(returns))
-            panel.plot(numbers[chosen], returns[chosen], marker, color=color, markersize=size, alpha=0.8, label=label)
+            panel.plot(numbers[mask], returns[mask], marker, color=color, markersize=size, alpha=0.8, label=label)
     drawing.steps_axis(panel, len(returns) + 1)
     panel.set_xlabel("episode")
     panel.set_ylabel("return")
@@ -137,7 +139,7 @@ def comparison(comparison: Any, path: str | Path | None = None) -> Picture:
     envs = list(dict.fromkeys(group.env_id for group in comparison.groups))[:MAX_PANELS]
     drawn = [charts.group_chart("curve", comparison, env) for env in envs]
     names = [[series["name"] for series in chart["series"] if series["name"]] for chart in drawn]
-    heights = [3.7 + 0.2 * math.ceil(len(one) / drawing.legend_columns(one)) for one in names]
+    heights = [3.7 + 0.2 * math.ceil(len(labels) / drawing.legend_columns(labels)) for labels in names]
     figure = drawing.make_figure("drawing a comparison", height=0.6 + sum(heights))
     panels = figure.subplots(len(envs), squeeze=False, height_ratios=heights)[:, 0]
     for panel, env, chart in zip(panels, envs, drawn, strict=True):
@@ -192,20 +194,20 @@ def trajectory(
     lows = np.broadcast_to(np.asarray(-np.inf if low is None else low, np.float64), dimension)
     highs = np.broadcast_to(np.asarray(np.inf if high is None else high, np.float64), dimension)
 
-    what = "drawing a trajectory"
+    description = "drawing a trajectory"
     if dimension == 1:
-        figure = drawing.make_figure(what)
+        figure = drawing.make_figure(description)
         panel = figure.subplots()
         _coordinate(panel, points[:, 0], lows[0], highs[0], names[0])
         panel.set_xlabel("step")
         drawing.add_title_and_legend(panel, title)
     elif dimension == 2:
-        figure = drawing.make_figure(what, 5.6, 5.6)
+        figure = drawing.make_figure(description, 5.6, 5.6)
         _plane(figure.subplots(), points, lows, highs, names, title)
     else:
-        figure = drawing.make_figure(what, 10.0, 5.6)
-        left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=[5.6, 4.4])[0]
-        _plane(left.subplots(), points, lows, highs, names, title)
+        figure = drawing.make_figure(description, 10.0, 5.6)
+        left_figure, right = figure.subfigures(1, 2, squeeze=False, width_ratios=[5.6, 4.4])[0]
+        _plane(left_figure.subplots(), points, lows, highs, names, title)
         shown = min(dimension, MAX_COORDINATES)
         panels = right.subplots(shown, 1, sharex=True)
         for i, panel in enumerate(panels):
