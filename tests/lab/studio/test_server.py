@@ -1,5 +1,6 @@
 """Who the server answers, where it listens, and how it ends. No browser."""
 
+import asyncio
 import http.client
 import os
 import socket
@@ -8,6 +9,12 @@ import sys
 
 import pytest
 
+pytest.importorskip("nicegui", reason="needs nicegui, which is in the extra studio")
+
+from starlette.responses import PlainTextResponse
+
+from rejeu.lab.studio.guard import Guard
+from rejeu.lab.studio.layout import address
 from tests.lab.studio.conftest import Served, opened, serving
 
 
@@ -39,6 +46,48 @@ def test_only_the_address_with_its_token_is_answered_and_then_its_cookie(served)
     assert asked(served, Cookie=f"{name}=wrong")[0] == 403
     assert asked(served, Cookie=f"{name}={value}", Host="evil.example")[0] == 403
     assert asked(served, Cookie=f"{name}={value}", Origin="http://evil.example")[0] == 403
+
+
+def requested(guard, host, receives=()):
+    """Returns status and text with which a guard answers."""
+    messages, received = [], iter([*receives, {"type": "http.request"}])
+
+    async def receive():
+        return next(received)
+
+    async def send(message):
+        messages.append(message)
+
+    headers = [(b"host", host.encode()), (b"cookie", f"{guard.cookie}=secret".encode())]
+    scope = {"type": "http", "headers": headers, "path": "/", "query_string": b"", "method": "GET"}
+    asyncio.run(guard(scope, receive, send))
+    return messages[0]["status"], messages[-1].get("body", b"").decode()
+
+
+async def page(scope, receive, send):
+    await PlainTextResponse("page")(scope, receive, send)
+
+
+def test_another_name_is_told_how_to_forward_the_port_and_answered_if_the_command_line_allows_it():
+    status, text = requested(Guard(page, "secret", 8080), "localhost:9000")
+    assert status == 403
+    assert "ssh -L 8080:localhost:8080 HOST" in text
+    assert "--allow-host" in text
+    guard = Guard(page, "secret", 8080, ["localhost:9000"])
+    assert [requested(guard, host) for host in ("localhost:9000", "127.0.0.1:8080")] == [(200, "page")] * 2
+    assert requested(guard, "evil.example:9000")[0] == 403
+
+
+def test_an_error_after_the_browser_has_gone_is_not_printed_and_another_is():
+    async def app(scope, receive, send):
+        await send({"type": "http.response.start", "status": 200, "headers": []})
+        await receive()
+        raise RuntimeError("No response returned.")
+
+    guard = Guard(app, "secret", 8080)
+    assert requested(guard, "localhost:8080", receives=[{"type": "http.disconnect"}])[0] == 200
+    with pytest.raises(RuntimeError):
+        requested(guard, "localhost:8080")
 
 
 @pytest.mark.parametrize("own", [{}, {"Origin": "http://evil.example"}])
@@ -76,6 +125,10 @@ def test_without_the_extra_there_is_one_line(tmp_path):
     assert (ended.returncode, ended.stdout) == (2, "")
     expected = 'rejeu: error: the studio needs nicegui, which is not installed; run: pip install "rejeu[studio]"'
     assert ended.stderr.strip() == expected
+
+
+def test_an_address_holds_any_name():
+    assert address("/play", agent=b"bad\xff".decode("utf-8", "surrogateescape")) == "/play?agent=bad%FF"
 
 
 def test_an_empty_folder_says_so_and_leads_to_a_new_run(browser, served):

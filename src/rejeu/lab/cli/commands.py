@@ -420,6 +420,8 @@ class Studio(RunOptions):
     """Port of this computer; if it is taken, the next free one. 0 for any."""
     no_browser: bool = False
     """Print the address, and do not open it in the web browser."""
+    allow_host: Annotated[tuple[str, ...], Shown("NAME:PORT")] = ()
+    """Answer under this name and port too, as the browser has them behind a tunnel; repeat for several."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -24,7 +24,7 @@ def run_studio(arguments: Studio) -> tuple[int, None]:
     """
     if arguments.folder.exists() and not arguments.folder.is_dir():
         raise NotADirectoryError(f"{arguments.folder} is no folder; expected one of runs, such as runs")
-    open_studio(arguments.folder, arguments.port, not arguments.no_browser, given=arguments)
+    open_studio(arguments.folder, arguments.port, not arguments.no_browser, given=arguments, hosts=arguments.allow_host)
     return 0, None
 
 
@@ -35,6 +35,7 @@ def open_studio(
     guests: Mapping[str, tuple[Path, Environment]] | None = None,
     page: tuple[str, Sequence[tuple[str, str]]] = ("/", ()),
     given: RunOptions = NOTHING,
+    hosts: Sequence[str] = (),
 ) -> None:
     """Serves the studio until Ctrl-C.
 
@@ -45,6 +46,7 @@ def open_studio(
         guests: models that may be elsewhere, with their environments, by their names.
         page: that is opened, and its query.
         given: the environment and the modules that the command line names, and which runs may therefore import.
+        hosts: further ``NAME:PORT`` under which the studio is asked.
 
     Raises:
         MissingExtra: if NiceGUI is not installed.
@@ -63,4 +65,4 @@ def open_studio(
     env_id = "" if given.env is None else from_arguments(given.env, given).env_id
     options = {one.name: getattr(given, one.name) for one in fields(EnvironmentOptions)}
     typed = RunConfig(env=env_id, env_argument=given.env or "", **options)
-    server.serve(state.Studio(folder, guests, typed), port, ready, page)
+    server.serve(state.Studio(folder, guests, typed), port, ready, page, hosts)

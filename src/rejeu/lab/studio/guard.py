@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import secrets
+from collections.abc import Sequence
 from typing import Any
 from urllib.parse import parse_qsl, urlencode, urlsplit
 
@@ -32,9 +33,13 @@ class Guard:
     server's, so that no page of another site reaches it.
     """
 
-    def __init__(self, app: Any, token: str, port: int) -> None:
+    def __init__(self, app: Any, token: str, port: int, hosts: Sequence[str] = ()) -> None:
         self.app, self.token, self.cookie = app, token, f"rejeu_studio_{port}"
-        self.hosts = {f"{name}:{port}" for name in (HOST, "localhost")}
+        self.hosts = {*hosts, *(f"{name}:{port}" for name in (HOST, "localhost"))}
+        self.advice = (
+            f"open the studio as localhost:{port}; by ssh forward the same port, ssh -L {port}:localhost:{port} HOST, "
+        )
+        self.advice += "or start it with --allow-host NAME:PORT, as it is in the address of the browser"
 
     async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
         """Answers one request."""
@@ -43,9 +48,9 @@ class Guard:
             return
         asked = HTTPConnection(scope)
         if not self.is_own(asked.headers):
-            await refuse(scope, receive, send, "this name is not the studio's")
+            await refuse(scope, receive, send, self.advice)
         elif secrets.compare_digest(asked.cookies.get(self.cookie, "").encode(), self.token.encode()):
-            await self.app(scope, receive, with_headers(send))
+            await while_there(self.app, scope, receive, with_headers(send))
         elif scope["type"] == "http" and self.token in asked.query_params.getlist("token"):
             await self.welcome(asked)(scope, receive, send)
         else:
@@ -70,6 +75,23 @@ async def refuse(scope: Any, receive: Any, send: Any, text: str) -> None:
         await send({"type": "websocket.close", "code": 1008})
     else:
         await PlainTextResponse(f"403: {text}", 403)(scope, receive, send)
+
+
+async def while_there(app: Any, scope: Any, receive: Any, send: Any) -> None:
+    """Answers a request. When the browser has gone, as with a tab that is closed while it connects, an error is of no use."""
+    is_gone = False
+
+    async def receiving() -> Any:
+        nonlocal is_gone
+        message = await receive()
+        is_gone = is_gone or message["type"].endswith(".disconnect")
+        return message
+
+    try:
+        await app(scope, receiving, send)
+    except Exception:  # middleware raises RuntimeError, and what it waits for anything
+        if not is_gone:
+            raise
 
 
 def with_headers(send: Any) -> Any:

@@ -53,6 +53,7 @@ def serve(
     port: int,
     ready: Callable[[str], None],
     page: tuple[str, Sequence[tuple[str, str]]] = ("/", ()),
+    hosts: Sequence[str] = (),
 ) -> None:
     """Serves the studio until Ctrl-C; ``ready`` is called with the address.
 
@@ -61,6 +62,7 @@ def serve(
         port: the port, or the first free one after it; 0 for any.
         ready: called before the first request is answered.
         page: that the address leads to, and its query.
+        hosts: further ``NAME:PORT`` under which it is asked, such as that of a tunnel.
     """
     with closing(bound(port)) as listening, studio:
         own_port = listening.getsockname()[1]
@@ -72,7 +74,9 @@ def serve(
         for one in PAGES:
             add(one, studio, links)
         ui.run_with(server, title="rejeu studio", dark=None, show_welcome_message=False, reconnect_timeout=RECONNECT)
-        config = uvicorn.Config(Guard(server, token, own_port), log_level="warning", ws_max_size=2**24, lifespan="on")
+        config = uvicorn.Config(
+            Guard(server, token, own_port, hosts), log_level="warning", ws_max_size=2**24, lifespan="on"
+        )
         path, query = page
         ready(f"http://{HOST}:{own_port}{path}?{urlencode([*query, ('token', token)])}")
         uvicorn.Server(config).run(sockets=[listening])
