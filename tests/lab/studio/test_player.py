@@ -2,6 +2,7 @@
 
 import json
 import os
+import threading
 import time
 
 import numpy as np
@@ -101,6 +102,43 @@ def test_what_cannot_be_shown_is_said_in_one_line(folder, monkeypatch):
         one.close()
         assert problem in one.problem
         assert "\n" not in one.problem
+
+
+def test_after_an_error_and_a_click_it_rests_between_two_attempts(folder, monkeypatch):
+    attempts, read = [], player.read_folder
+    monkeypatch.setattr(player, "RENEW", 0.1)
+    monkeypatch.setattr(player, "read_folder", lambda one: attempts.append(None) or read(one))
+    folder.config.write_text("{", encoding="utf-8")
+    one = LivePlayer(folder.path, RunOptions(), lambda *_: None)
+    until(lambda: one.problem)
+    one.choose(BEST)
+    time.sleep(0.35)
+    one.close()
+    assert len(attempts) <= 6  # the first, the one after the click, and one each 0.1 s
+    until(lambda: not one._thread.is_alive())
+
+
+def test_an_environment_of_any_speed_is_stepped_at_a_thousand_a_second(folder, monkeypatch):
+    """A thread without a pause would keep the pages waiting."""
+    waits, wait = [], threading.Event.wait
+    monkeypatch.setattr(player, "playback_fps", lambda env: 1e12)
+    monkeypatch.setattr(threading.Event, "wait", lambda event, time=None: waits.append(time) or wait(event, time))
+    one = LivePlayer(folder.path, RunOptions(), lambda *_: None)
+    until(lambda: one.complete is not None)
+    one.close()
+    assert any(time is not None and 1e-4 < time <= 1e-3 for time in waits)
+
+
+def test_a_run_that_has_ended_without_a_model_does_not_promise_one(folder):
+    for path in (folder.agent, folder.best, folder.models / "step_000000000021.safetensors"):
+        path.unlink()
+    for is_over, text in ((False, "within seconds"), (True, "the run has ended before it wrote one")):
+        if is_over:
+            (folder.path / "lock").touch()
+        one = LivePlayer(folder.path, RunOptions(), lambda *_: None)
+        until(lambda one=one: one.problem)
+        one.close()
+        assert text in one.problem
 
 
 @pytest.mark.parametrize("error", [KeyError("palette"), RuntimeError("no display"), AttributeError("no screen")])

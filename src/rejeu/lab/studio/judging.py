@@ -67,7 +67,7 @@ class Judging:
                 self._evaluate(leaderboard.models(self.folder))
                 self.problem = ""
             except Exception as error:  # the environment can raise anything
-                self.problem, self._results, self._stamps = one_line(error), {}, {}
+                self.problem, self.now, self._results, self._stamps = one_line(error), "", {}, {}
                 self.version += 1
             time.sleep(1.0)
 

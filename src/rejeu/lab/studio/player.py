@@ -27,13 +27,15 @@ from rejeu.envs.rendering import rgb_frame
 from rejeu.lab.cli import one_line
 from rejeu.lab.cli.commands import RunOptions
 from rejeu.lab.cli.environment import from_run
-from rejeu.lab.reporting.runs import has_process
+from rejeu.lab.reporting.runs import has_process, is_recent
 from rejeu.lab.runs import requests
 from rejeu.lab.runs.config import read_folder
 from rejeu.logs.video import playback_fps
 
 LEAST_FPS = 20.0
 """Frames a second of environments that are slower; of faster ones not every step is shown, but at least so many a second."""
+MOST_FPS = 1000.0
+"""Steps a second of environments that are faster."""
 RENEW = 2.0
 """Seconds between two looks for new weights, and two requests for them."""
 REST = 0.8
@@ -108,6 +110,7 @@ class LivePlayer:
     def _run(self) -> None:
         lower_priority()
         while not self._closed.is_set():
+            self._changed.clear()
             try:
                 made = from_run(read_folder(self.folder), self.folder.path, self.given)
                 with closing(made.rendering()) as env:
@@ -135,10 +138,10 @@ class LivePlayer:
     def _play(self, agent: Agent, env: gym.Env, episode: LiveEpisode) -> None:
         """Plays one episode, with new weights as they come; another choice ends it."""
         obs, _ = env.reset(seed=episode.seed)
-        fps, memory, due = max(playback_fps(env), LEAST_FPS), None, time.perf_counter()
+        fps, memory, due = max(min(playback_fps(env), MOST_FPS), LEAST_FPS), None, time.perf_counter()
         stride, period = max(int(fps / LEAST_FPS), 1), 1 / fps
         self._show(env, episode)
-        while not (episode.is_over or self._changed.is_set()):
+        while not (episode.is_over or self._changed.is_set() or self._closed.is_set()):
             if not self.is_seen:
                 time.sleep(0.1)
                 continue
@@ -190,6 +193,8 @@ class LivePlayer:
         for path in chosen.get(self.model, named):
             if path.is_file():
                 return path
+        if has_process(folder.path) is False or not is_recent(folder.path):
+            raise FileNotFoundError("there is no model; the run has ended before it wrote one")
         raise FileNotFoundError("there is no model yet; the first is written within seconds or at the first evaluation")
 
 
