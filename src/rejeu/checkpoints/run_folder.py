@@ -132,7 +132,7 @@ def find_model(run: str | Path, which: Literal["best", "last"] = "best") -> Path
     path = Path(run)
     if os.path.isfile(path):  # unlike Path.is_file, False for a name that is too long
         return path
-    if not os.path.isdir(path) or (path.name not in ("", "..") and checkpoint.resolve(path).is_file()):
+    if not os.path.isdir(path) or (path.name not in ("", "..") and os.path.isfile(checkpoint.resolve(path))):
         try:
             return checkpoint.existing(path)
         except FileNotFoundError:

@@ -143,6 +143,15 @@ def shown(value: Any, length: int = 100) -> str:
     return text if len(text) <= length else text[: length - 3] + "..."
 
 
+def utf8(text: object) -> str:
+    r"""Returns a text in which is escaped what UTF-8 cannot encode, such as other bytes in the name of a file.
+
+    >>> print(utf8(b"bad\xff".decode("utf-8", "surrogateescape")))
+    bad\udcff
+    """
+    return str(text).encode("utf-8", "backslashreplace").decode()
+
+
 def brief(error: BaseException) -> str:
     """Returns the message of an error on one line, shortened."""
     text = " ".join((str(error) or type(error).__name__).split())

@@ -600,6 +600,22 @@ def test_what_could_not_be_written_is_repeated_at_the_end_of_the_command(tmp_pat
     assert rejeu.load(out / "best.safetensors").num_timesteps == 40
 
 
+@pytest.mark.filterwarnings("always::UserWarning")
+def test_nothing_is_advised_that_needs_a_model_or_a_checkpoint_that_was_not_written(tmp_path, monkeypatch, capsys):
+    disk, call = FullDisk(monkeypatch), Evaluate.__call__
+
+    def fill(self, agent, progress):
+        disk.full = True
+        call(self, agent, progress)
+
+    monkeypatch.setattr(Evaluate, "__call__", fill)
+    assert train(tmp_path / "run", *FEWER_FILES, "--backend", "gymnasium", steps=60) == 2
+    printed = capsys.readouterr()
+    assert "agent.safetensors" in printed.err
+    assert "try it" not in printed.out
+    assert "resume" not in printed.out
+
+
 def test_check_leaves_out_what_only_the_authors_of_a_package_can_change(capsys):
     assert main(["check", "CartPole-v1"]) == 0
     text = capsys.readouterr().out

@@ -1,13 +1,16 @@
 """Rows of runs: what is read again, and what is shown of runs that are damaged or have disappeared."""
 
 import json
+import os
 import shutil
 
 import pytest
 
+from rejeu.lab.cli import dumps, main
+from rejeu.lab.cli.output import noted_in
 from rejeu.lab.reporting import rows as module, run_list
 from rejeu.lab.reporting.rows import COLUMNS, Rows, cells
-from tests.lab.reporting.report.folders import write
+from tests.lab.reporting.report.folders import CONFIG, write
 
 
 @pytest.fixture
@@ -65,7 +68,7 @@ def test_a_row_says_that_its_run_is_damaged_or_gone_or_not_read_yet(tmp_path):
     assert [row["state"] for row in reader.read(seconds=0)] == ["unread"] * 3
     a, b, c = reader.read()
     assert "config.json is damaged" in a["notes"][0]
-    assert (b["state"], c["state"]) == ("finished", "damaged")
+    assert (a["state"], b["state"], c["state"]) == ("damaged", "finished", "damaged")
     assert "expected the columns r, l and t" in c["notes"][0]
     shutil.rmtree(tmp_path / "b")
     a, b, c = reader.read()
@@ -75,8 +78,105 @@ def test_a_row_says_that_its_run_is_damaged_or_gone_or_not_read_yet(tmp_path):
 
 
 def test_rows_are_json(tmp_path):
-    from rejeu.lab.cli import dumps
-
     write(tmp_path / "a")
     (row,) = json.loads(dumps(Rows(tmp_path).read()))
     assert len(row["curve"]) == 40
+
+
+@pytest.mark.skipif(os.name != "posix", reason="names are Unicode, and links need a permission")
+def test_odd_names_links_and_files_for_folders_hide_no_other_run(tmp_path, capsys):
+    for name in ("good", "x", "L" * 250, "loops", "files"):
+        write(tmp_path / name, videos=False)
+    (tmp_path / "group").mkdir()
+    for source, name in ((write(tmp_path / "y", videos=False), b"group/\xe9"), (tmp_path / "x", b"bad\xff\xfe")):
+        os.rename(source, os.path.join(os.fsencode(tmp_path), name))
+    for name in ("checkpoints", "models", "videos"):
+        (tmp_path / "loops" / name).symlink_to(name)
+        (tmp_path / "files" / name).touch()
+    for name, target in (("loop", "loop"), ("up", ".."), ("nowhere", "no/where")):
+        (tmp_path / name).symlink_to(target)
+    reader = Rows(tmp_path)
+    rows = {row["run"]: row for row in reader.read()}
+    assert {*rows} == {"good", "L" * 250, "loops", "files", r"group/\udce9", r"bad\udcff\udcfe"}
+    for name, row in rows.items():
+        expected = ("damaged", ("its name is not UTF-8; rename the folder",)) if "udc" in name else ("finished", ())
+        assert (row["state"], row["notes"]) == expected
+    assert len(json.loads(dumps(reader.read()))) == 6
+    assert main(["runs", str(tmp_path), "--json"]) == 0
+    assert len(json.loads(capsys.readouterr().out)["runs"]) == 6
+    shutil.rmtree(os.path.join(os.fsencode(tmp_path), b"bad\xff\xfe"))
+    assert {row["run"]: row["state"] for row in reader.read()}[r"bad\udcff\udcfe"] == "gone"
+    shutil.rmtree(tmp_path)
+    assert {row["state"] for row in reader.read()} == {"gone"}
+
+
+def test_a_run_that_causes_any_error_hides_no_other_run(tmp_path, monkeypatch):
+    for name in ("a", "b"):
+        write(tmp_path / name, videos=False)
+    read = run_list.read
+
+    def fail(path, **options):
+        if path.name == "a":
+            raise RecursionError
+        return read(path, **options)
+
+    monkeypatch.setattr(run_list, "read", fail)
+    assert [(row["state"], row["notes"]) for row in Rows(tmp_path).read()] == [
+        ("damaged", ("RecursionError()",)),
+        ("finished", ()),
+    ]
+
+
+@pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="the superuser may read all")
+@pytest.mark.parametrize("mode", [0o000, 0o444])
+def test_a_folder_without_permission_has_a_row_that_says_so(tmp_path, mode):
+    for name in ("a", "b"):
+        write(tmp_path / name, videos=False)
+    (tmp_path / "a").chmod(mode)
+    a, b = Rows(tmp_path).read()
+    (tmp_path / "a").chmod(0o755)
+    assert (a["state"], b["state"]) == ("damaged", "finished")
+    assert "Permission denied" in a["notes"][0]
+
+
+def test_a_folder_that_cannot_be_read_has_a_row_that_says_so(tmp_path, monkeypatch):
+    """As the test above, also for the superuser."""
+    for name in ("a", "b"):
+        write(tmp_path / name, videos=False)
+
+    def denied(function):
+        def checked(path, *arguments, **options):
+            if "a" in str(path).removeprefix(str(tmp_path)).split(os.sep):
+                raise PermissionError(13, "Permission denied", str(path))
+            return function(path, *arguments, **options)
+
+        return checked
+
+    for name in ("scandir", "lstat"):
+        monkeypatch.setattr(os, name, denied(getattr(os, name)))
+    a, b = Rows(tmp_path).read()
+    assert (a["run"], a["state"], b["state"]) == ("a", "damaged", "finished")
+    assert "Permission denied" in a["notes"][0]
+
+
+def test_a_row_says_which_error_has_ended_a_run_until_it_is_resumed(tmp_path):
+    run = write(tmp_path / "a", {**CONFIG, "steps": 10**6}, videos=False)
+    (run / "warnings.txt").write_text("the reward is large\nNonFiniteError: the loss is NaN\n", encoding="utf-8")
+    (row,) = Rows(tmp_path).read()
+    assert (row["state"], row["notes"][0]) == ("crashed", "NonFiniteError: the loss is NaN")
+    with noted_in(run / "warnings.txt"):
+        pass
+    (row,) = Rows(tmp_path).read()
+    assert (row["state"], row["notes"]) == ("interrupted", ())
+    assert row["warnings"][-1] == "the run was resumed after this error"
+    with pytest.raises(KeyError), noted_in(run / "warnings.txt"):
+        raise KeyError("at")
+    (row,) = Rows(tmp_path).read()
+    assert (row["state"], row["notes"][0]) == ("crashed", "KeyError: 'at'")
+
+
+def test_the_error_that_ended_a_run_is_found_after_many_warnings(tmp_path):
+    run = write(tmp_path / "a", {**CONFIG, "steps": 10**6}, videos=False)
+    (run / "warnings.txt").write_text("odd\n" * 500 + "ValueError: end\n", encoding="utf-8")
+    (row,) = Rows(tmp_path).read()
+    assert (row["state"], row["notes"][0], len(row["warnings"])) == ("crashed", "ValueError: end", 100)

@@ -24,6 +24,7 @@ import msgspec
 
 import rejeu
 from rejeu.core import errors, hardware, interrupt
+from rejeu.core.records import utf8
 from rejeu.lab.cli import parsing
 from rejeu.lab.cli.commands import COMMANDS, MODULES, TASKS, check_options, of_task
 from rejeu.lab.runs.config import read_task
@@ -162,4 +163,4 @@ def plain(value: Any) -> Any:
 
     if isinstance(value, np.generic | np.ndarray):
         return value.tolist()
-    return dict(value) if isinstance(value, Mapping) else str(value)
+    return dict(value) if isinstance(value, Mapping) else utf8(value)

@@ -13,12 +13,13 @@ from typing import Any
 
 from rejeu.agents import Agent
 from rejeu.callbacks import Evaluate, Evaluated
-from rejeu.checkpoints.run_folder import RunFolder
+from rejeu.checkpoints.run_folder import RunFolder, checkpoint_files
 from rejeu.core import atomic, xla
 from rejeu.core.errors import RunInUseError
 from rejeu.core.interrupt import NAMES
 from rejeu.envs.registry import register
 from rejeu.lab.cli.environment import Environment
+from rejeu.lab.reporting.runs import RunSummary, read_warnings
 from rejeu.lab.runs.config import DecidedRun
 from rejeu.lab.runs.requests import keep_model
 from rejeu.logs.formatting import counted, quoted
@@ -115,7 +116,7 @@ def summary(
     options = environment.run.again()
     lines = [""]
     if not facts["complete"]:
-        can_resume = folder.checkpoints.is_dir()
+        can_resume = checkpoint_files(folder.checkpoints)
         how = f"; rejeu resume {quoted(folder.path)}{options} continues" if can_resume else ""
         what = "paused" if facts["signal"] is None else f"stopped by {NAMES[facts['signal']]}"
         saved = "; everything is saved" if agent.failed_writes.complete else ""
@@ -128,12 +129,13 @@ def summary(
         lines.append(f"best model    step {evaluate.best.step:,}: {evaluate.best.evaluation}")
     backend = " --backend gymnasium" if register(environment.env_id) else ""
     steps = f"; {agent.num_timesteps:,} steps at {agent.steps_per_second:,.0f} steps/s" if agent.num_timesteps else ""
+    try_it = f"try it        rejeu evaluate {quoted(folder.path)}{options}{backend}"
     return "\n".join(
         [
             *lines,
             f"files         {folder.path}: {', '.join(facts['files'])}",
             f"time          {facts['seconds']:.1f} s in all, {facts['compile_seconds']:.1f} s of them compiling{steps}",
-            f"try it        rejeu evaluate {quoted(folder.path)}{options}{backend}",
+            *([try_it] if {folder.best.name, folder.agent.name} & {*facts["files"]} else ()),
         ]
     )
 
@@ -151,6 +153,8 @@ def noted_in(path: Path) -> Iterator[None]:
         show(message, *arguments, **options)
         note(message)
 
+    if RunSummary(path=path, name="", warnings=read_warnings(path)).error:
+        note("the run was resumed after this error")
     warnings.showwarning = show_and_note
     try:
         yield

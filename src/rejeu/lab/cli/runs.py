@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from rejeu.core.interrupt import leaving
+from rejeu.core.records import utf8
 from rejeu.lab.cli.commands import Runs, Status
 from rejeu.lab.reporting import run_list
 from rejeu.lab.reporting.rows import COLUMNS, N_TEXT, Row, Rows, cells, describe, texts
 from rejeu.logs.formatting import console, show_table, table_of
 
-EXIT = {"running": 0, "finished": 0, "unknown": 0, "paused": 3, "interrupted": 3, "crashed": 4}
+EXIT = {"running": 0, "finished": 0, "unknown": 0, "paused": 3, "interrupted": 3, "crashed": 4, "damaged": 4}
 """Exit status of ``rejeu status`` by the state of a run."""
 EVERY = 1.0
 """Seconds between two looks at the folder with ``--follow``."""
@@ -34,7 +35,7 @@ def run_runs(arguments: Runs) -> tuple[int, dict[str, Any]]:
 
 def run_status(arguments: Status) -> tuple[int, Row]:
     """Prints the row of a run; the exit status is 3 if it was interrupted or paused, 4 if it crashed."""
-    row = {"run": arguments.run.name, **describe(run_list.read(arguments.run))}
+    row = {"run": utf8(arguments.run.name), **describe(run_list.read(arguments.run))}
     if not arguments.json:
         show([row], arguments.run)
         print("".join(f"warning: {one}\n" for one in row["warnings"]), end="")

@@ -6,6 +6,7 @@ import math
 import os
 import time
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from rejeu.checkpoints.run_folder import RunFolder
-from rejeu.core.records import shown
+from rejeu.core.records import shown, utf8
 from rejeu.lab.reporting import run_list
 from rejeu.lab.reporting.runs import RunSummary, best_row, has_process, is_file, is_recent
 from rejeu.logs import charts
@@ -64,7 +65,10 @@ class Rows:
             seconds: time after which further runs are left to the next call; their state is then "unread" or as it was.
         """
         until = time.monotonic() + seconds
-        paths = run_list.find(self.folder) if self.folder.is_dir() else []
+        try:
+            paths = run_list.find(self.folder)
+        except OSError:  # it is not there, or not any more
+            paths = []
         for path in self._known.keys() - {*paths}:
             row = {**self._known[path].row, "state": "gone", "notes": ("its folder is no longer there",)}
             self._known[path] = Known(None, row, None, 0.0)
@@ -81,8 +85,8 @@ class Rows:
         return self._known[path].row
 
     def name_of(self, path: Path) -> str:
-        """Returns the path of a run below the folder, which names it."""
-        return path.relative_to(self.folder).as_posix() if path != self.folder else path.name
+        """Returns the path of a run below the folder, which names it; what is not UTF-8 in it is escaped."""
+        return utf8(path.relative_to(self.folder).as_posix() if path != self.folder else path.name)
 
     def summaries(self) -> Mapping[str, RunSummary]:
         """Returns the runs that could be read, without their tables, by the names of their rows."""
@@ -95,11 +99,13 @@ class Rows:
             return
         run: RunSummary | None = None
         try:
+            if utf8(inner := str(path.relative_to(self.folder))) != inner:
+                raise ValueError("its name is not UTF-8; rename the folder")
             run = run_list.read(path, table_only=True)
             row = describe(run)
             run = replace(run, episodes=EMPTY, evaluations=EMPTY, metrics=EMPTY, replays=EMPTY)
-        except (OSError, ValueError, ImportError) as error:
-            row = {**nothing(path, "damaged"), "notes": (shown(error, 300),)}
+        except Exception as error:  # files can hold anything, and one run may not hide the others
+            row = {**nothing(path, "damaged"), "notes": (shown(str(error) or repr(error), 300),)}
         now = time.monotonic()
         self._known[path] = Known(found, row, run, now + min(SHARE * (now - began), LONGEST))
 
@@ -119,9 +125,8 @@ def files(path: Path) -> tuple[Path, ...]:
 
 def others(path: Path) -> Iterator[Path]:
     """Yields a file, or the first files of a folder, of another program's run."""
-    if path.is_dir():
-        with os.scandir(path) as inside:
-            yield from (Path(one.path) for one, _ in zip(inside, range(SLICE), strict=False))
+    with suppress(OSError), os.scandir(path) as inside:
+        yield from (Path(one.path) for one, _ in zip(inside, range(SLICE), strict=False))
     yield path
 
 
@@ -175,7 +180,7 @@ def describe(run: RunSummary) -> Row:
         "changed": max((time_of(path) or (0, 0))[0] for path in files(run.path)) / 1e9,
         "pictures": tuple(path.name for path in (folder.video, folder.curve) if is_file(path)),
         "warnings": run.warnings,
-        "notes": run.notes,
+        "notes": (*filter(None, [run.error if run.state == "crashed" else ""]), *run.notes),
     }
 
 

@@ -34,6 +34,8 @@ def read(path: str | Path, table_only: bool = False) -> RunSummary:
         ValueError: if a file is not what its name says.
     """
     path = Path(path)
+    if os.path.isdir(path):
+        os.lstat(os.path.join(path, "."))  # raises an error that says why nothing in it can be read
     if path.is_file() and MONITOR.fullmatch(path.name):
         return read_monitor(path)
     if not path.is_dir() or is_ours(path):
@@ -91,7 +93,7 @@ def read_or_note(path: Path | RunSummary) -> RunSummary | str:
 
 
 def find(path: Path) -> list[Path]:
-    """Returns the runs at or below a path, sorted; symbolic links below it are not followed.
+    """Returns the runs at or below a path, sorted, and folders that cannot be read; symbolic links below it are not followed.
 
     Raises:
         FileNotFoundError: if the path does not exist.
@@ -101,9 +103,9 @@ def find(path: Path) -> list[Path]:
     if not path.is_dir():
         raise FileNotFoundError(f"there is no run folder {shown(path, 300)}")
     found: list[Path] = []
-    for root, names, _ in os.walk(path):
+    for root, names, _ in os.walk(path, onerror=lambda error: found.append(Path(error.filename))):
         folder = Path(root)
-        if is_run(folder):
+        if is_run(folder) or not os.access(folder, os.X_OK):
             found.append(folder)
         depth = len(folder.relative_to(path).parts)
         is_searched = folder not in found[-1:] and depth < MAX_DEPTH and len(found) < MAX_RUNS

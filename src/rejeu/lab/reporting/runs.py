@@ -40,12 +40,14 @@ MAX_WORD = 10_000
 """Upper limit on the length of a word of the command that repeats a run, in characters."""
 MAX_STEP = 2**53
 """Upper limit on environment steps; larger numbers are damage."""
+ERROR = re.compile(r"[A-Z]\w*(Error|Exception): ")
+"""Beginning of the warning that names the error which ended a run, if it is the last one."""
 RECENT = 60.0
 """Seconds since the last write up to which a run without a lock counts as running."""
 
 UNKNOWN = RunConfig(env="", algorithm="")
 """The description of a run of which nothing is known."""
-State = Literal["running", "finished", "paused", "interrupted", "crashed", "unknown"]
+State = Literal["running", "finished", "paused", "interrupted", "crashed", "damaged", "unknown"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -80,6 +82,11 @@ class RunSummary:
     """Paths of the model files, the best first."""
     notes: tuple[str, ...] = ()
     """One line for each thing that was missing or damaged."""
+
+    @property
+    def error(self) -> str:
+        """The error that ended the run; empty if there was none, or the run was resumed since."""
+        return next((text for text in self.warnings[-1:] if ERROR.match(text)), "")
 
     @cached_property
     def changed(self) -> dict[str, tuple[Any, Any]]:
@@ -231,7 +238,9 @@ def state_of(run: RunSummary) -> State:
     reached_minutes = run.config.minutes is not None and run.seconds >= 0.98 * 60 * run.config.minutes
     if has_model and run.steps in run.evaluations.column("step") and (reached_steps or reached_minutes):
         return "finished"
-    if not has_model:
+    if any(note.startswith(f"{files.config.name} is damaged") for note in run.notes):
+        return "damaged"
+    if not has_model or run.error:
         return "crashed"
     return "paused" if is_file(files.paused) else "interrupted"
 
@@ -282,7 +291,9 @@ def read_warnings(path: Path) -> tuple[str, ...]:
         lines = read_bytes(path, MAX_WARNINGS_BYTES).decode("utf-8", "replace").splitlines()
     except OSError:
         return ()
-    return tuple(shown(line, 1000) for line in lines[:MAX_WARNINGS] if line.strip())
+    return tuple(
+        shown(line, 1000) for line in (*lines[: MAX_WARNINGS - 1], *lines[MAX_WARNINGS - 1 :][-1:]) if line.strip()
+    )
 
 
 def find_videos(folder: RunFolder) -> Iterator[Path]:

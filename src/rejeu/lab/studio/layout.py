@@ -100,4 +100,4 @@ def address(path: str, **query: str | Sequence[str]) -> str:
     >>> address("/run", run="a b/<c>")
     '/run?run=a+b%2F%3Cc%3E'
     """
-    return f"{path}?{urlencode(query, doseq=True)}" if query else path
+    return f"{path}?{urlencode(query, doseq=True, errors='surrogateescape')}" if query else path

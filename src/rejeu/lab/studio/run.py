@@ -16,10 +16,12 @@ from nicegui import ui
 from rejeu.checkpoints.run_folder import RunFolder
 from rejeu.core import atomic
 from rejeu.core.records import brief
+from rejeu.lab.cli import one_line
 from rejeu.lab.experiments.work import HIDDEN
 from rejeu.lab.reporting import run_list
 from rejeu.lab.reporting.report import sections
 from rejeu.lab.reporting.rows import SHARE, Row
+from rejeu.lab.reporting.runs import is_file
 from rejeu.lab.runs import requests
 from rejeu.lab.studio import processes
 from rejeu.lab.studio.branch import open_form
@@ -48,13 +50,15 @@ def build(studio: Studio, request: Request) -> None:
     """Makes the page of the run that the address names."""
     name = request.query_params.get("run", "")
     row = studio.row(name)
-    if row is None:
+    if row is None or row["state"] == "unread":
         said = ui.label().classes("text")
 
         def look() -> None:
-            text = "there is no run of this name below the folder" if studio.version else "reading the folder"
+            row = studio.row(name)
+            is_missing = studio.version and row is None
+            text = "there is no run of this name below the folder" if is_missing else "reading the folder"
             said.text = f"{text}: {name}"
-            if studio.row(name) is not None:
+            if row is not None and row["state"] != "unread":
                 ui.navigate.reload()
 
         look()
@@ -73,7 +77,7 @@ class RunPage:
         self.places: dict[str, Any] = {}
         self.seen: Row | None = None
         self.due = 0.0
-        self.is_ours = RunFolder(path).config.is_file()
+        self.is_ours = name in studio.summaries and is_file(RunFolder(path).config)
         self.head = Head(self)
         with ui.row().classes("w-full items-start gap-4"):
             with ui.column().classes("col-grow gap-2").style("flex-basis: 320px; max-width: 720px"):
@@ -97,12 +101,14 @@ class RunPage:
         row = self.studio.row(self.name)
         if row is None or row == self.seen or time.monotonic() < self.due:
             return
-        began = time.monotonic()
+        began, self.seen = time.monotonic(), row
+        parts = None
         try:
-            parts = await asyncio.get_running_loop().run_in_executor(READING, read, self.path)
-        except (OSError, ValueError, ImportError) as error:
-            parts, row = None, {**row, "notes": (*row["notes"], str(error))}
-        self.seen, self.due = row, time.monotonic() + SHARE * (time.monotonic() - began)
+            if self.name in self.studio.summaries:  # else its row says why it cannot be read
+                parts = await asyncio.get_running_loop().run_in_executor(READING, read, self.path)
+        except Exception as error:  # files can hold anything; it is not read again each second
+            row = {**row, "notes": (*row["notes"], one_line(error))}
+        self.due = time.monotonic() + SHARE * (time.monotonic() - began)
         self.show(row, parts)
 
     def show(self, row: Row, parts: sections.Parts | None) -> None:
@@ -179,7 +185,7 @@ def stop(button: Any, folder: RunFolder) -> None:
         ui.notify(brief(error), type="negative")
     else:
         ui.notify("The run stops after this step, and saves everything.")
-        disable_while(button, folder.stop.exists)
+        disable_while(button, lambda: is_file(folder.stop))
 
 
 def command(button: Any, name: str, page: RunPage, text: str, *words: str) -> None:

@@ -144,7 +144,7 @@ def line(row: Row) -> dict[str, Any]:
         "link": address("/run", run=row["run"]),
         "state": row["state"],
         "color": COLORS.get(row["state"], "grey-7"),
-        "note": next(iter(row["notes"]), "") if row["state"] in ("damaged", "gone") else "",
+        "note": next(iter(row["notes"]), "") if row["state"] in ("damaged", "gone", "crashed") else "",
         "steps": texts["steps"],
         "share": share([row]),
         **best_lines(row),

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import os
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing, suppress
@@ -109,7 +110,8 @@ def models(folder: Path) -> list[Path]:
     if not folder.is_dir():
         raise FileNotFoundError(f"there is no folder {folder}")
     suffixes = (checkpoint.SUFFIX, ".zip")
-    files = (one for one in folder.rglob("*") if one.suffix in suffixes and one.is_file() and not one.is_symlink())
+    every = (Path(root, name) for root, _, names in os.walk(folder) for name in names)  # also if some cannot be read
+    files = (one for one in every if one.suffix in suffixes and os.path.isfile(one) and not one.is_symlink())
     found = {find_model(one.parent) if is_of_run(one) else one for one in files if not is_passing(one)}
     if not found:
         raise FileNotFoundError(f"{folder} holds no {' or '.join(suffixes)} files; agent.save(name) writes them")
