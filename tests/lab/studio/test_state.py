@@ -118,6 +118,6 @@ def test_all_that_makes_an_environment_or_starts_a_process_asks_what_was_typed()
     makers = {"from_arguments", "make", "make_vector", "make_env", "find_id", "import_source", "Popen", "run"}
     assert {(file, name) for file, name, _ in calls if name in makers} == {
         ("processes.py", "Popen"),  # start
-        ("new.py", "run"),  # rejeu check of what is in the form
+        ("new.py", "Popen"),  # rejeu check of what is in the form
         ("server.py", "run"),  # the server itself
     }
