@@ -24,8 +24,8 @@ from rejeu.lab.experiments.folder import NOTHING, Plan, open_folder
 from rejeu.lab.experiments.plan import PlanError, read_plan
 from rejeu.lab.experiments.sweep import imports_of
 from rejeu.lab.experiments.work import Job
-from rejeu.lab.reporting.runs import RunSummary
 from rejeu.lab.runs.config import RunConfig
+from rejeu.lab.runs.read import RunSummary
 from tests.environments import Reach
 
 ROOT = Path(__file__).parents[1]
@@ -251,9 +251,7 @@ def test_the_file_works_as_a_notebook_cell():
 
 def command(site, folder, *arguments):
     """Runs the command in a process in which the package is installed."""
-    program = (
-        f"import sys; sys.path.insert(0, {str(site)!r}); from rejeu.lab.cli import main; sys.exit(main(sys.argv[1:]))"
-    )
+    program = f"import sys; sys.path.insert(0, {str(site)!r}); from rejeu.lab.cli import main; sys.exitmainsys.argv[1:]"
     return subprocess.run(
         [sys.executable, "-c", program, *arguments],
         cwd=folder,

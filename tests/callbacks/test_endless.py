@@ -15,7 +15,7 @@ import rejeu
 from rejeu.callbacks import Checkpoint, Evaluate
 from rejeu.envs import checker
 from rejeu.lab.cli import main
-from rejeu.lab.reporting.runs import read_run
+from rejeu.lab.runs.read import read_run
 from rejeu.logs import evaluation
 from tests.helpers import assert_same_parameters, small_sac
 from tests.lab.cli.test_cli import FEWER_FILES, TINY

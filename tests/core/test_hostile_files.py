@@ -247,7 +247,7 @@ def test_a_path_that_is_too_long_is_refused_in_a_few_words(tmp_path):
 def test_the_environment_of_a_file_is_only_looked_for_among_those_that_are_registered(env_id, tmp_path):
     """Gymnasium imports the module that an id names before a colon, which no file may choose."""
     from rejeu.lab.cli.commands import Evaluate
-    from rejeu.lab.cli.environment import environment_of
+    from rejeu.lab.runs.environment import environment_of
 
     path = tmp_path / "model.safetensors"
     path.write_bytes(hostile_files.changed(CONTENTS["agent"], lambda h, a: h.update(env_id=env_id)))

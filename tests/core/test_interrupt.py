@@ -160,7 +160,7 @@ def test_a_signal_after_training_ends_the_command_and_keeps_the_models(tmp_path,
     def record_video(*arguments):
         raise SystemExit(143)
 
-    monkeypatch.setattr("rejeu.lab.cli.session.leaving", leaving)
+    monkeypatch.setattr("rejeu.lab.runs.session.leaving", leaving)
     monkeypatch.setattr("rejeu.logs.video.record_video", record_video)
     argv = ["train", "rejeu/Ball-v0", "--algo", "SAC", "--steps", "60", "--evaluate-episodes", "1"]
     with shared_learners(), pytest.raises(SystemExit):

@@ -41,7 +41,7 @@ def measure(library: str) -> dict[str, Any]:
         result["first update, warm"] = run(first_update, **kept)
     if library == "rejeu":
         result["command line, --help"] = run(
-            "import sys; sys.argv = ['rejeu', '--help']; from rejeu.lab.cli import main; main()"
+            "import sys; sys.argv = ['rejeu', '--help']; from rejeu.lab.cli import main; main"
         )
     return {"seconds": result}
 

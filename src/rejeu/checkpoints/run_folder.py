@@ -53,11 +53,11 @@ class RunFolder:
     curve = File("curve.png")
     """The learning curve."""
     replays = File("replays.csv")
-    """Episodes of the trained agent, one row each; read by :mod:`rejeu.lab.reporting.runs`."""
+    """Episodes of the trained agent, one row each; read by :mod:`rejeu.lab.runs.read`."""
     report = File("report.html")
     """The page about the run."""
     warnings = File("warnings.txt")
-    """Warnings of the training, and the error that ended it, one a line; read by :mod:`rejeu.lab.reporting.runs`."""
+    """Warnings of the training, and the error that ended it, one a line; read by :mod:`rejeu.lab.runs.read`."""
     video = File("video.mp4")
     """A few episodes of the best model."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from importlib import metadata
@@ -75,3 +76,21 @@ class ClusterError(ConnectionError):
 
 class RunInUseError(RuntimeError):
     """Another process is training in the folder of this run."""
+
+
+def expected_errors() -> tuple[type[Exception], ...]:
+    """Returns the errors whose message is meant for the user; the others are bugs and keep their traceback."""
+    import gymnasium  # takes longer than all that --help needs
+
+    own = (BadEnvironmentError, NonFiniteError, RunInUseError, WorkerError)
+    return ValueError, TypeError, ImportError, OSError, MemoryError, *own, gymnasium.error.Error
+
+
+def one_line(error: Exception | Warning | str) -> str:
+    r"""Returns an error's or a warning's message on one line and without colors, with its class if it has none or is a key.
+
+    >>> one_line(ValueError("two\n  lines")), one_line(MemoryError()), one_line(KeyError("at"))
+    ('two lines', 'MemoryError', "KeyError('at')")
+    """
+    text = repr(error) if isinstance(error, KeyError) else str(error)
+    return " ".join(re.sub(r"\x1b\[[\d;]*m", "", text).split()) or type(error).__name__

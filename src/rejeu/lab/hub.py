@@ -22,7 +22,8 @@ from rejeu.checkpoints.run_folder import check_free, find_model
 from rejeu.core.errors import requires
 from rejeu.core.records import brief
 from rejeu.core.validation import assign
-from rejeu.lab.reporting import run_list, runs
+from rejeu.lab.reporting import run_list
+from rejeu.lab.runs import read as runs
 from rejeu.logs import statistics
 from rejeu.logs.formatting import counted
 

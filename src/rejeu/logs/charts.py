@@ -143,7 +143,7 @@ def episode_chart(episodes: Table, evaluations: Table, column: str, window: int 
 
     Args:
         episodes: of training.
-        evaluations: with the columns of :attr:`rejeu.lab.reporting.runs.RunSummary.evaluations`.
+        evaluations: with the columns of :attr:`rejeu.lab.runs.read.RunSummary.evaluations`.
         column: "return", "success" or "length".
         window: episodes in the moving mean; None for :func:`window_of` their number.
     """

@@ -10,7 +10,7 @@ import rejeu
 from rejeu.agents import exporting, find_preset, presets
 from rejeu.core.errors import CheckpointError
 from rejeu.lab import cli, hub
-from rejeu.lab.cli.session import Session
+from rejeu.lab.runs.session import Session
 from tests import hostile_files
 from tests.core.test_schemas import FILES
 

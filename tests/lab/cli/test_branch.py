@@ -10,7 +10,7 @@ import pytest
 
 import rejeu
 from rejeu.lab.cli import main
-from rejeu.lab.reporting.runs import read_run
+from rejeu.lab.runs.read import read_run
 from tests.lab.cli.test_cli import FEWER_FILES, TINY, error_of, table
 
 pytestmark = pytest.mark.usefixtures("learners_are_shared")

@@ -22,10 +22,10 @@ from rejeu.checkpoints import run_folder as folder
 from rejeu.lab import cli
 from rejeu.lab.cli import main
 from rejeu.lab.cli.report import goal_of
-from rejeu.lab.cli.session import Session
-from rejeu.lab.cli.train import untuned
 from rejeu.lab.reporting.report.page import plotly_script
 from rejeu.lab.runs import config
+from rejeu.lab.runs.begin import untuned
+from rejeu.lab.runs.session import Session
 from rejeu.logs.logging import CsvFile
 from tests.bad_environments import RewardReadsInfo
 from tests.environments import Counter, Reach
@@ -629,8 +629,8 @@ def test_a_warning_is_one_line_on_the_command_line(capsys):
     argv = ["train", "Pendulum-v1", "--algo", "TD3", "--steps", "1"]
     with pytest.MonkeyPatch.context() as patch:
         warn = lambda out: warnings.warn("\x1b[33mWARN: one\n  two\x1b[0m", UserWarning, stacklevel=1)  # noqa: E731
-        patch.setattr("rejeu.lab.cli.train.check_free", warn)
-        patch.setattr("rejeu.lab.cli.environment.from_arguments", lambda *_: (_ for _ in ()).throw(ValueError("over")))
+        patch.setattr("rejeu.lab.runs.begin.check_free", warn)
+        patch.setattr("rejeu.lab.runs.environment.from_arguments", lambda *_: (_ for _ in ()).throw(ValueError("over")))
         with warnings.catch_warnings():
             warnings.simplefilter("always")
             assert main(argv) == 2

@@ -21,11 +21,11 @@ from rejeu.checkpoints.run_folder import RunFolder
 from rejeu.core.interrupt import Interrupt
 from rejeu.lab import hub
 from rejeu.lab.cli import clone, compare, courses, main, models, resume, sweep, train, tune
-from rejeu.lab.cli.commands import Train
-from rejeu.lab.cli.environment import Environment
-from rejeu.lab.cli.session import Session, TrainingLimits
 from rejeu.lab.experiments import study_plan
+from rejeu.lab.runs.arguments import Train
 from rejeu.lab.runs.config import DecidedRun, RunConfig, Task, write_task
+from rejeu.lab.runs.environment import Environment
+from rejeu.lab.runs.session import Session, TrainingLimits
 from rejeu.logs.evaluation import Evaluation
 from rejeu.teaching import play
 from rejeu.teaching.courses.leaderboard import Leaderboard
@@ -107,7 +107,7 @@ def game():
 def test_watch_and_play(spy, monkeypatch, capsys):
     found, watched, played = spy(models, "find_model"), spy(play, "watch", game()), spy(play, "play", game())
     spy(models, "load", "agent")
-    monkeypatch.setattr("rejeu.lab.cli.environment.recorded_id", lambda model: TYPED)
+    monkeypatch.setattr("rejeu.lab.runs.environment.recorded_id", lambda model: TYPED)
     common = ["--seed", "5", "--fps", "20", "--episodes", "2", "--which", "last", "--json"]
     assert main(["watch", "run", "--env", TYPED, *common]) == 0
     assert includes(found, which="last")
@@ -117,7 +117,7 @@ def test_watch_and_play(spy, monkeypatch, capsys):
     assert main(["play", TYPED, "--keys", "a=0", "--record", "shown", "--against", "other", *common]) == 0
     assert includes(found, run=Path("other"), which="last")
     assert includes(played, keys={"a": 0}, seed=5, fps=20.0, episodes=2, record=Path("shown"), against="agent")
-    monkeypatch.setattr("rejeu.lab.cli.environment.recorded_id", lambda model: "Acrobot-v1")
+    monkeypatch.setattr("rejeu.lab.runs.environment.recorded_id", lambda model: "Acrobot-v1")
     assert main(["play", TYPED, "--against", "other"]) == 2
 
 

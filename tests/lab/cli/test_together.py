@@ -6,7 +6,7 @@ import pytest
 
 from rejeu.lab import cli
 from rejeu.lab.cli import sweep
-from rejeu.lab.cli.commands import Train
+from rejeu.lab.runs.arguments import Train
 
 TINY = ["--set", "policy_kwargs.net_arch=[8]", "batch_size=8", "learning_starts=20", "buffer_size=200"]
 

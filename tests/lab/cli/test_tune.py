@@ -8,8 +8,9 @@ import sys
 import pytest
 
 from rejeu.lab import cli
-from rejeu.lab.cli import environment, tune as tune_command
+from rejeu.lab.cli import tune as tune_command
 from rejeu.lab.experiments import display, process, study as studies, study_plan, tune as tuning
+from rejeu.lab.runs import environment
 from rejeu.lab.runs.config import RunConfig
 from tests.lab.experiments.fake_training import Pretended
 

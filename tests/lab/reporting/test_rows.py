@@ -7,9 +7,9 @@ import shutil
 import pytest
 
 from rejeu.lab.cli import dumps, main
-from rejeu.lab.cli.output import noted_in
 from rejeu.lab.reporting import rows as module, run_list
 from rejeu.lab.reporting.rows import COLUMNS, Rows, cells
+from rejeu.lab.runs.output import noted_in
 from tests.lab.reporting.report.folders import CONFIG, write
 
 

@@ -10,8 +10,8 @@ import pytest
 from filelock import FileLock
 
 from rejeu.agents import BUILT_IN
-from rejeu.lab.reporting.runs import best_row, default_hyperparameters, read_run
 from rejeu.lab.runs import config
+from rejeu.lab.runs.read import best_row, default_hyperparameters, read_run
 
 CONFIG = {
     "env": "CartPole-v1",

@@ -10,8 +10,8 @@ import pytest
 
 import rejeu
 from rejeu.core.errors import CheckpointError
-from rejeu.lab.cli import commands, main, parsing
-from rejeu.lab.runs import config
+from rejeu.lab.cli import commands, main
+from rejeu.lab.runs import config, parsing
 from rejeu.lab.runs.config import DecidedRun, RunConfig, Task, read_task, write_task
 from tests.lab.cli.test_cli import FEWER_FILES, TINY
 from tests.tiers import exhaustive

@@ -110,7 +110,7 @@ def test_a_run_keeps_models_that_act_and_stops_when_it_is_asked(tmp_path, capsys
         if step >= 200:
             requests.ask(out / "stop")
 
-    monkeypatch.setattr("rejeu.lab.cli.output.keep_model", keep_and_ask)
+    monkeypatch.setattr("rejeu.lab.runs.output.keep_model", keep_and_ask)
     argv = [
         "train",
         "CartPole-v1",

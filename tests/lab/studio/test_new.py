@@ -12,7 +12,7 @@ pytest.importorskip("nicegui", reason="needs nicegui, which is in the extra stud
 
 from fastapi import Request
 
-from rejeu.lab.cli.commands import Train
+from rejeu.lab.runs.arguments import Train
 from rejeu.lab.runs.config import options
 from rejeu.lab.studio import new, processes
 from rejeu.lab.studio.new import LEFT_OUT, command, lead_to, new_folder, prefilled, problem_of, require_known

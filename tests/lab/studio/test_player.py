@@ -12,7 +12,7 @@ pytest.importorskip("nicegui", reason="needs nicegui, which is in the extra stud
 
 import rejeu
 from rejeu.checkpoints.run_folder import RunFolder
-from rejeu.lab.cli.commands import RunOptions
+from rejeu.lab.runs.arguments import RunOptions
 from rejeu.lab.studio import player
 from rejeu.lab.studio.player import BEST, LiveEpisode, LivePlayer
 from tests.lab.reporting.report.folders import write

@@ -8,9 +8,9 @@ import pytest
 pytest.importorskip("nicegui", reason="needs nicegui, which is in the extra studio")
 
 from rejeu.checkpoints.run_folder import RunFolder
-from rejeu.lab.cli.commands import Resume
 from rejeu.lab.cli.resume import run_resume
 from rejeu.lab.runs import requests
+from rejeu.lab.runs.arguments import Resume
 from rejeu.lab.studio import processes, run
 from rejeu.lab.studio.state import Studio
 

@@ -8,8 +8,8 @@ import pytest
 pytest.importorskip("nicegui", reason="needs nicegui, which is in the extra studio")
 
 from rejeu.lab import studio as package
-from rejeu.lab.cli.commands import RunOptions
 from rejeu.lab.reporting.rows import Rows
+from rejeu.lab.runs.arguments import RunOptions
 from rejeu.lab.runs.config import RunConfig
 from rejeu.lab.studio.state import Studio
 from tests.lab.reporting.report.folders import CONFIG, write

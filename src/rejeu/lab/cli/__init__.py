@@ -9,7 +9,6 @@ from __future__ import annotations
 import importlib
 import io
 import os
-import re
 import signal
 import sys
 import sysconfig
@@ -25,8 +24,9 @@ import msgspec
 import rejeu
 from rejeu.core import errors, hardware, interrupt
 from rejeu.core.records import utf8
-from rejeu.lab.cli import parsing
-from rejeu.lab.cli.commands import COMMANDS, MODULES, TASKS, check_options, of_task
+from rejeu.lab.cli.commands import COMMANDS, MODULES, TASKS
+from rejeu.lab.runs import parsing
+from rejeu.lab.runs.arguments import check_options, of_task
 from rejeu.lab.runs.config import read_task
 
 DESCRIPTION = """Trains agents on Gymnasium environments.
@@ -71,7 +71,7 @@ def run_command(argv: Sequence[str]) -> int:
         )
         check_options(arguments)
         for name in getattr(arguments, "imports", ()):
-            importlib.import_module("rejeu.lab.cli.environment").import_source(name)
+            importlib.import_module("rejeu.lab.runs.environment").import_source(name)
         module = importlib.import_module(f"rejeu.lab.cli.{MODULES.get(command, command)}")
         with messages(getattr(arguments, "json", False)) as emit:
             status, result = getattr(module, f"run_{command}")(arguments)
@@ -84,24 +84,16 @@ def run_command(argv: Sequence[str]) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # else Python complains when it exits
         return CLOSED
     except Exception as error:
-        if not isinstance(error, expected_errors()):
+        if not isinstance(error, errors.expected_errors()):
             raise
         has_trace = isinstance(error, errors.WorkerError)  # of the environment's code
-        print(f"rejeu: error: {error if has_trace else one_line(error)}{place_of(error)}", file=sys.stderr)
+        print(f"rejeu: error: {error if has_trace else errors.one_line(error)}{place_of(error)}", file=sys.stderr)
         return 2
 
 
 def show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
     """Prints a warning on one line, without the line of code that it comes from."""
-    print(f"warning: {one_line(message).removeprefix('WARN: ')}", file=sys.stderr, flush=True)
-
-
-def expected_errors() -> tuple[type[Exception], ...]:
-    """Returns the errors whose message is meant for the user; the others are bugs and keep their traceback."""
-    import gymnasium  # takes longer than all that --help needs
-
-    own = (errors.BadEnvironmentError, errors.NonFiniteError, errors.RunInUseError, errors.WorkerError)
-    return ValueError, TypeError, ImportError, OSError, MemoryError, *own, gymnasium.error.Error
+    print(f"warning: {errors.one_line(message).removeprefix('WARN: ')}", file=sys.stderr, flush=True)
 
 
 def place_of(error: Exception) -> str:
@@ -116,16 +108,6 @@ def place_of(error: Exception) -> str:
     if "values to unpack (expected 5" in str(error):  # by a wrapper of Gymnasium
         return "; step must return observation, reward, terminated, truncated and info"
     return ""
-
-
-def one_line(error: Exception | Warning | str) -> str:
-    r"""Returns an error's or a warning's message on one line and without colors, with its class if it has none or is a key.
-
-    >>> one_line(ValueError("two\n  lines")), one_line(MemoryError()), one_line(KeyError("at"))
-    ('two lines', 'MemoryError', "KeyError('at')")
-    """
-    text = repr(error) if isinstance(error, KeyError) else str(error)
-    return " ".join(re.sub(r"\x1b\[[\d;]*m", "", text).split()) or type(error).__name__
 
 
 @contextmanager

@@ -15,14 +15,16 @@ from rejeu.callbacks.base import stateful
 from rejeu.core.interrupt import Interrupt
 from rejeu.demonstrations import Demonstrations
 from rejeu.envs.registry import register
-from rejeu.lab.cli import environment
-from rejeu.lab.cli.commands import Clone, Train
-from rejeu.lab.cli.environment import Environment
+from rejeu.lab.cli.commands import Clone
 from rejeu.lab.cli.models import agent_of
-from rejeu.lab.cli.output import Stopwatch, echo
-from rejeu.lab.cli.session import Session
-from rejeu.lab.cli.train import begin
+from rejeu.lab.reporting.report import write_report
+from rejeu.lab.runs import environment
+from rejeu.lab.runs.arguments import Train
+from rejeu.lab.runs.begin import begin
 from rejeu.lab.runs.config import RunConfig
+from rejeu.lab.runs.environment import Environment
+from rejeu.lab.runs.output import Stopwatch, echo
+from rejeu.lab.runs.session import Session
 from rejeu.logs.formatting import counted
 
 
@@ -46,7 +48,7 @@ def run_clone(arguments: Clone) -> tuple[int, dict[str, Any]]:
         no_video=arguments.no_video,
     )
     with ExitStack() as stack:
-        session, stop = begin(task, stack), stack.enter_context(Interrupt())
+        session, stop = begin(task, stack, write_report), stack.enter_context(Interrupt())
         expert = None if arguments.expert is None else expert_of(arguments.expert, arguments, made)
         demonstrations.check(session.agent, shown)
         if arguments.critic_updates:

@@ -9,10 +9,11 @@ from typing import Any
 from rejeu.core import atomic
 from rejeu.core.language import chosen, said
 from rejeu.core.validation import whole
-from rejeu.lab.cli import dumps, environment
+from rejeu.lab.cli import dumps
 from rejeu.lab.cli.commands import Class, Course
-from rejeu.lab.cli.output import echo
+from rejeu.lab.runs import environment
 from rejeu.lab.runs.config import RunConfig
+from rejeu.lab.runs.output import echo
 from rejeu.logs.formatting import quoted, show_table
 from rejeu.teaching.courses import grading, leaderboard, write
 

@@ -13,11 +13,11 @@ from rejeu.checkpoints.run_folder import RunFolder, find_model
 from rejeu.core import devices
 from rejeu.core.errors import CheckpointError
 from rejeu.export import FORMATS, target_of
-from rejeu.lab.cli import environment
 from rejeu.lab.cli.commands import Evaluate, Export, Import, Play, Pull, Push, Record, Watch
-from rejeu.lab.cli.environment import Environment
-from rejeu.lab.cli.output import echo
+from rejeu.lab.runs import environment
 from rejeu.lab.runs.config import value
+from rejeu.lab.runs.environment import Environment
+from rejeu.lab.runs.output import echo
 from rejeu.logs.formatting import counted, quoted
 from rejeu.logs.video import record_video
 

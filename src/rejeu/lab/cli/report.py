@@ -48,7 +48,7 @@ def replay(path: Path, arguments: Report) -> None:
         ValueError: if the environment cannot be made.
     """
     from rejeu.agents import load  # JAX takes longer than all that rejeu status needs
-    from rejeu.lab.cli.environment import environment_of
+    from rejeu.lab.runs.environment import environment_of
 
     assert arguments.replay is not None
     model = find_model(path)

@@ -9,9 +9,10 @@ from pathlib import Path
 
 from rejeu.core import devices
 from rejeu.core.errors import requires
-from rejeu.lab.cli.commands import PORT, RunOptions, Studio
-from rejeu.lab.cli.environment import Environment, from_arguments
+from rejeu.lab.cli.commands import PORT, Studio
+from rejeu.lab.runs.arguments import RunOptions
 from rejeu.lab.runs.config import EnvironmentOptions, RunConfig
+from rejeu.lab.runs.environment import Environment, from_arguments
 
 NOTHING = RunOptions()
 

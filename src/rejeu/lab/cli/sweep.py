@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Callable
 from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
@@ -19,20 +18,20 @@ from rejeu.core.interrupt import NAMES, Interrupt
 from rejeu.core.validation import choice
 from rejeu.envs.functional import is_functional
 from rejeu.envs.make import BACKENDS
-from rejeu.lab.cli.commands import Resume, Sweep, Train
-from rejeu.lab.cli.environment import find_id
-from rejeu.lab.cli.output import Stopwatch, echo, header
-from rejeu.lab.cli.session import Session, installed_logs, make_evaluation_env
+from rejeu.lab.cli.commands import Sweep
 from rejeu.lab.experiments.folder import Plan, SweepFolder, open_folder, read_folder
 from rejeu.lab.experiments.process import default_workers, hold, threads_of
 from rejeu.lab.experiments.sweep import SweepResult, imports_of, make_launcher, prepare, states_text, train
 from rejeu.lab.experiments.work import Job, Work, again
 from rejeu.lab.reporting.comparison import By, Comparison, compare
+from rejeu.lab.reporting.report import write_report
+from rejeu.lab.runs.arguments import Resume, Train
+from rejeu.lab.runs.begin import begin
 from rejeu.lab.runs.config import RunConfig
+from rejeu.lab.runs.environment import find_id
+from rejeu.lab.runs.output import Stopwatch, echo, header
+from rejeu.lab.runs.session import Session, installed_logs, make_evaluation_env
 from rejeu.logs.formatting import counted, quoted
-
-Begin = Callable[[Train, ExitStack], Session]
-"""Makes the session of a seed; see :func:`rejeu.lab.cli.train.begin`."""
 
 
 def run_sweep(arguments: Sweep) -> tuple[int, dict[str, Any]]:
@@ -145,7 +144,7 @@ def fit_together(arguments: Train) -> bool:
     return arguments.jobs is None and not arguments.wrappers and is_functional(find_id(arguments.env))
 
 
-def train_together(arguments: Train, begin: Begin) -> tuple[int, dict[str, Any]]:
+def train_together(arguments: Train) -> tuple[int, dict[str, Any]]:
     """Trains all seeds and compares them; returns the exit status and the result.
 
     Settings that cannot be trained on the device are trained in processes.
@@ -153,7 +152,7 @@ def train_together(arguments: Train, begin: Begin) -> tuple[int, dict[str, Any]]
     stopwatch, jobs = Stopwatch(), make_jobs(arguments)
     path = choose_folder(arguments)
     with ExitStack() as stack:
-        first = begin(dataclasses.replace(arguments, seed=jobs[0].seed), stack)
+        first = begin(dataclasses.replace(arguments, seed=jobs[0].seed), stack, write_report)
         if reason := reason_against(first.agent, ()):
             echo(f"the seeds are trained in processes of their own, not in one program: {reason}")
             return train_all(arguments)

@@ -8,13 +8,14 @@ from typing import Any
 from rejeu.agents import AGENTS, find_agent, find_preset
 from rejeu.algorithms.search import Dimension
 from rejeu.core.interrupt import NAMES, Interrupt
-from rejeu.lab.cli import environment
-from rejeu.lab.cli.commands import Resume, Tune
-from rejeu.lab.cli.environment import Environment
-from rejeu.lab.cli.output import echo
+from rejeu.lab.cli.commands import Tune
 from rejeu.lab.experiments import space, study as studies, study_plan as plans, tune as tuning
 from rejeu.lab.experiments.study import Study, StudyFolder
+from rejeu.lab.runs import environment
+from rejeu.lab.runs.arguments import Resume
 from rejeu.lab.runs.config import merged
+from rejeu.lab.runs.environment import Environment
+from rejeu.lab.runs.output import echo
 from rejeu.logs.formatting import counted, quoted
 
 OF_THE_PLAN = (

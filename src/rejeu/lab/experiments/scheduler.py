@@ -26,8 +26,8 @@ from rejeu.checkpoints.run_folder import newest_step
 from rejeu.core.interrupt import TAKEN, Interrupt
 from rejeu.lab.experiments.process import hold, last_line
 from rejeu.lab.experiments.work import Ending, Work
-from rejeu.lab.reporting.runs import is_locked
 from rejeu.lab.runs.config import write_task
+from rejeu.lab.runs.read import is_locked
 
 POLL = 0.2
 """Seconds between two looks at the processes."""

@@ -27,8 +27,8 @@ from rejeu.lab.experiments.study import State, Study, StudyFolder, Trial
 from rejeu.lab.experiments.study_plan import MIN_FINAL_SEEDS, Measure
 from rejeu.lab.experiments.work import Job, Work
 from rejeu.lab.reporting.comparison import Comparison, compare
-from rejeu.lab.reporting.runs import RunSummary, read_run
 from rejeu.lab.runs.config import RunConfig
+from rejeu.lab.runs.read import RunSummary, read_run
 from rejeu.logs import statistics
 from rejeu.logs.tables import read_table
 

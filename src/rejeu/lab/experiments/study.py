@@ -36,7 +36,7 @@ from rejeu.lab.experiments.folder import begin
 from rejeu.lab.experiments.process import hold
 from rejeu.lab.experiments.study_plan import StudyPlan
 from rejeu.lab.experiments.work import HIDDEN
-from rejeu.lab.reporting.runs import is_locked
+from rejeu.lab.runs.read import is_locked
 
 if TYPE_CHECKING:
     import optuna

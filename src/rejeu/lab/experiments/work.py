@@ -26,8 +26,8 @@ from rejeu.core import atomic
 from rejeu.core.errors import CheckpointError
 from rejeu.envs.registry import are_plain
 from rejeu.lab.experiments.process import LOST
-from rejeu.lab.reporting.runs import is_locked
 from rejeu.lab.runs.config import RunConfig, Task, written
+from rejeu.lab.runs.read import is_locked
 from rejeu.logs.tables import read_bytes
 
 HIDDEN = ".sweep"

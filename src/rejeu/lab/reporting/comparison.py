@@ -28,7 +28,7 @@ from rejeu.lab.reporting.grouping import (
     settings,
 )
 from rejeu.lab.reporting.run_list import read_all
-from rejeu.lab.reporting.runs import RunSummary
+from rejeu.lab.runs.read import RunSummary
 from rejeu.logs import statistics
 from rejeu.logs.charts import GROUP_COLORS, group_chart
 from rejeu.logs.formatting import cell, counted, csv_text, markdown_table, number

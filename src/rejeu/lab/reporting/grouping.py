@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 
 from rejeu.core.records import shown
-from rejeu.lab.reporting.runs import RunSummary
+from rejeu.lab.runs.read import RunSummary
 from rejeu.logs.tables import HUGE, flat
 
 By = Literal["algorithm", "setting", "env"]

@@ -16,8 +16,8 @@ import numpy as np
 from rejeu.algorithms.catalog import CATALOG
 from rejeu.core.errors import requires
 from rejeu.core.records import Malformed, parse_json, shown
-from rejeu.lab.reporting.runs import MAX_NAME, MAX_STEP, RunSummary, is_file, ordered
 from rejeu.lab.runs.config import RunConfig
+from rejeu.lab.runs.read import MAX_NAME, MAX_STEP, RunSummary, is_file, ordered
 from rejeu.logs.formatting import counted
 from rejeu.logs.tables import EMPTY, MAX_COLUMNS, Table, read_bytes, read_table
 

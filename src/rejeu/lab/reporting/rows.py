@@ -16,7 +16,7 @@ import numpy as np
 from rejeu.checkpoints.run_folder import RunFolder
 from rejeu.core.records import shown, utf8
 from rejeu.lab.reporting import run_list
-from rejeu.lab.reporting.runs import RunSummary, best_row, has_process, is_file, is_recent
+from rejeu.lab.runs.read import RunSummary, best_row, has_process, is_file, is_recent
 from rejeu.logs import charts
 from rejeu.logs.tables import EMPTY
 

@@ -14,7 +14,7 @@ from rejeu.checkpoints.run_folder import RunFolder
 from rejeu.core.errors import MissingExtra
 from rejeu.core.records import shown
 from rejeu.lab.reporting.other_programs import EVENTS, FILES, MONITOR, files, read_monitor, read_tensorboard
-from rejeu.lab.reporting.runs import MAX_NAME, RunSummary, is_file, read_run
+from rejeu.lab.runs.read import MAX_NAME, RunSummary, is_file, read_run
 
 MAX_DEPTH = 4
 """Levels of folders that are searched for runs."""

@@ -8,8 +8,8 @@ from pathlib import Path
 from nicegui import ui
 
 from rejeu.checkpoints.run_folder import RunFolder, checkpoint_files, step_of
-from rejeu.lab.cli import parsing
-from rejeu.lab.cli.commands import COMMANDS, TASKS
+from rejeu.lab.runs import parsing
+from rejeu.lab.runs.arguments import Branch
 from rejeu.lab.studio.new import lead_to, new_folder
 from rejeu.lab.studio.state import Studio
 
@@ -32,7 +32,7 @@ def open_form(studio: Studio, name: str, path: Path) -> None:
                 words = ["branch", str(path), "--at", str(step.value), "--out", str(out), *studio.words(name)]
                 words += ["--steps", more.value] if more.value else []
                 words += ["--set", *shlex.split(settings.value)] if settings.value else []
-                parsing.parse(words, COMMANDS, TASKS, "")
+                parsing.parse(words, {"branch": Branch}, {}, "")
                 said.text = await lead_to(studio, words, out)
             except (ValueError, OSError) as error:
                 said.text = str(error)

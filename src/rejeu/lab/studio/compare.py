@@ -10,7 +10,7 @@ from typing import Any
 from fastapi import Request
 from nicegui import ui
 
-from rejeu.lab.cli import expected_errors, one_line
+from rejeu.core.errors import expected_errors, one_line
 from rejeu.lab.reporting.comparison import MAX_LISTED, Comparison, compare
 from rejeu.lab.studio.figures import Figure
 from rejeu.lab.studio.state import Studio

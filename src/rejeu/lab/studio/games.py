@@ -12,10 +12,11 @@ from typing import Any, NamedTuple
 
 from rejeu.agents import load
 from rejeu.checkpoints.run_folder import dated, find_model
+from rejeu.core.errors import one_line
 from rejeu.core.language import said
-from rejeu.lab.cli import environment, one_line
-from rejeu.lab.cli.environment import Environment
+from rejeu.lab.runs import environment
 from rejeu.lab.runs.config import RunConfig
+from rejeu.lab.runs.environment import Environment
 from rejeu.lab.studio.state import Studio
 from rejeu.teaching.play import Opened, opened
 from rejeu.teaching.play.game import Event, Game, Player

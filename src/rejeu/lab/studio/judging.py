@@ -8,9 +8,10 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+from rejeu.core.errors import one_line
 from rejeu.core.language import Language
-from rejeu.lab.cli import environment, one_line
 from rejeu.lab.reporting.rows import time_of
+from rejeu.lab.runs import environment
 from rejeu.lab.runs.config import RunConfig
 from rejeu.lab.studio.state import Studio
 from rejeu.teaching.courses import leaderboard

@@ -21,11 +21,11 @@ from rejeu.checkpoints.run_folder import dated
 from rejeu.core.records import shown
 from rejeu.core.validation import field_docs
 from rejeu.envs.registry import in_envpool, is_plain_id, register, unknown_environment
-from rejeu.lab.cli import parsing
-from rejeu.lab.cli.commands import COMMANDS, TASKS, Train, check_options
 from rejeu.lab.reporting.run_list import MAX_DEPTH, SKIPPED, find, is_run
-from rejeu.lab.reporting.runs import MAX_NAME
+from rejeu.lab.runs import parsing
+from rejeu.lab.runs.arguments import Train, check_options
 from rejeu.lab.runs.config import Option, Topic, options
+from rejeu.lab.runs.read import MAX_NAME
 from rejeu.lab.studio import processes
 from rejeu.lab.studio.layout import action, address
 from rejeu.lab.studio.state import Studio
@@ -149,7 +149,7 @@ def command(texts: Texts, studio: Studio) -> tuple[list[str], Train]:
     given = {**texts, "out": str(new_folder(studio, named))}
     words = [word for one in options(Train) for word in words_of(one, given.get(one.field))]
     words += [word for name in studio.imports for word in ("--import", name)]
-    _, arguments = parsing.parse(["train", *words], COMMANDS, TASKS, "")
+    _, arguments = parsing.parse(["train", *words], {"train": Train}, {}, "")
     check_options(arguments)
     return ["train", *words], arguments
 

@@ -20,16 +20,16 @@ from rejeu.agents import Agent, OnPolicyAgent, load
 from rejeu.checkpoints.model_files import Counters
 from rejeu.checkpoints.run_folder import RunFolder
 from rejeu.core import checkpoint
+from rejeu.core.errors import one_line
 from rejeu.core.records import convert
 from rejeu.envs.base import success_of
 from rejeu.envs.masks import for_agent
 from rejeu.envs.rendering import rgb_frame
-from rejeu.lab.cli import one_line
-from rejeu.lab.cli.commands import RunOptions
-from rejeu.lab.cli.environment import from_run
-from rejeu.lab.reporting.runs import has_process, is_recent
 from rejeu.lab.runs import requests
+from rejeu.lab.runs.arguments import RunOptions
 from rejeu.lab.runs.config import read_folder
+from rejeu.lab.runs.environment import from_run
+from rejeu.lab.runs.read import has_process, is_recent
 from rejeu.logs.video import playback_fps
 
 LEAST_FPS = 20.0

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from rejeu.core import atomic
-from rejeu.lab.reporting.runs import is_file
+from rejeu.lab.runs.read import is_file
 
 HIDDEN = ".studio"
 """Folder of the logs, beside the run folders."""

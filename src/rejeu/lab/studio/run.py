@@ -15,14 +15,14 @@ from nicegui import ui
 
 from rejeu.checkpoints.run_folder import RunFolder
 from rejeu.core import atomic
+from rejeu.core.errors import one_line
 from rejeu.core.records import brief
-from rejeu.lab.cli import one_line
 from rejeu.lab.experiments.work import HIDDEN
 from rejeu.lab.reporting import run_list
 from rejeu.lab.reporting.report import sections
 from rejeu.lab.reporting.rows import SHARE, Row
-from rejeu.lab.reporting.runs import is_file
 from rejeu.lab.runs import requests
+from rejeu.lab.runs.read import is_file
 from rejeu.lab.studio import processes
 from rejeu.lab.studio.branch import open_form
 from rejeu.lab.studio.figures import Figure

@@ -13,7 +13,7 @@ from nicegui import ui
 
 from rejeu.lab.reporting.grouping import group_labels
 from rejeu.lab.reporting.rows import POINTS, Row, best_text, cells
-from rejeu.lab.reporting.runs import RunSummary
+from rejeu.lab.runs.read import RunSummary
 from rejeu.lab.studio.layout import address, follow
 from rejeu.lab.studio.state import Studio
 from rejeu.logs import statistics

@@ -9,11 +9,11 @@ from pathlib import Path, PurePath
 from types import TracebackType
 
 from rejeu.envs.registry import are_plain, is_plain_id
-from rejeu.lab.cli.commands import RunOptions
-from rejeu.lab.cli.environment import Environment
 from rejeu.lab.reporting.rows import Row, Rows
-from rejeu.lab.reporting.runs import RunSummary, is_file
+from rejeu.lab.runs.arguments import RunOptions
 from rejeu.lab.runs.config import RunConfig, written
+from rejeu.lab.runs.environment import Environment
+from rejeu.lab.runs.read import RunSummary, is_file
 
 EVERY = 1.0
 """Seconds between two looks at the folder, and longest look, after which rows are shown though some runs are not read yet."""

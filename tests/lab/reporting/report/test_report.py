@@ -11,8 +11,8 @@ import pytest
 
 import rejeu
 from rejeu.lab.cli import main
-from rejeu.lab.reporting import runs
 from rejeu.lab.reporting.report import page, record, sections, write_report
+from rejeu.lab.runs import read as runs
 from rejeu.logs import charts
 from rejeu.logs.evaluation import Evaluation
 from rejeu.logs.tables import EMPTY, Table

@@ -16,8 +16,8 @@ from rejeu.algorithms import config as configs
 from rejeu.checkpoints.run_folder import RunFolder
 from rejeu.core import atomic
 from rejeu.lab.reporting.report import page, sections
-from rejeu.lab.reporting.runs import RunSummary, read_run
 from rejeu.lab.runs.config import RunConfig
+from rejeu.lab.runs.read import RunSummary, read_run
 from rejeu.logs.evaluation import Evaluation
 from rejeu.logs.tables import Table, evaluation_table
 

@@ -14,8 +14,8 @@ import numpy as np
 from rejeu.checkpoints.run_folder import RunFolder
 from rejeu.core.records import shown
 from rejeu.lab.reporting.report.videos import BUDGET, Video, collect
-from rejeu.lab.reporting.runs import MAX_WORD, RunSummary, best_row
 from rejeu.lab.runs.config import RunConfig
+from rejeu.lab.runs.read import MAX_WORD, RunSummary, best_row
 from rejeu.logs import charts as chart_data
 from rejeu.logs.formatting import counted, quoted
 from rejeu.logs.tables import flat

@@ -11,7 +11,7 @@ from urllib.parse import quote
 
 from rejeu.checkpoints.run_folder import RunFolder
 from rejeu.core.records import shown
-from rejeu.lab.reporting.runs import RunSummary
+from rejeu.lab.runs.read import RunSummary
 from rejeu.logs.tables import read_bytes
 
 BUDGET = 5 * 2**19

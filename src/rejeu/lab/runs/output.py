@@ -18,9 +18,9 @@ from rejeu.core import atomic, xla
 from rejeu.core.errors import RunInUseError
 from rejeu.core.interrupt import NAMES
 from rejeu.envs.registry import register
-from rejeu.lab.cli.environment import Environment
-from rejeu.lab.reporting.runs import RunSummary, read_warnings
 from rejeu.lab.runs.config import DecidedRun
+from rejeu.lab.runs.environment import Environment
+from rejeu.lab.runs.read import RunSummary, read_warnings
 from rejeu.lab.runs.requests import keep_model
 from rejeu.logs.formatting import counted, quoted
 from rejeu.logs.logging import Sink

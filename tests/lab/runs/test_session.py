@@ -14,9 +14,10 @@ from filelock import FileLock
 
 from rejeu.callbacks.evaluate import Evaluated
 from rejeu.core import xla
-from rejeu.lab.cli import main, output, session
-from rejeu.lab.cli.session import TrainingLimits
+from rejeu.lab.cli import main
 from rejeu.lab.reporting import rows, run_list
+from rejeu.lab.runs import output, session
+from rejeu.lab.runs.session import TrainingLimits
 from rejeu.logs.evaluation import Evaluation
 from rejeu.logs.logging import CsvFile
 from tests.lab.reporting.test_comparison import write_run

@@ -17,11 +17,12 @@ import pytest
 
 import rejeu
 from rejeu.core.errors import WorkerError
-from rejeu.lab.cli import check, environment, main
-from rejeu.lab.cli.commands import Train
-from rejeu.lab.cli.environment import Environment
+from rejeu.lab.cli import check, main
 from rejeu.lab.experiments.work import Job, again
+from rejeu.lab.runs import environment
+from rejeu.lab.runs.arguments import Train
 from rejeu.lab.runs.config import RunConfig
+from rejeu.lab.runs.environment import Environment
 from rejeu.logs.formatting import quoted
 from tests.lab.cli.test_cli import FEWER_FILES, TINY, error_of
 

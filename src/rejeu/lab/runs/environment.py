@@ -25,7 +25,7 @@ from rejeu.envs.functional import REGISTRY
 from rejeu.envs.make import VectorEnv, WorkerOptions, make_vector
 from rejeu.envs.registry import are_plain, is_plain_id, maker
 from rejeu.envs.rendering import make_rendering_env
-from rejeu.lab.cli.commands import RunOptions
+from rejeu.lab.runs.arguments import RunOptions
 from rejeu.lab.runs.config import EnvironmentOptions, RunConfig, merged, read_folder
 
 

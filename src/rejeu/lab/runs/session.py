@@ -18,15 +18,13 @@ from rejeu.callbacks import Checkpoint, Evaluate, RecordVideo
 from rejeu.callbacks.base import restore
 from rejeu.checkpoints.run_folder import RunFolder, create
 from rejeu.core import errors, xla
+from rejeu.core.errors import one_line
 from rejeu.core.interrupt import Interrupt, leaving
 from rejeu.envs.make import VectorEnv
-from rejeu.lab.cli import one_line
-from rejeu.lab.cli.commands import Train
-from rejeu.lab.cli.environment import Environment
-from rejeu.lab.cli.output import Stopwatch, as_dict, echo, noted_in, reporter, summary
-from rejeu.lab.reporting import report
 from rejeu.lab.runs import config as runs
-from rejeu.lab.runs.config import DecidedRun
+from rejeu.lab.runs.config import DecidedRun, RunConfig
+from rejeu.lab.runs.environment import Environment
+from rejeu.lab.runs.output import Stopwatch, as_dict, echo, noted_in, reporter, summary
 from rejeu.lab.runs.requests import Requests, ask
 from rejeu.logs import plots, video
 from rejeu.logs.formatting import counted, quoted
@@ -40,7 +38,11 @@ VIDEO_STEPS = 600
 """Most steps of a video: a poor policy's episodes are long, and highway-env renders some 70 frames a second."""
 
 
-def installed_logs(arguments: Train) -> tuple[str, ...]:
+Report = Callable[[Path, Path], object]
+"""``report(folder, path)`` writes the page about the run in a folder."""
+
+
+def installed_logs(arguments: RunConfig) -> tuple[str, ...]:
     """Returns the logs of ``--log``.
 
     Raises:
@@ -93,8 +95,8 @@ class Session(NamedTuple):
     limits: TrainingLimits
     is_new: bool
     """Whether the run begins here, rather than being resumed."""
-    has_report: bool = True
-    """Whether ``report.html`` and ``curve.png`` are written at the end."""
+    report: Report | None = None
+    """Writes ``report.html`` at the end; None for neither page nor ``curve.png``."""
     has_video: bool = True
     """Whether a video is recorded at the end."""
     backend: str = ""
@@ -234,7 +236,7 @@ class Session(NamedTuple):
     def plot_curve(self, evaluate: Evaluate) -> None:
         """Plots the learning curve or prints why not, unless the run is to have no report."""
         title = f"{self.environment.env_id}, {self.agent.name}"
-        if self.has_report:
+        if self.report is not None:
             with optional("curve"):
                 plots.learning_curve(self.agent.history, self.folder.curve, evaluations=evaluate.results, title=title)
 
@@ -248,9 +250,9 @@ class Session(NamedTuple):
 
     def write_report(self) -> None:
         """Writes the page about the run or prints why not, unless the run is to have none."""
-        if self.has_report:
+        if self.report is not None:
             with optional("report"):
-                report.write_report(self.folder.path, self.folder.report)
+                self.report(self.folder.path, self.folder.report)
 
 
 @contextmanager
