@@ -18,6 +18,7 @@ from rejeu.lab.runs.read import RunSummary, is_file
 EVERY = 1.0
 """Seconds between two looks at the folder, and longest look, after which rows are shown though some runs are not read yet."""
 
+Guests = Mapping[str, tuple[Path, Environment]]
 NOTHING = RunConfig(env="")
 """What the command line names if it names no environment and no module."""
 
@@ -30,12 +31,7 @@ def is_below(path: PurePath) -> bool:
 class Studio:
     """The folder of a studio, and the rows of its runs; a thread reads them while the context is entered."""
 
-    def __init__(
-        self,
-        folder: Path,
-        guests: Mapping[str, tuple[Path, Environment]] | None = None,
-        typed: RunConfig = NOTHING,
-    ) -> None:
+    def __init__(self, folder: Path, guests: Guests | None = None, typed: RunConfig = NOTHING) -> None:
         self.folder, self.imports = folder, typed.imports
         self.guests = dict(guests or {})
         """Models that the command line named, with their environments; they may be elsewhere."""
@@ -94,11 +90,8 @@ class Studio:
         """Returns what people have typed about an environment that they named like this, or on the command line by its id."""
         options = (
             RunOptions(env=one.typed, env_kwargs=one.env_kwargs, wrappers=one.wrappers, imports=one.imports)
-            for one in self._trusted
-            if env
-            and (
-                (env == one.typed and not is_plain_id(env)) or (one is self._trusted[0] and env in (one.env, one.typed))
-            )
+            for i, one in enumerate(self._trusted)  # the first is of the command line
+            if env and env in (one.env, one.typed) and (i == 0 or not is_plain_id(env))
         )
         return self._with_imports(next(options, RunOptions()))
 
