@@ -9,7 +9,7 @@ import pathlib
 
 
 class FullDisk:
-    """While ``full``, every write through ``Path.open`` fails after half of its bytes, as on a real disk."""
+    """While ``full``, every write of ``rejeu.core.atomic`` fails after half of its bytes, as on a real disk."""
 
     def __init__(self, monkeypatch):
         self.full = False
@@ -19,9 +19,10 @@ class FullDisk:
         def open_(path, mode="r", *rest, **keywords):
             if self.full and mode in ("xb", "r+b"):
                 return _Half(path, mode, self)
-            return opened(path, mode, *rest, **keywords)
+            return (open if "opener" in keywords else opened)(path, mode, *rest, **keywords)
 
         monkeypatch.setattr(pathlib.Path, "open", open_)
+        monkeypatch.setattr("rejeu.core.atomic.open", open_, raising=False)
 
 
 class _Half(io.FileIO):

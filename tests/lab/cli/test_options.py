@@ -20,8 +20,10 @@ from rejeu.agents.together import sibling
 from rejeu.checkpoints.run_folder import RunFolder
 from rejeu.core.interrupt import Interrupt
 from rejeu.lab import hub
-from rejeu.lab.cli import clone, compare, courses, main, models, resume, sweep, train, tune
+from rejeu.lab.cli import clone, compare, courses, main, models, sweep, tune
 from rejeu.lab.experiments import study_plan
+from rejeu.lab.reporting.report import write_report
+from rejeu.lab.runs import begin, resume
 from rejeu.lab.runs.arguments import Train
 from rejeu.lab.runs.config import DecidedRun, RunConfig, Task, write_task
 from rejeu.lab.runs.environment import Environment
@@ -238,7 +240,7 @@ def test_train(sessions, tmp_path):
     assert {key: content[key] for key in GIVEN} == GIVEN
     assert (content["log"], content["hyperparameters"]["policy_kwargs"]["net_arch"]) == (["json"], [4])
     assert session.limits == TrainingLimits(steps=70, pause_steps=20)
-    assert (session.has_report, session.has_video, session.is_new) == (False, False, True)
+    assert (session.report, session.has_video, session.is_new) == (None, False, True)
     agent = session.agent
     assert (agent.seed, agent.device, agent.success_threshold, agent.n_envs) == (5, "cpu", 3.0, 2)
     assert (session.evaluation_env.n_envs, session.evaluation_env.backend, session.log_interval) == (6, "gymnasium", 8)
@@ -262,16 +264,16 @@ def test_workers_and_datasets_of_train(spy):
     made, shown = spy(Environment, "vector"), Train(env=TYPED, offline=Path("shown"))
     given = Train(env=TYPED, n_envs=3, backend="gymnasium-async", restart_workers=2, wait_for=1)
     environment = models.environment.from_arguments(TYPED, given)
-    train.make_env(given, environment, None, 5)
+    begin.make_env(given, environment, None, 5)
     assert includes(made, n_envs=3, backend="gymnasium-async", seed=5)
     assert (made[-1]["workers"].restart_workers, made[-1]["workers"].wait_for) == (2, 1)
-    train.make_env(dataclasses.replace(given, backend="ray", ray="auto", env_cpus=0.5), environment, None, 5)
+    begin.make_env(dataclasses.replace(given, backend="ray", ray="auto", env_cpus=0.5), environment, None, 5)
     assert made[-1]["workers"].ray == {"address": "auto", "num_cpus": 0.5}
-    given = train.with_dataset(shown)
+    given = begin.with_dataset(shown)
     assert (given.algorithm, given.offline) == ("IQL", None)
     assert given.hyperparameters == {"demonstrations": "shown", "offline": True}
-    assert train.with_dataset(dataclasses.replace(shown, preset="p.json")).algorithm is None
-    assert train.with_dataset(dataclasses.replace(shown, algorithm="SAC")).algorithm == "SAC"
+    assert begin.with_dataset(dataclasses.replace(shown, preset="p.json")).algorithm is None
+    assert begin.with_dataset(dataclasses.replace(shown, algorithm="SAC")).algorithm == "SAC"
 
 
 def test_train_for_minutes_with_the_report_and_the_video(sessions, tmp_path):
@@ -282,10 +284,10 @@ def test_train_for_minutes_with_the_report_and_the_video(sessions, tmp_path):
     write_task(tmp_path / "task.json", Task(folder=str(tmp_path / "other"), run=run, no_video=True))
     assert main(["--task", str(tmp_path / "task.json")]) == 0
     session, other = sessions
-    assert (other.config.seed, other.has_report, other.has_video) == (6, True, False)
+    assert (other.config.seed, other.report, other.has_video) == (6, write_report, False)
     assert other.folder == RunFolder(tmp_path / "other")
     assert session.limits == TrainingLimits(minutes=2.0)
-    assert session.has_report
+    assert session.report is write_report
     assert session.has_video
     assert session.config.checkpoint_minutes is None
     assert session.agent.seed == 5
@@ -310,7 +312,7 @@ def test_resume(spy, sessions, monkeypatch, tmp_path):
     argv += ["--set", "gamma=0.5", "policy_kwargs.layer_norm=true"]
     assert main([*argv, "--steps", "20"]) == 0
     assert sessions[-1].limits == TrainingLimits(pause_steps=20)
-    assert (sessions[-1].has_report, sessions[-1].has_video, sessions[-1].is_new) == (False, True, False)
+    assert (sessions[-1].report, sessions[-1].has_video, sessions[-1].is_new) == (None, True, False)
     assert kind.resume.call_args.kwargs == {
         "device": "cpu",
         "gamma": 0.5,

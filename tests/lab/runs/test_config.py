@@ -12,6 +12,7 @@ import rejeu
 from rejeu.core.errors import CheckpointError
 from rejeu.lab.cli import commands, main
 from rejeu.lab.runs import config, parsing
+from rejeu.lab.runs.arguments import of_task
 from rejeu.lab.runs.config import DecidedRun, RunConfig, Task, read_task, write_task
 from tests.lab.cli.test_cli import FEWER_FILES, TINY
 from tests.tiers import exhaustive
@@ -100,11 +101,11 @@ def test_a_run_is_the_same_as_words_of_the_command_line_and_as_data(run, tmp_pat
     assert command == "train"
     assert {one.name: getattr(arguments, one.name) for one in dataclasses.fields(run)} == dataclasses.asdict(run)
     write_task(tmp_path / "task.json", Task(folder="runs/1", run=run))
-    command, arguments = commands.of_task(read_task(tmp_path / "task.json"))
+    command, arguments = of_task(read_task(tmp_path / "task.json"))
     assert {one.name: getattr(arguments, one.name) for one in dataclasses.fields(run)} == dataclasses.asdict(run)
     assert (command, str(arguments.out), arguments.pause) == ("train", "runs/1", None)
     task = Task(folder="runs/1", run=run, resume=True, no_report=True)
-    command, arguments = commands.of_task(task)
+    command, arguments = of_task(task)
     assert (command, str(arguments.run), arguments.steps, arguments.finish) == ("resume", "runs/1", None, True)
     assert (arguments.hyperparameters, arguments.no_report, arguments.no_video) == ({}, True, False)
     assert (arguments.imports, arguments.env_kwargs) == (run.imports, run.env_kwargs if run.names_code else {})

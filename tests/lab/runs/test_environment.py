@@ -17,9 +17,9 @@ import pytest
 
 import rejeu
 from rejeu.core.errors import WorkerError
-from rejeu.lab.cli import check, main
+from rejeu.lab.cli import main
 from rejeu.lab.experiments.work import Job, again
-from rejeu.lab.runs import environment
+from rejeu.lab.runs import begin, environment
 from rejeu.lab.runs.arguments import Train
 from rejeu.lab.runs.config import RunConfig
 from rejeu.lab.runs.environment import Environment
@@ -327,5 +327,5 @@ def test_the_check_before_training_draws_no_random_numbers_of_others(here):
     random.seed(1)
     np.random.seed(1)  # noqa: NPY002
     expected = random.getstate(), np.random.get_state()[1].tolist()  # noqa: NPY002
-    check.before_training(made, None)
+    begin.check_own_environment(made, None)
     assert (random.getstate(), np.random.get_state()[1].tolist()) == expected  # noqa: NPY002

@@ -10,8 +10,8 @@ import pytest
 import rejeu
 from rejeu.checkpoints.run_folder import RunFolder
 from rejeu.core.interrupt import Interrupt
-from rejeu.lab.cli import main, resume
-from rejeu.lab.runs import requests
+from rejeu.lab.cli import main
+from rejeu.lab.runs import requests, resume
 
 
 @pytest.fixture
