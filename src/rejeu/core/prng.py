@@ -63,11 +63,20 @@ def _seed(seed: Array) -> Array:
 
 
 def _split(key: Array, shape: tuple[int, ...]) -> Array:
-    return jnp.stack(_hashes(key, shape), axis=-1)
+    return _stored(jnp.stack(_hashes(key, shape), axis=-1))
 
 
 def _fold_in(key: Array, data: Any) -> Array:
-    return jnp.stack(threefry(key, jnp.asarray(data, jnp.uint32)))
+    return _stored(jnp.stack(threefry(key, jnp.asarray(data, jnp.uint32))))
+
+
+def _stored(keys: Array) -> Array:
+    """Returns derived keys such that XLA does not compute them again for each number that is drawn with them.
+
+    Where it does, in JAX 0.11.2 and 0.12, LLVM's loop vectorizer follows every path through the rounds
+    (``onlyFirstLaneUsed``), whose number doubles with each: compiling never ends (docs/installation.md).
+    """
+    return jax.lax.optimization_barrier(keys)
 
 
 def _random_bits(key: Array, bit_width: int, shape: tuple[int, ...]) -> Array:
