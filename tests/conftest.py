@@ -32,6 +32,8 @@ import hypothesis
 import jax
 import pytest
 
+from rejeu.core.xla import RUN_ONCE
+
 hypothesis.settings.register_profile("rejeu", max_examples=50, derandomize=True, deadline=None, database=None)
 hypothesis.settings.load_profile("rejeu")
 jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -39,8 +41,8 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # set by shells for backg
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-QUICK_TO_COMPILE = (
-    "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
+QUICK_TO_COMPILE = " ".join(
+    f"--{name}={value}".lower() for name, value in {**RUN_ONCE, "xla_cpu_parallel_codegen_split_count": 1}.items()
 )
 STATUS = Path("/proc/self/status")
 LARGE = 3 * 2**29

@@ -25,8 +25,10 @@ LITTLE_WORK = 2**23
 two threads a step of DDPG with batches of 128 and layers 128-128 takes 1.5 times as long; with one thread batches of 256 and
 layers 256-256 take 1.2 times as long."""
 
-RUN_ONCE = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
+RUN_ONCE: dict[str, bool | int] = {"xla_backend_optimization_level": 0}
 """XLA's options for functions that run once: compiling takes a quarter of the time."""
+if jax.__version_info__ < (0, 11, 1):  # later versions do not have it, and end the program if XLA_FLAGS does
+    RUN_ONCE["xla_cpu_use_fusion_emitters"] = False
 
 F = TypeVar("F", bound=Callable[..., Any])
 
