@@ -395,6 +395,49 @@ def test_an_envpool_of_another_layout_is_imported_as_it_is(entry, tmp_path, monk
     assert "envpool.entry" not in sys.modules
 
 
+IMPORTS = {
+    "envpool/__init__.py": {"envpool/__init__.py": "{fault}"},
+    "a game": {
+        "envpool/__init__.py": "from envpool import entry\ndef list_all_envs(): return ['Pendulum-v1']\n",
+        "envpool/entry.py": '"""Entry point."""\n\nimport envpool.games.registration\n',
+        "envpool/games/__init__.py": "{fault}",
+        "envpool/games/registration.py": "from envpool import games\n",
+    },
+}
+
+
+@pytest.fixture(params=IMPORTS)
+def envpool_without_libraries(request, tmp_path, monkeypatch):
+    """An EnvPool whose import fails like that of version 1.2.7 in a slim container."""
+    fault = "raise ImportError('libEGL.so.1: cannot open shared object file: No such file or directory')\n"
+    for name, text in IMPORTS[request.param].items():
+        (tmp_path / name).parent.mkdir(exist_ok=True, parents=True)
+        (tmp_path / name).write_text(text.replace("{fault}", fault))
+    monkeypatch.syspath_prepend(tmp_path)
+    for name in [name for name in sys.modules if name.partition(".")[0] == "envpool"]:
+        monkeypatch.delitem(sys.modules, name)
+    yield
+    for name in [name for name in sys.modules if name.partition(".")[0] == "envpool"]:
+        del sys.modules[name]
+
+
+FAILED_IMPORT = (
+    r"backend='envpool' needs EnvPool \(.*\), whose import fails: libEGL\.so\.1: cannot open shared object file: .*; "
+    "on Debian or Ubuntu, run: apt-get install libegl1 libgl1 libopengl0"
+)
+
+
+def test_auto_uses_gymnasium_with_a_warning_if_the_import_of_envpool_fails(envpool_without_libraries):
+    for _ in range(2):  # nothing of the first import stays behind
+        with pytest.warns(UserWarning, match=f"^{FAILED_IMPORT}; Gymnasium's environments are used instead$"):
+            assert make_vector("Pendulum-v1", 4).backend == "gymnasium"
+
+
+def test_the_envpool_backend_says_which_system_packages_to_install_if_its_import_fails(envpool_without_libraries):
+    with pytest.raises(rejeu.MissingExtra, match=f"^{FAILED_IMPORT}$"):
+        make_vector("Pendulum-v1", 4, backend="envpool")
+
+
 def test_auto_uses_gymnasium_without_envpool(without_envpool):
     assert make_vector("Pendulum-v1", 4).backend == "gymnasium"
     agent = rejeu.DQN("MlpPolicy", make_vector("CartPole-v1", 4), policy_kwargs={"net_arch": [4]}, seed=0).learn(8)

@@ -8,22 +8,30 @@ from contextlib import contextmanager, suppress
 from importlib import metadata
 from pathlib import Path
 
+GRAPHICS = re.compile(r"lib(EGL|GL|OpenGL)\b")
+"""Libraries of graphics, which slim systems lack."""
+
 
 class MissingExtra(ImportError):
-    """An optional package is not installed. The message contains the command that installs it."""
+    """An optional package is not installed, or its import fails. The message says what to install."""
 
-    def __init__(self, purpose: str, package: str, extra: str = "") -> None:
-        needed = f'"rejeu[{extra}]"' if extra else package
-        super().__init__(f"{purpose} needs {package}, which is not installed; run: pip install {needed}")
+    def __init__(self, purpose: str, package: str, extra: str = "", error: Exception | None = None) -> None:
+        if error is None or isinstance(error, ModuleNotFoundError):
+            needed = f'"rejeu[{extra}]"' if extra else package
+            super().__init__(f"{purpose} needs {package}, which is not installed; run: pip install {needed}")
+        else:
+            remedy = "; on Debian or Ubuntu, run: apt-get install libegl1 libgl1 libopengl0"
+            remedy = remedy if GRAPHICS.search(str(error)) else ""
+            super().__init__(f"{purpose} needs {package}, whose import fails: {error}{remedy}")
 
 
 @contextmanager
 def requires(purpose: str, package: str, extra: str = "") -> Iterator[None]:
-    """Raises :class:`MissingExtra` with these arguments in the place of an ``ImportError`` inside."""
+    """Raises :class:`MissingExtra` with these arguments if an import inside fails."""
     try:
         yield
-    except ImportError:
-        raise MissingExtra(purpose, package, extra) from None
+    except (ImportError, OSError) as error:
+        raise MissingExtra(purpose, package, extra, error) from None
 
 
 def installed(package: str) -> str | None:

@@ -166,7 +166,7 @@ def check_envpool_knows(env_id: str) -> None:
     """Checks that EnvPool has an environment.
 
     Raises:
-        MissingExtra: if EnvPool is not installed.
+        MissingExtra: if EnvPool is not installed, or its import fails.
         ValueError: if it does not have the environment, or if that has several players, with what to use instead.
     """
     if env_id not in import_envpool().list_all_envs():
@@ -179,7 +179,7 @@ def check_envpool_knows(env_id: str) -> None:
 def envpool_knows(env_id: str) -> bool:
     """Returns whether EnvPool can be used for an id.
 
-    It must be installed and have the environment. False if Gymnasium has only a newer version, or if the goals need a
+    It must be installed, and have the environment. False if Gymnasium has only a newer version, or if the goals need a
     package that is not installed.
     """
     if not in_envpool(env_id) or (env_id not in gym.registry and newer_version(env_id) is not None):

@@ -8,6 +8,7 @@ import importlib
 import importlib.util
 import re
 import sys
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -226,20 +227,34 @@ def import_envpool() -> Any:
     the modules that register their ids. These are executed alone here, where EnvPool's entry imports nothing else.
 
     Raises:
-        MissingExtra: if it is not installed.
+        MissingExtra: if it is not installed, or a library of the system is missing.
     """
-    if "envpool" in sys.modules or not (tables := _tables_of_envpool()):
-        with requires("backend='envpool'", f"EnvPool ({ENVPOOL_SIZE})", "envpool"):
+    with requires("backend='envpool'", f"EnvPool ({ENVPOOL_SIZE})", "envpool"):
+        if "envpool" in sys.modules or not (tables := _tables_of_envpool()):
             return importlib.import_module("envpool")
-    sys.modules["envpool.entry"] = ModuleType("envpool.entry")
-    envpool = importlib.import_module("envpool")
-    for name, path in tables.items():
-        spec = importlib.util.spec_from_file_location(name, path)
-        assert spec is not None
-        assert spec.loader is not None
-        sys.modules[name] = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(sys.modules[name])
-    return envpool
+        sys.modules["envpool.entry"] = ModuleType("envpool.entry")
+        try:
+            envpool = importlib.import_module("envpool")
+            for name, path in tables.items():
+                spec = importlib.util.spec_from_file_location(name, path)
+                assert spec is not None
+                assert spec.loader is not None
+                sys.modules[name] = importlib.util.module_from_spec(spec)
+                spec.loader.exec_module(sys.modules[name])
+        except (ImportError, OSError):
+            sys.modules.pop("envpool", None)
+            raise
+        return envpool
+
+
+def usable_envpool() -> Any:
+    """Returns the module ``envpool``, or None where it cannot be imported; warns if it is installed nevertheless."""
+    try:
+        return import_envpool()
+    except MissingExtra as error:
+        if is_envpool_installed():
+            warnings.warn(f"{error}; Gymnasium's environments are used instead", UserWarning, stacklevel=2)
+        return None
 
 
 def _tables_of_envpool() -> dict[str, Path]:
@@ -261,7 +276,7 @@ def is_envpool_installed() -> bool:
 
 
 def in_envpool(env_id: str) -> bool:
-    """Returns whether EnvPool is installed and has an environment of this id.
+    """Returns whether EnvPool can be used and has an environment of this id.
 
     An id of the user's own code is not looked up, which would take a second.
     """
@@ -270,7 +285,5 @@ def in_envpool(env_id: str) -> bool:
     package = (source if isinstance(source, str) else getattr(source, "__module__", "")).partition(".")[0]
     if source is not None and package not in MIRRORED:
         return False
-    try:
-        return env_id in import_envpool().list_all_envs()
-    except MissingExtra:
-        return False
+    envpool = usable_envpool()
+    return envpool is not None and env_id in envpool.list_all_envs()

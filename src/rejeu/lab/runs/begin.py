@@ -27,7 +27,7 @@ from rejeu.core import devices, validation
 from rejeu.core.errors import BadEnvironmentError
 from rejeu.core.spaces import leaves
 from rejeu.envs.make import VectorEnv, WorkerOptions, make_vector
-from rejeu.envs.registry import ENVPOOL_SIZE, is_envpool_installed, provider, register
+from rejeu.envs.registry import ENVPOOL_SIZE, is_envpool_installed, provider, register, usable_envpool
 from rejeu.lab.runs import environment
 from rejeu.lab.runs.arguments import Train
 from rejeu.lab.runs.config import DecidedRun, merged
@@ -81,7 +81,8 @@ def make_env(arguments: Train, made: Environment, preset: Preset | None, seed: i
         return make_vector(made.rendering, 1, "gymnasium", seed)
     n_envs = arguments.n_envs or (preset.n_envs if preset else 1)
     backend = preset.backend if preset and made.is_plain else "auto"
-    if backend == "envpool" and not is_envpool_installed() and (register(made.env_id) or provider(made.env_id)):
+    is_elsewhere = backend == "envpool" and (register(made.env_id) or provider(made.env_id))
+    if is_elsewhere and arguments.backend is None and usable_envpool() is None:
         backend = "gymnasium"
     backend = arguments.backend or backend
     workers = WorkerOptions(restart_workers=arguments.restart_workers, wait_for=arguments.wait_for)
