@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import shutil
 import subprocess
 import zipfile
@@ -11,15 +12,20 @@ from types import SimpleNamespace
 
 import gymnasium as gym
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from gymnasium.wrappers import FrameStackObservation
+from jax import lax
 
 from rejeu.agents import exporting
 from rejeu.algorithms.sac.continuous import policy as sac_policy
 from rejeu.core import spaces
 from rejeu.core.spaces import parts
-from rejeu.export import FORMATS, c_file, check, contract, stablehlo_file
+from rejeu.export import FORMATS, c_file, check, contract, onnx_file, stablehlo_file, web_file
+from rejeu.export.npz_file import described
+from rejeu.export.numpy_policy import NumpyProgram
+from rejeu.export.program import trace
 from rejeu.lab.cli import main
 from rejeu.lab.policies import load_policy
 from tests.export.policies import KINDS, agent_of, made, observations
@@ -402,3 +408,48 @@ def test_observations_with_practically_infinite_bounds_are_sampled_near_0():
     x = exporting.moderate(np.array([[0.9 * most, -most, 3.0, 0.0]], np.float32), np.random.default_rng(0))
     assert np.abs(x).max() < 10
     assert x[0, 2:].tolist() == [3.0, 0.0]
+
+
+def rounded(x):
+    """Whole numbers, their quotients and remainders, the nearest whole numbers, and which numbers are not 0, as floats.
+
+    Each is used once, so no array of whole numbers rounds it in the place of the expression.
+    """
+    by = jnp.int32([[3, -3, 2, -2]])
+    parts = x.astype(jnp.int32), lax.div(x.astype(jnp.int32), by), lax.rem(x.astype(jnp.int32), by), jnp.rint(x), x != 0
+    return (jnp.concatenate([one.astype(jnp.float32) for one in (*parts, x.astype(bool))], axis=1),)
+
+
+def run_rounded(target, x):
+    """The results of :func:`rounded` in a format, one row at a time."""
+    program = trace(rounded, jax.ShapeDtypeStruct((1, 4), np.float32))
+    if target == "npz":
+        return [NumpyProgram(*described(program), [row])(1, [row])[0][0] for row in x[:, None]]
+    if target == "web":
+        code = (web_file.TEMPLATES / "web.js").read_text(encoding="utf-8") + web_file.function("f", program)
+        call = 'const rows = JSON.parse(require("fs").readFileSync(0, "utf8")); console.log(JSON.stringify('
+        return web_file.node(code + call + "rows.map((row) => Array.from(f(row)[0]))));", x.tolist())
+    ports = (
+        contract.Port("observation", "observation", (4,), "float32"),
+        contract.Port("action", "action", (24,), "float32"),
+    )
+    policy = contract.Policy(program, ports[:1], ports[1:], 1)
+    if target == "c":
+        return c_file.c_run(policy, *c_file.write(policy, {"rejeu": "", "weights": ""}, "p"), "p")({"observation": x})[
+            0
+        ]
+    return onnx_file.onnx_run(policy, onnx_file.write(policy, {}))({"observation": x})[0]
+
+
+@pytest.mark.parametrize("target", ["npz", "onnx", "c", "web"])
+def test_every_format_rounds_towards_zero_and_halves_to_even(target):
+    if (target == "c" and not has_compiler) or (target == "web" and shutil.which("node") is None):
+        pytest.skip("nothing runs it")
+    x = np.random.default_rng(0).permutation(np.arange(-24, 24) / 2).astype(np.float32).reshape(12, 4)
+    expected = []
+    for row in x.tolist():
+        whole = [int(one) for one in row]
+        quotients = [int(math.copysign(abs(n) // abs(by), n * by)) for n, by in zip(whole, (3, -3, 2, -2), strict=True)]
+        rests = [n - q * by for n, q, by in zip(whole, quotients, (3, -3, 2, -2), strict=True)]
+        expected.append([*whole, *quotients, *rests, *map(round, row), *(one != 0 for one in row), *map(bool, row)])
+    np.testing.assert_array_equal(run_rounded(target, x), expected)

@@ -52,7 +52,6 @@ def test_a_primitive_has_the_results_of_jax(name):
         lambda x, y: (x[:, ::2], y[1:, 1:], jnp.split(x, [1], axis=1), jnp.squeeze(y[:1])),
         lambda x, y: (x.sum(0), x.max(1), y.min((0, 1)), x.argmax(1), jnp.concatenate([x, y], 0)),
         lambda x, y: lax.select_n(jnp.int32([[0, 1, 2]]) + jnp.zeros((2, 1), jnp.int32), x, y, x + y),
-        lambda x, y: lax.div((4 * x).astype(jnp.int32), jnp.int32([[2, -3, 1]]) + jnp.zeros((2, 1), jnp.int32)),
         lambda x, y: jnp.broadcast_to(y[0, 0], x.shape) + x,
     ],
 )
