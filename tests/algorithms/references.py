@@ -9,6 +9,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from scipy import stats
 
 from rejeu.core.algorithm import TD_ERROR, Transition
 from tests.algorithms.batches import noise_of
@@ -16,7 +17,9 @@ from tests.numpy_networks import Adam, Layers, action_value, ensemble, follow, f
 
 
 def members(network: Any) -> list[Layers]:
-    """Copies the weights of a network, or of each member of an ensemble."""
+    """Copies the weights of a network, or of each member of an ensemble; log standard deviations are a last layer."""
+    if hasattr(network, "log_std"):
+        return [[*layers(network.network), [np.array(np.float64(network.log_std)), np.zeros(0)]]]
     return ensemble(network) if network.head.bias.ndim > 1 else [layers(network)]
 
 
@@ -371,3 +374,56 @@ class TQC(SAC):
 
     def judge(self, critics: list[Layers], obs: Any, action: Any) -> np.ndarray:
         return np.mean([self.quantiles(critic, obs, action) for critic in critics], axis=(0, 2))
+
+
+class IQL(Reference):
+    """A value, an actor that imitates what was better than it, and critics that learn from the value, in this order."""
+
+    def __init__(self, state: Any, config: Any, rate: float) -> None:
+        self.config, self.met = config, set()
+        (self.actor,), (self.value,), self.critics = members(state.actor), members(state.value), members(state.critics)
+        self.target_critics, self.target_actor, self.tau = members(state.target_critics), None, config.tau
+        learned = [*self.networks().items()][:3]
+        self.adams = {name: [Adam(network, rate) for network in networks] for name, networks in learned}
+
+    @property
+    def branches(self) -> set[str]:
+        return {"no critic is the smallest everywhere", "largest weight", "above", "below"}
+
+    def networks(self) -> dict[str, list[Layers]]:
+        targets = {"target_critics": self.target_critics}
+        return {"actor": [self.actor], "value": [self.value], "critics": self.critics, **targets}
+
+    def first_moments(self) -> dict[str, list[Layers]]:
+        return {f"{name}_optimizer": [adam.first for adam in adams] for name, adams in self.adams.items()}
+
+    def update(self, batch: Transition) -> dict[str, Any]:
+        recorded = self.smallest([action_value(critic, batch.obs, batch.action) for critic in self.target_critics])
+
+        def value_loss() -> float:
+            errors = recorded - forward(self.value, batch.obs)[:, 0]
+            self.met |= {"above" if error > 0 else "below" for error in errors}
+            return np.mean([(self.config.expectile if u > 0 else 1 - self.config.expectile) * u**2 for u in errors])
+
+        metrics = {"value_loss": self.descend("value", value_loss)}
+        weight = np.exp(self.config.inverse_temperature * (recorded - forward(self.value, batch.obs)[:, 0]))
+        self.met |= {"largest weight"} if (weight > 100).any() else set()
+        weight[weight > 100] = 100
+
+        def actor_loss() -> float:
+            mean, std = np.tanh(forward(self.actor[:-1], batch.obs)), np.exp(self.actor[-1][0])
+            return -np.mean(weight * stats.norm.logpdf(np.float64(batch.action), mean, std).sum(axis=1))
+
+        metrics["actor_loss"] = self.descend("actor", actor_loss)
+        target = batch.reward + batch.discount * forward(self.value, batch.next_obs)[:, 0]
+        values = np.array([self.predict(critic, batch) for critic in self.critics])
+        losses = [lambda one=one: np.mean((self.predict(one, batch) - target) ** 2) for one in self.critics]
+        metrics["critic_loss"] = sum(self.descend("critics", loss, i) for i, loss in enumerate(losses))
+        self.move_targets()
+        return metrics | {"q_value": values.mean(), TD_ERROR: np.abs(values - target).mean(axis=0)}
+
+    def descend(self, name: str, loss: Any, index: int = 0) -> float:
+        """Takes one step of a network against the gradient of ``loss()``, and returns the loss before."""
+        before = loss()
+        self.adams[name][index].descend(loss)
+        return before
