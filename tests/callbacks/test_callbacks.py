@@ -65,6 +65,7 @@ def test_return_decides_where_success_is_equal_or_unknown():
     assert merit(evaluation([-50, -50], [1, 1])) > merit(evaluation([-1, -1], [1, 0]))
     assert merit(evaluation([2, 2], [1, 0])) > merit(evaluation([1, 1], [0, 1]))
     assert merit(evaluation([2, 2])) > merit(evaluation([1, 1]))
+    assert merit(evaluation([1, 1], [0, 0])) > merit(evaluation([2, 2]))  # of which nothing is known
     assert merit(evaluation([1, 1])) == merit(evaluation([1, 1]))
 
 

@@ -56,7 +56,9 @@ def test_every_environment_plays_its_share_so_short_episodes_are_not_counted_mor
 
 @pytest.mark.parametrize("n_envs", [1, 3])
 def test_exactly_as_many_episodes_are_played_as_asked_for(n_envs):
-    assert len(evaluate(still, InProcess([Counter((2,)) for _ in range(n_envs)]), 7).returns) == 7
+    envs = lambda: InProcess([Counter((2,)) for _ in range(n_envs)])  # noqa: E731
+    assert len(evaluate(still, envs(), 7).returns) == 7
+    assert len(rejeu.evaluate_policy(Still(), envs(), 7, return_episode_rewards=True)[0]) == 7
 
 
 def timed(monkeypatch, envs, episodes, seconds, compiling=0.0):
@@ -134,6 +136,15 @@ def test_statistics_equal_numpy_and_scipy():
     half = z / (1 + z**2 / n) * np.sqrt(p * (1 - p) / n + z**2 / (4 * n**2))
     assert result.success_interval == pytest.approx((middle - half, middle + half))
     assert "success 75.0%" in str(result)
+
+
+def test_episodes_of_unknown_success_count_neither_for_the_rate_nor_for_its_interval():
+    known = np.array([1.0, 0.0, 1.0, 1.0])
+    for n_unknown in (1, 3, 20):
+        successes = np.append(known, np.full(n_unknown, np.nan))
+        mixed = Evaluation(np.zeros(len(successes)), np.ones(len(successes)), successes)
+        alone = Evaluation(np.zeros(4), np.ones(4), known)
+        assert (mixed.success_rate, mixed.success_interval) == (alone.success_rate, alone.success_interval)
 
 
 def test_one_episode_has_no_interval_and_unknown_success_none_either():

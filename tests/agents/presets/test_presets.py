@@ -54,6 +54,13 @@ def test_a_preset_with_a_name_is_for_any_environment():
     assert find_preset("CartPole-v1", None, "Rainbow") == presets.named("Rainbow", "CartPole-v1")
 
 
+def test_a_preset_with_a_name_is_first_that_of_the_algorithm_and_then_that_of_the_environment():
+    names = [one for one in presets.ALL if one.name]
+    for one in names:
+        assert presets.named(one.name, one.env_id, one.algorithm) is one
+        assert {presets.named(one.name, other.env_id, one.algorithm).algorithm for other in names} == {one.algorithm}
+
+
 def test_sizes_are_presets_of_each_algorithm_with_a_name():
     widths = lambda found: found.hyperparameters["policy_kwargs"]["net_arch"]["qf"]  # noqa: E731
     found = {name: find_preset("Hopper-v5", name, "small") for name in ("FlashSAC", "XQC")}

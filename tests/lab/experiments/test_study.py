@@ -19,7 +19,6 @@ from rejeu.lab.experiments import process, search, study as studies, study_plan 
 from rejeu.lab.experiments.search import Search
 from rejeu.lab.experiments.study import StudyFolder
 from rejeu.lab.runs.config import RunConfig
-from rejeu.logs.tables import Table
 from tests.lab.experiments.fake_training import Pretended
 
 optuna = pytest.importorskip("optuna")
@@ -225,11 +224,6 @@ def test_difference_says_whether_zero_is_in_the_interval():
     value, low, high = search.difference([bad], [bad[::-1]], 0)
     assert low < 0 < high
     assert value == pytest.approx(0)
-
-
-def test_what_is_compared_at_the_end_is_the_last_evaluation_and_not_the_best():
-    table = Table({"step": np.arange(3.0), "mean_return": np.array([1.0, 5.0, 3.0])})
-    assert search.last_values([SimpleNamespace(evaluations=table)] * 2, "mean_return").tolist() == [3, 3]
 
 
 @pytest.mark.parametrize(

@@ -105,6 +105,8 @@ def test_the_best_evaluation_has_the_highest_success_rate_and_then_the_highest_r
     ]
     (folder / "evaluations.csv").write_text("\n".join([*rows, ""]), encoding="utf-8")
     assert best_row(read_run(folder).evaluations) == 2
+    (folder / "evaluations.csv").write_text("step,success_rate,mean_return\n10,0,1\n20,nan,9\n", encoding="utf-8")
+    assert best_row(read_run(folder).evaluations) == 0
     (folder / "evaluations.csv").write_text("step,mean_return\n10,1\n20,3\n30,2\n", encoding="utf-8")
     assert best_row(read_run(folder).evaluations) == 1
 
