@@ -8,6 +8,7 @@ import pytest
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
 from rejeu.envs.make import EnvPool, GymnasiumVector, InProcess, make_vector
+from rejeu.sb3.common.vec_env import DummyVecEnv, VecMonitor
 from tests.environments import Counter, Reach
 from tests.tiers import only
 
@@ -37,12 +38,14 @@ EVERY = {
     **{f"workers-{mode.name}": lambda mode=mode: workers(mode) for mode in AutoresetMode},
 }
 
+HERE = [name for name in EVERY if "workers" not in name]
+
 
 def no_action(vector):
     return np.zeros((vector.n_envs, *vector.action_space.shape), np.float32)
 
 
-every_vector = pytest.mark.parametrize("name", only([name for name in EVERY if "workers" not in name], EVERY))
+every_vector = pytest.mark.parametrize("name", only(HERE, EVERY))
 
 
 @every_vector
@@ -83,6 +86,25 @@ def test_environments_that_waited_can_begin_anew_while_others_go_on(name):
     np.testing.assert_array_equal(step.obs[:, 1], [1, 1, 5])
     np.testing.assert_array_equal(step.truncated, [False, False, True])
     vector.close()
+
+
+@pytest.mark.parametrize(
+    ("name", "begun"),
+    [*((name, begun) for name in HERE for begun in ("reset", [1, 1, 1], [1, 0, 1])), ("wrapped", "reset")],
+)
+def test_environments_that_waited_are_afterwards_like_any_other(name, begun):
+    """Each end of an episode is followed by the next episode, and by no second reset."""
+    vector = make_vector(VecMonitor(DummyVecEnv(counters()))) if name == "wrapped" else EVERY[name]()
+    vector.reset()
+    vector.step(no_action(vector), np.array([False, True, False]))
+    obs = vector.reset() if begun == "reset" else vector.reset_done(np.array(begun, bool))
+    episode, time = obs[:, :2].T.copy()
+    for _ in range(12):
+        np.testing.assert_array_equal(obs[:, :2], np.stack([episode, time], axis=1))
+        step = vector.step(no_action(vector))
+        done = np.array(LENGTHS) == time + 1
+        np.testing.assert_array_equal(step.truncated, done)
+        obs, episode, time = (vector.reset_done(done) if done.any() else step.obs), episode + done, (time + 1) * ~done
 
 
 @pytest.mark.parametrize("name", ["in-process", "synchronous-DISABLED"])

@@ -269,6 +269,28 @@ def numpy_relu(reader, x):
     return dense(reader.head, x)
 
 
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_the_memory_of_a_sequence_is_that_before_its_first_row_that_is_there(n_envs):
+    """A row's number is its time, and so is its memory. Those that are gone are shown as the oldest, and not counted."""
+    leaf = Leaf("", "continuous", (1,), "float32")
+    ring = Ring(12 * n_envs, n_envs, (leaf,), jax.tree.structure(0), (), np.int32, memory_size=1)
+    buffer, nobody = ReplayBuffer(ring, 0.9, sequence=(4, 3)), np.zeros(n_envs, bool)
+    for time in range(40):
+        row = np.full((n_envs, 1), time, np.float32)
+        if time in (0, 33):
+            buffer.begin(row)
+        else:
+            buffer.add(np.zeros(n_envs, np.int32), np.zeros(n_envs, np.float32), nobody, row)
+        ring.remember(row, nobody)
+    obs, (oldest, final, newest) = buffer.sample(np.random.default_rng(0), (400,)).obs, (28, 32, 39)
+    for row, (first,), n_absent, reads in zip(obs.obs[..., 0], obs.memory, obs.n_absent, obs.reads, strict=True):
+        times = first - n_absent + np.arange(len(row))
+        np.testing.assert_array_equal(row, np.clip(times, oldest, newest))
+        assert n_absent == np.sum(times < oldest)
+        assert not {final, newest} & {*row[reads].tolist()}  # from which no step was taken
+    assert {*obs.n_absent.tolist()} == {0, 1, 2, 3}
+
+
 def test_masks_go_with_the_rows_that_are_read():
     kinds = (Leaf("obs", "continuous", (1,), "float32"), Leaf("mask", "continuous", (3,), "bool"))
     ring = Ring(100, 2, kinds, jax.tree.structure(Masked(0, 0)), (), np.int32, memory_size=2)

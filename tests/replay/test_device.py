@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from types import SimpleNamespace
 from typing import Any
 
@@ -17,7 +18,7 @@ from rejeu.envs.functional.protocol import of_two_goals
 from rejeu.envs.functional.vector import goal_functions
 from rejeu.replay import device_priorities
 from rejeu.replay.device import DeviceReplay, download, uploaded
-from rejeu.replay.hindsight import HerReplayBuffer, HindsightConfig
+from rejeu.replay.hindsight import HerReplayBuffer, HindsightConfig, relabeled_positions
 from rejeu.replay.prioritized import Priorities, PriorityConfig
 from rejeu.replay.ring import Ring
 from rejeu.replay.uniform import ReplayBuffer
@@ -241,6 +242,14 @@ def test_rows_of_the_device_are_copied_to_the_host_with_their_counters(n: int) -
         since_start = np.minimum(expected.since_start[index], age)  # of an episode whose beginning was overwritten
         np.testing.assert_array_equal(ring.since_start[index], since_start)
         np.testing.assert_array_equal(ring.kind[index], expected.kind[index])
+
+
+def test_as_many_transitions_are_relabeled_as_on_the_host_for_any_size_of_a_batch() -> None:
+    """The first ``k / (k + 1)``, rounded down: of 3 at ``k = 1`` one."""
+    for n, k in itertools.product(range(1, 40), range(6)):
+        wanted = sum((k + 1) * i <= k * n for i in range(1, n + 1))
+        assert relabeled_positions((n,), k) == slice(wanted)
+        assert DeviceReplay(ROWS, N_ENVS, None, 0.9, n, n_sampled_goal=k).n_relabeled == wanted
 
 
 def test_whole_numbers_from_random_bits_equal_64_bit_arithmetic() -> None:
