@@ -228,7 +228,10 @@ def test_updates_are_counted_as_they_were_taken_where_the_divergence_stops_them(
 
 @pytest.mark.parametrize(
     ("n", "n_valid"),
-    only_tuples([(12, 7), (2**14 + 1, 2**14)], [(1, 1), (12, 1), (12, 7), (12, 12), (2**14, 9000), (2**14 + 1, 2**14)]),
+    only_tuples(
+        [(12, 7), (2**14 + 1, 2**14), (2**14 + 1, 0)],
+        [(1, 1), (12, 1), (12, 7), (12, 12), (2**14, 9000), (2**14 + 1, 2**14), (2**14 + 1, 0), (12, 0)],
+    ),
     ids=str,
 )
 def test_an_order_holds_every_step_once_the_valid_ones_first(n, n_valid):

@@ -207,8 +207,8 @@ def permuted(key: Array, n: int, n_first: Array, n_epochs: int) -> Array:
     the row the column: an unbalanced Feistel network, a bijection of the grid. A number that leaves the ``n_first`` is
     encrypted again until it is one of them (Black and Rogaway, 2002, "Ciphers with arbitrary finite domains").
     """
-    number, n_first = jnp.arange(n, dtype=jnp.uint32)[None], n_first.astype(jnp.uint32)
-    n_rows = jnp.ceil(jnp.sqrt(jnp.maximum(n_first, 1).astype(jnp.float32))).astype(jnp.uint32)
+    number, n_first = jnp.arange(n, dtype=jnp.uint32)[None], jnp.maximum(n_first, 1).astype(jnp.uint32)
+    n_rows = jnp.ceil(jnp.sqrt(n_first.astype(jnp.float32))).astype(jnp.uint32)
     sizes = n_rows, (n_first + n_rows - 1) // n_rows
     round_keys = jax.random.bits(key, (N_ROUNDS, n_epochs, 1), jnp.uint32)
 
