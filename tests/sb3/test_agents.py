@@ -6,6 +6,7 @@ import random
 from collections import deque
 
 import gymnasium as gym
+import jax
 import numpy as np
 import pytest
 
@@ -49,6 +50,13 @@ def test_the_environments_of_an_id_have_the_methods_of_the_original():
     assert env.env_method("get_wrapper_attr", "gravity") == [5.0]
     with pytest.raises(AttributeError, match="use set_env"):
         model.env = env
+
+
+@pytest.mark.skipif(jax.default_backend() == "gpu", reason="there is a GPU")
+def test_cuda_without_a_gpu_is_the_cpu():
+    model = A2C("MlpPolicy", Endless(), n_steps=8, device="cuda", **TINY)
+    assert (model.device, model.device.type) == ("cpu", "cpu")
+    assert model.learn(8).num_timesteps == 8
 
 
 def test_a_gymnasium_environment_gets_one_monitor():

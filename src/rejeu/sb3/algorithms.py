@@ -373,6 +373,12 @@ class Original(Agent):
         env = super().get_env()
         return env if env is None or not has_channels_last(env.observation_space) else VecTransposeImage(env)
 
+    def start_run(self, env: Any, state: Any = None) -> None:
+        """Starts a run; without a GPU on the CPU, whatever ``device`` is."""
+        if self.device == "gpu" and jax.default_backend() != "gpu":
+            self.device = "cpu"
+        super().start_run(env, state)  # type: ignore[safe-super]
+
     def make_buffer(self, env: Any) -> Any:
         """Returns a new buffer; one for ``VecNormalize`` stores what was not normalized, and scales what is drawn."""
         scales = self._asks_for_originals(env)
