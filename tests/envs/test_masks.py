@@ -122,6 +122,23 @@ def test_masks_that_workers_do_not_have_are_asked_for():
         vector.close()
 
 
+class Mistaken(Silent):
+    def action_masks(self):
+        return self.allowed_moves()
+
+
+def test_an_attribute_error_in_the_mask_of_an_environment_is_its_own():
+    with pytest.raises(AttributeError, match="no attribute 'allowed_moves'"):
+        make_masked(Mistaken()).reset()
+    vector = make_masked(make_vector(Mistaken, 1, "gymnasium-async"))
+    try:
+        with pytest.raises(BadEnvironmentError, match="does not return action masks") as caught:
+            vector.reset()
+        assert "no attribute 'allowed_moves'" in str(caught.value.__cause__)
+    finally:
+        vector.close()
+
+
 @exhaustive
 def test_a_lost_worker_with_masks_is_started_anew_where_that_is_asked_for():
     env = make_masked(Leaving, 2, "gymnasium-async", seed=0, worker_timeout=60.0, restart_workers=1)

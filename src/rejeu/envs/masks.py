@@ -78,10 +78,10 @@ class MaskInObservation(gym.Wrapper[Any, Any, Any, Any]):
     def _mask(self, info: dict[str, Any], over: bool) -> np.ndarray:
         if not isinstance(info, dict):  # reported by the vector, with the number of the environment
             return np.zeros(self._n, np.int8)
-        try:
-            given = info[MASK] if MASK in info else self.env.get_wrapper_attr(METHOD)()
-        except AttributeError:
-            raise BadEnvironmentError(f"{id_of(self.env)} {NO_MASKS}") from None
+        method = None if MASK in info else attribute(self.env, METHOD)
+        if MASK not in info and method is None:
+            raise BadEnvironmentError(f"{id_of(self.env)} {NO_MASKS}")
+        given = info[MASK] if method is None else method()  # an AttributeError in it is the environment's own
         return flat_mask(given, self.action_space, id_of(self.env), over)
 
 
@@ -174,8 +174,8 @@ class MaskedVector(VectorEnv):
         asked = [i for i in which.tolist() if MASK not in infos[i] and not ended[i]]
         try:
             called = self.inner.call(METHOD) if asked else []
-        except AttributeError:
-            raise BadEnvironmentError(f"{self.env_id} {NO_MASKS}") from None
+        except AttributeError as error:
+            raise BadEnvironmentError(f"{self.env_id} {NO_MASKS}") from error
         for i in which.tolist():
             given = called[i] if i in asked else infos[i].get(MASK)
             self._mask[i] = True if given is None else flat_mask(given, self.action_space, self.env_id, ended[i])

@@ -329,8 +329,11 @@ class InWorkers(VectorEnv):
 
     def call(self, name: str) -> list[Any]:
         said = self.workers.ask(dict.fromkeys(range(self.n_envs), ("call", process.call_method, name, (), {})))
-        if any(isinstance(answer, WorkerFailure) and answer.kind == "no attribute" for answer in said.values()):
-            raise AttributeError(name)
+        for answer in said.values():
+            if (
+                isinstance(answer, WorkerFailure) and answer.kind == "no attribute"
+            ):  # perhaps of something in the method
+                raise AttributeError(f"{name}:\n{answer.trace}")
         self._lost |= {i: answer for i, answer in self._heard(said, name).items() if isinstance(answer, Restarted)}
         return [None if i in self._lost else said[i] for i in range(self.n_envs)]
 
