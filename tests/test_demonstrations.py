@@ -448,6 +448,19 @@ def test_damaged_demonstrations_are_refused() -> None:
         clone(agent, "shown", 1)  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize("kind", ["terminations", "truncations"])
+def test_a_recorded_episode_that_goes_on_after_its_end_is_refused_by_its_name(kind: str, tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    pytest.importorskip("minari")
+    env = Target()
+    record(Expert(env), env, 2, tmp_path / "shown", seed=0)
+    (main,) = tmp_path.rglob("main_data.hdf5")
+    with h5py.File(main, "r+") as file:
+        file[f"episode_1/{kind}"][2] = True
+    with pytest.raises(ValueError, match=rf"episode_1 of .*shown has {kind} at step 2 of 5; an episode ends where one"):
+        read(tmp_path / "shown")
+
+
 def test_a_clone_that_diverges_leaves_the_agent_as_it_was() -> None:
     env, known = shown("Box", 1)
     agent = rejeu.PPO("MlpPolicy", env, **SMALL)

@@ -230,8 +230,8 @@ def test_progress_bar_says_what_the_time_went_into_lately(monkeypatch):
 
     console = Console(file=io.StringIO(), force_terminal=False, width=200)
     lines = shown(60, None, range(1, 61), console, spent).splitlines()
-    assert lines[0].endswith("env 100% · replay 0% · update 0% · rest 0%")
-    assert lines[-1].endswith("env 10% · replay 5% · update 75% · rest 10%")
+    assert lines[0].endswith("env 100% · buffer 0% · update 0% · rest 0%")
+    assert lines[-1].endswith("env 10% · buffer 5% · update 75% · rest 10%")
 
 
 def test_shares_of_time_are_rows_of_statistics_and_sum_to_one():

@@ -15,7 +15,7 @@ from rejeu.agents import device
 from rejeu.agents.base import BaseAgent, Best
 from rejeu.algorithms import config as configs
 from rejeu.algorithms.catalog import CATALOG
-from rejeu.callbacks.base import Callback, called, in_order, listed, listening, stateful
+from rejeu.callbacks.base import Callback, called, in_order, listed, listening, runs_last, stateful
 from rejeu.callbacks.progress_bar import ProgressBar
 from rejeu.core import schedules, xla
 from rejeu.core.interrupt import Interrupt
@@ -241,8 +241,10 @@ def session(
         stack.enter_context(listening(agent, callbacks))
 
         def record(turn: Progress) -> bool:
-            record_turn(agent, call, turn, outputs)
-            answers = [called(callback, agent, turn) for callback in callbacks]
+            record_turn(agent, call, turn)
+            answers = [called(callback, agent, turn) for callback in callbacks if not runs_last(callback)]
+            write_row(agent, call, turn, outputs)  # with what these callbacks have recorded
+            answers += [called(callback, agent, turn) for callback in callbacks if runs_last(callback)]
             agent.failed_writes.retry_if_due()
             over = call.is_over(turn.step, agent.run.episode)
             return over or any(isinstance(answer, bool | np.bool_) and not answer for answer in answers)
@@ -286,11 +288,17 @@ def marked_as_learning(agent: BaseAgent, outputs: Sequence[Sink]) -> Iterator[No
         agent.logger.outputs, agent.is_learning = loggers, False
 
 
-def record_turn(agent: BaseAgent, call: TrainingCall, turn: Progress, outputs: Sequence[Sink]) -> None:
-    """Adds what one turn of the loop did to the statistics, writes a row if one is due, and keeps the best weights."""
+def record_turn(agent: BaseAgent, call: TrainingCall, turn: Progress) -> None:
+    """Adds what one turn of the loop did to the statistics, and keeps the best weights."""
     agent.steps_per_second = (turn.step - call.first_step) / max(call.elapsed, 1e-9)
     for episode in turn.episodes:
         record_episode(agent, episode)
+    if ended := device.episodes_to_judge(agent, call, turn):
+        note_training_return(agent, ended)
+
+
+def write_row(agent: BaseAgent, call: TrainingCall, turn: Progress, outputs: Sequence[Sink]) -> None:
+    """Writes a row of statistics if one is due."""
     counted = turn.step // STEPS_OF_A_ROW if is_offline(agent) else len(agent.history)
     if counted - call.logged >= call.log_interval and outputs:
         call.logged = counted
@@ -298,8 +306,6 @@ def record_turn(agent: BaseAgent, call: TrainingCall, turn: Progress, outputs: S
         for output in outputs:
             output.write(agent.num_timesteps, row)
         hint_at_more_environments(agent)
-    if ended := device.episodes_to_judge(agent, call, turn):
-        note_training_return(agent, ended)
 
 
 def is_offline(agent: BaseAgent) -> bool:

@@ -86,7 +86,12 @@ def listed(callback: Callback | Iterable[Callback] | None) -> list[Callback]:
 
 def in_order(callbacks: Iterable[Callback]) -> list[Callback]:
     """Returns callbacks in the order in which they are called: those that run last after the others."""
-    return sorted(callbacks, key=lambda callback: isinstance(callback, TrainingCallback) and callback.runs_last)
+    return sorted(callbacks, key=runs_last)
+
+
+def runs_last(callback: Callback) -> bool:
+    """Returns whether a callback is called after the others, and after the row of statistics was written."""
+    return isinstance(callback, TrainingCallback) and callback.runs_last
 
 
 def stateful(callbacks: Iterable[Any]) -> list[Stateful]:

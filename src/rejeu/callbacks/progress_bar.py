@@ -28,6 +28,8 @@ RATE_SECONDS = 10.0
 """Interval over which steps per second and shares of time are measured."""
 
 
+NAMES = {"replay": "buffer"}
+"""How parts of the time are shown: PPO and A2C have a rollout buffer."""
 BAR_WIDTH = 40
 """Characters of the bar."""
 
@@ -44,8 +46,8 @@ class _Mark(NamedTuple):
 class ProgressBar(TrainingCallback):
     """Shows the progress of training: a bar on a terminal or in a notebook, elsewhere a line every ten seconds.
 
-    Below the bar, or at the end of the line, are the shares of time spent on the environment's steps and resets, the replay
-    buffer, the update (off-policy: the time the loop waited for the device) and everything else.
+    Below the bar, or at the end of the line, are the shares of time spent on the environment's steps and resets, the buffer of
+    experience, the update (off-policy: the time the loop waited for the device) and everything else.
     """
 
     def __init__(
@@ -200,12 +202,13 @@ def time_spent(before: Mapping[str, float], now: Mapping[str, float]) -> str:
     ...     {"env": 1.0, "replay": 0.5, "update": 3.0, "total": 5.0},
     ...     {"env": 2.2, "replay": 1.4, "update": 10.0, "total": 15.0},
     ... )
-    'env 12% · replay 9% · update 70% · rest 9%'
+    'env 12% · buffer 9% · update 70% · rest 9%'
     """
     passed = {activity: now[activity] - before[activity] for activity in now}
     if passed["total"] <= 0.0:
         return ""
-    return " · ".join(f"{activity} {max(share, 0.0):.0%}" for activity, share in time_shares(passed).items())
+    shares = time_shares(passed).items()
+    return " · ".join(f"{NAMES.get(activity, activity)} {max(share, 0.0):.0%}" for activity, share in shares)
 
 
 def duration(seconds: float) -> str:

@@ -57,6 +57,8 @@ class Episode:
     """Whether it ended in a terminal state; else it was truncated."""
     is_labeled: bool = False
     """Whether the actions are an expert's answers, and others were taken: rewards and next observations follow from those."""
+    name: str = "an episode"
+    """In the dataset, for messages."""
 
     def __len__(self) -> int:
         return len(self.rewards)
@@ -119,14 +121,26 @@ def read(path: str | Path) -> Demonstrations:
         names = ", ".join(str(one.parent.relative_to(path)) for one in found[:5])
         raise ValueError(f"{path} holds {len(found)} datasets ({names}); give the folder of one of them")
     rows, observation_space, action_space, spec = dataset.read(found[0])
+    for name, _, _, *series in rows:
+        check_end(path, name, *series)
     episodes = tuple(
-        Episode(obs, actions, np.asarray(rewards, np.float32), bool(terminations[-1]))
-        for obs, actions, rewards, terminations in rows
+        Episode(obs, actions, np.asarray(rewards, np.float32), bool(terminations[-1]), name=name)
+        for name, obs, actions, rewards, terminations, _ in rows
         if len(rewards) and len(terminations)
     )
     if not episodes:
         raise ValueError(f"{path} holds no step; play at least one episode")
     return Demonstrations(episodes, observation_space, action_space, spec)
+
+
+def check_end(path: Path, name: str, rewards: np.ndarray, terminations: np.ndarray, truncations: np.ndarray) -> None:
+    """Raises ``ValueError`` if an episode of a dataset goes on after a step that ended it."""
+    for kind, flags in (("terminations", terminations), ("truncations", truncations)):
+        if np.any(flags[:-1]):
+            raise ValueError(
+                f"{name} of {path} has {kind} at step {np.argmax(flags)} of {len(rewards)}; an episode ends where one is "
+                "true: record each episode by itself"
+            )
 
 
 def record(
@@ -461,15 +475,15 @@ def check(agent: Any, demonstrations: Demonstrations) -> None:
         if not all(
             np.isfinite(a).all() for a in jax.tree.leaves((episode.observations, episode.actions, episode.rewards))
         ):
-            raise ValueError("the demonstrations hold numbers that are NaN or infinite; record them again")
+            raise ValueError(f"{episode.name} has numbers that are NaN or infinite; record the demonstrations again")
         n, n_obs = len(episode), {len(leaf) for leaf in jax.tree.leaves(episode.observations)}
         if len(episode.actions) != n or n_obs != {n + 1}:
             raise ValueError(
-                f"an episode has {n} rewards, {len(episode.actions)} actions and {n_obs} observations; it must have as many "
-                "actions as rewards, and one observation more"
+                f"{episode.name} has {n} rewards, {len(episode.actions)} actions and {', '.join(map(str, sorted(n_obs)))} "
+                "observations; it must have as many actions as rewards, and one observation more"
             )
         if not isinstance(space, gym.spaces.Box):  # actions beyond the bounds of a Box are what an expert wanted
-            spaces.check_env_actions(space, np.asarray(episode.actions), "a demonstration")
+            spaces.check_env_actions(space, np.asarray(episode.actions), episode.name)
 
 
 def arrays_of(agent: Any, episode: Episode) -> tuple[PyTree, np.ndarray]:

@@ -27,6 +27,7 @@ from rejeu.core.records import WRONG, brief, shown
 METADATA, MAIN = "metadata.json", "main_data.hdf5"
 EPISODE = re.compile(r"episode_(\d{1,9})")
 SPACES = ("observation_space", "action_space")
+SERIES = ("rewards", "terminations", "truncations")
 MOST_METADATA = 16 * 2**20
 """Upper limit on the bytes of the metadata; the bounds of images are written as numbers."""
 SLACK, ROOM, PACKED, IMAGES = 2**20, 16, 32, 256
@@ -73,7 +74,9 @@ class ArrayReader:
 
 
 def read(data: Path) -> tuple[list[tuple[Any, ...]], gym.Space, gym.Space, EnvSpec | None]:
-    """Returns the episodes of a dataset as (observations, actions, rewards, terminations), its two spaces and its spec.
+    """Returns the episodes of a dataset, its two spaces and its spec.
+
+    An episode is its name, observations, actions, rewards, terminations and truncations.
 
     Warns if the metadata cannot be read and those in the episodes' file are used.
 
@@ -90,13 +93,13 @@ def read(data: Path) -> tuple[list[tuple[Any, ...]], gym.Space, gym.Space, EnvSp
             raise ValueError(f"it is in the format {shown(form)}, and only hdf5 is read")
         most = max(spaces.MAX_NUMBERS, rows.left)
         both = [spaces.rebuild(described(json.loads(metadata[name])), most) for name in SPACES]
-        keys = dict(zip(("observations", "actions", "rewards", "terminations"), (*both, None, None), strict=True))
+        keys = dict(zip(("observations", "actions", *SERIES), (*both, None, None, None), strict=True))
         found: dict[int, tuple[Any, ...]] = {}
         for path in files:
             with h5py.File(path, "r") as file:
                 for name in file:
                     if (match := EPISODE.fullmatch(name)) and (i := int(match[1])) not in found:
-                        found[i] = tuple(rows.part(file, f"{name}/{key}", space) for key, space in keys.items())
+                        found[i] = name, *(rows.part(file, f"{name}/{key}", space) for key, space in keys.items())
         return [found[i] for i in sorted(found)], both[0], both[1], spec_of(metadata.get("env_spec"))
     except (*WRONG, OSError, RuntimeError) as error:
         problem = f"{atomic.shortened(data)} is damaged or of another kind ({brief(error)})"
@@ -175,7 +178,7 @@ def episode(i: int, steps: list[tuple[Any, ...]], seed: int | None, metadata: Ma
         group.attrs.update({"id": i, "total_steps": len(steps) - 1, **({} if seed is None else {"seed": seed})})
         obs, *others = zip(*steps[1:], strict=True)
         put(group, "observations", [steps[0][0], *obs])
-        for name, column in zip(("actions", "rewards", "terminations", "truncations"), others, strict=True):
+        for name, column in zip(("actions", *SERIES), others, strict=True):
             put(group, name, column)
     return content.getvalue()
 
