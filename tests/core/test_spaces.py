@@ -68,6 +68,73 @@ def test_only_what_has_64_bits_is_narrowed(dtype, kept):
     assert spaces.narrow(np.dtype(dtype)) == kept
 
 
+@pytest.mark.parametrize(
+    ("space", "stored"),
+    [
+        (gym_spaces.Box(0, 2**31 - 1, (1,), np.int64), "int32"),
+        (gym_spaces.Box(0, 2**31, (1,), np.int64), "float32"),
+        (gym_spaces.Box(-(2**31), 0, (1,), np.int64), "int32"),
+        (gym_spaces.Box(0, 2**32 - 1, (1,), np.uint64), "uint32"),
+        (gym_spaces.Box(0, 2**64 - 1, (1,), np.uint64), "float32"),
+    ],
+)
+def test_integers_whose_bounds_need_64_bits_are_stored_as_floats(space, stored):
+    (leaf,) = leaves = spaces.leaves(space)
+    assert leaf.dtype == stored
+    np.testing.assert_array_equal(spaces.cast(space, leaves, space.high[None])[0], space.high.astype(stored))
+    again = spaces.rebuild(json.loads(json.dumps(spaces.describe(space))))
+    assert spaces.leaves(again) == leaves
+    assert (again.low == space.low).all()
+    assert (again.high == space.high).all()
+
+
+@pytest.mark.parametrize(
+    "space", [gym_spaces.Discrete(3, start=2**31 - 2), gym_spaces.MultiDiscrete([2, 3], start=[0, -(2**31) - 1])]
+)
+def test_choices_with_numbers_beyond_32_bits_are_refused(space):
+    with pytest.raises(TypeError, match="numbers beyond 32 bits; let it start at 0"):
+        spaces.leaves(space)
+    with pytest.raises(TypeError, match="numbers beyond 32 bits"):
+        spaces.action_scaler(space, jax.numpy)
+
+
+IMAGE = gym_spaces.Box(0, 255, (4, 4, 3), np.uint8)
+PAIR = gym_spaces.Dict({"image": IMAGE, "choice": gym_spaces.Discrete(3)})
+
+
+@pytest.mark.parametrize(
+    ("space", "observation", "fault"),
+    [
+        (IMAGE, np.full((4, 4, 3), 0.5), "has the dtype float64, and uint8 cannot .* multiply by 255"),
+        (IMAGE, np.full((2, 4, 4, 3), 256), "has the dtype int64, and uint8 cannot"),
+        (gym_spaces.Discrete(3), 7, "has the number 7, expected 0 to 2"),
+        (gym_spaces.Discrete(3, start=-1), [0, -2], "has the number -2, expected -1 to 1"),
+        (gym_spaces.Discrete(3), 1.5, "has the dtype float64, and int32 cannot"),
+        (gym_spaces.MultiDiscrete([2, 3]), [0, 3], "has the number 3"),
+        (gym_spaces.MultiBinary(2), [0, 2], "has the number 2, expected 0 to 1"),
+        (BOX, [np.nan, 0.0], "NaN or infinite"),
+        (BOX, [[1e300, 0.0]], "NaN or infinite"),
+        (BOX, ["0", "1"], "has the structure list, expected Box.*something else than numbers"),
+        (gym_spaces.Box(0, 9, (1,), np.int64), np.array([2**40]), "has the dtype int64, and int32 cannot"),
+        (PAIR, {"image": np.zeros((4, 4, 3)), "choice": 3}, "of 'choice' has the number 3"),
+    ],
+)
+def test_observations_that_training_would_refuse_are_refused(space, observation, fault):
+    with pytest.raises(ValueError, match=fault):
+        spaces.as_batch(observation, space, spaces.leaves(space))
+
+
+def test_observations_of_other_dtypes_with_the_same_numbers_are_taken():
+    for given in (
+        {"image": np.full((4, 4, 3), 7.0), "choice": np.float32(2)},
+        {"image": [[[7] * 3] * 4] * 4, "choice": 2},
+    ):
+        batch, single = spaces.as_batch(given, PAIR, spaces.leaves(PAIR))
+        assert single
+        assert batch["choice"].tolist() == [2]
+        np.testing.assert_array_equal(batch["image"], np.full((1, 4, 4, 3), 7, np.uint8))
+
+
 def test_features_count_one_hot_places():
     features = {leaf.path: (leaf.kind, leaf.n_features) for leaf in spaces.leaves(NESTED)}
     assert features == {

@@ -134,3 +134,32 @@ class Picky(Sampled):
 @pytest.mark.parametrize("space", [gym.spaces.Discrete(4), gym.spaces.MultiDiscrete([2, 4]), gym.spaces.MultiBinary(4)])
 def test_actions_are_checked_that_the_mask_allows(space, in_info):
     assert not [one for one in findings(Picky(space, in_info)) if "allowed" in one.text or one.level == "error"]
+
+
+class Clock(Tidy):
+    """Shows the time in milliseconds since 1970, which a step moves by ``pace``."""
+
+    def __init__(self, dtype, pace):
+        super().__init__()
+        self.pace, self.observation_space = pace, gym.spaces.Dict(now=gym.spaces.Box(0, 2**45, (2,), dtype))
+
+    def seen(self, obs):
+        now = 1_700_000_000_000 + int(obs[0]) * self.pace
+        return {"now": np.array([0, now], self.observation_space["now"].dtype)}
+
+    def reset(self, **kwargs):
+        obs, info = super().reset(**kwargs)
+        return self.seen(obs), info
+
+    def step(self, action):
+        obs, *others = super().step(action)
+        return self.seen(obs), *others
+
+
+@pytest.mark.parametrize("dtype", [np.int64, np.uint64, np.float64])
+def test_steps_that_float32_does_not_show_are_told(dtype):
+    """Near 1.7e12 float32 holds the multiples of 131,072."""
+    lost = [one for one in findings(Clock(dtype, 1000)) if "float32, which holds both" in one.text]
+    assert [one.level for one in lost] == ["warning"]
+    assert "under 'now' went from 1700000001000 to 1700000002000 at index 1" in lost[0].text.replace(".0 ", " ")
+    assert not [one for one in findings(Clock(dtype, 2**18)) if "holds both" in one.text]

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import rejeu
+from rejeu.core.errors import BadEnvironmentError
 from rejeu.envs import checker
 from rejeu.envs.goals import goal_functions, over_batches, parking_reward
 from rejeu.envs.make import GymnasiumVector, InProcess, make_vector
@@ -96,6 +97,15 @@ def test_a_function_that_mixes_rows_is_called_by_row():
     achieved, desired = goals(6)
     given = over_batches(mixing, np.float32)(achieved, desired)
     np.testing.assert_allclose(given, (achieved - desired).sum(axis=1), rtol=1e-5)
+
+
+def test_an_exception_of_a_function_of_goals_says_which_goals_it_was_given():
+    batched = over_batches(lambda achieved, desired, info: -abs(achieved[:, 0] - desired[:, 0]), np.float32)
+    with pytest.raises(
+        BadEnvironmentError, match=r"raised IndexError of goals of the shape \(2,\): too many"
+    ) as caught:
+        batched(*goals(20))
+    assert isinstance(caught.value.__cause__, IndexError)
 
 
 def test_a_single_row_does_not_decide():

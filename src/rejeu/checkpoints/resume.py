@@ -28,7 +28,6 @@ from rejeu.envs.make import BACKENDS, Backend, VectorEnv
 from rejeu.replay import ring_io
 from rejeu.replay.prioritized import Draw, Priorities
 from rejeu.replay.rollout import RolloutBuffer
-from rejeu.training.checks import is_finite
 from rejeu.training.learner import Readings
 from rejeu.training.run import Run, TrainingCall
 
@@ -338,7 +337,7 @@ def like(expected: PyTree, given: list[np.ndarray], name: str) -> PyTree:
         ValueError: if shapes or dtypes differ, or a number is not finite.
     """
     parts = jax.tree.leaves(expected)
-    if not all(is_finite(part) for part in given):
+    if not all(spaces.is_finite(part) for part in given):
         raise ValueError(f"{name} is not finite")
     return jax.tree.unflatten(
         jax.tree.structure(expected),

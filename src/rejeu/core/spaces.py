@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,6 +23,8 @@ MAX_LEAVES = 1024
 """Upper limit on the parts of a Dict or Tuple in a file."""
 UNBOUNDED = 1e10
 """Actions with a bound of at least this size, such as the largest float32, count as unbounded."""
+VDOT_SIZE = 2**13
+"""Number of elements up to which an array is checked by its square; beyond it BLAS would use its threads."""
 INVALID = (ArithmeticError, AssertionError, AttributeError, LookupError, RecursionError, TypeError, ValueError)
 """Exceptions that an invalid description of a space can cause."""
 
@@ -37,7 +40,7 @@ class Leaf:
     shape: tuple[int, ...]
     """Of one observation, without the batch axis."""
     dtype: str
-    """As stored and passed to the network: 64-bit numbers become 32-bit."""
+    """As stored and passed to the network, of 32 bits at most; see :func:`stored_dtype`."""
     sizes: tuple[int, ...] = ()
     """For ``categorical``: number of values of each component."""
     starts: tuple[int, ...] = ()
@@ -72,7 +75,8 @@ def leaves(space: spaces.Space, path: str = "") -> tuple[Leaf, ...]:
         return tuple(leaf for i, part in enumerate(space.spaces) for leaf in leaves(part, f"{path}.{i}".lstrip(".")))
     if isinstance(space, spaces.Box):
         is_image = space.dtype == np.uint8 and len(space.shape) in (3, 4)
-        return (Leaf(path, "image" if is_image else "continuous", space.shape, narrow(space.dtype)),)
+        return (Leaf(path, "image" if is_image else "continuous", space.shape, stored_dtype(space)),)
+    check_32_bits(space)
     if isinstance(space, spaces.Discrete):
         return (Leaf(path, "categorical", (), "int32", (int(space.n),), (int(space.start),)),)
     if isinstance(space, spaces.MultiDiscrete):
@@ -125,10 +129,86 @@ def flat_keys(tree_structure: Any) -> list[str] | None:
 
 
 def narrow(dtype: Any) -> str:
-    """Returns the name of the dtype in which values are stored: 64-bit floats and integers become 32-bit."""
+    """Returns the name of a dtype of 32 bits at most: 64-bit floats and integers become 32-bit."""
     return {"float64": "float32", "int64": "int32", "uint64": "uint32", "bool": "int8"}.get(
         np.dtype(dtype).name, np.dtype(dtype).name
     )
+
+
+def stored_dtype(space: spaces.Box) -> str:
+    """Returns the name of the dtype in which numbers of a Box are stored: ``float32`` if its bounds need integers of 64 bits.
+
+    >>> stored_dtype(spaces.Box(0, 255, (1,), np.int64)), stored_dtype(spaces.Box(0, 2**45, (1,), np.int64))
+    ('int32', 'float32')
+    """
+    name = narrow(space.dtype)
+    if name == space.dtype.name or name[0] not in "iu":
+        return name
+    limits = np.iinfo(name)
+    return name if (space.low >= limits.min).all() and (space.high <= limits.max).all() else "float32"
+
+
+def check_32_bits(space: spaces.Space) -> None:
+    """Raises ``TypeError`` for choices with numbers that integers of 32 bits cannot hold."""
+    if isinstance(space, spaces.Discrete | spaces.MultiDiscrete):
+        last = space.start + (space.n if isinstance(space, spaces.Discrete) else space.nvec) - 1
+        if np.min(space.start) < np.iinfo(np.int32).min or np.max(last) > np.iinfo(np.int32).max:
+            raise TypeError(
+                f"{space} has numbers beyond 32 bits; let it start at 0, and subtract its start in a wrapper"
+            )
+
+
+@functools.cache
+def limits(leaf: Leaf) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the smallest and the largest numbers of choices or bits."""
+    if leaf.kind == "binary":
+        return np.zeros(leaf.shape, int), np.ones(leaf.shape, int)
+    low = np.reshape(leaf.starts, leaf.shape)
+    return low, low + np.reshape(leaf.sizes, leaf.shape) - 1
+
+
+def keeps_values(array: np.ndarray, dtype: Any) -> bool:
+    """Returns whether casting to ``dtype`` keeps the values, except for the precision of floats."""
+    if array.dtype.kind not in "fiub":
+        return False
+    if np.dtype(dtype).kind == "f" or np.can_cast(array.dtype, dtype):
+        return True
+    with np.errstate(invalid="ignore", over="ignore"):
+        return bool((array.astype(dtype) == array).all())
+
+
+def as_stored(value: Any, leaf: Leaf) -> np.ndarray:
+    """Returns one or many values of a leaf as an array of its dtype; copies only if needed.
+
+    Raises:
+        ValueError: if that dtype cannot hold them, or if they are none of the choices.
+    """
+    array, is_choice = np.asarray(value), leaf.kind in ("categorical", "binary")
+    if (
+        array.dtype != leaf.dtype
+        and not (is_choice and array.dtype.kind in "iub")
+        and not keeps_values(array, leaf.dtype)
+    ):
+        fix = "; multiply by 255 first if the numbers lie in [0, 1]" if leaf.kind == "image" else ""
+        raise ValueError(f"the dtype {array.dtype}, and {leaf.dtype} cannot hold the numbers{fix}")
+    is_one = array.ndim == 0 and leaf.kind == "categorical"
+    if is_choice and not (is_one and 0 <= array.item() - leaf.starts[0] < leaf.sizes[0]):  # ten times as fast as NumPy
+        low, high = limits(leaf)
+        if (outside := (array < low) | (array > high)).any():
+            raise ValueError(f"the number {array[outside].flat[0]}, expected {low.min()} to {high.max()}")
+    if array.dtype != leaf.dtype:
+        with np.errstate(over="ignore"):  # infinite numbers are told as such
+            array = array.astype(leaf.dtype)
+    return array
+
+
+def is_finite(array: np.ndarray) -> bool:
+    """Returns whether all numbers are finite. For small arrays the square is the fastest check."""
+    if array.dtype.kind != "f":
+        return True
+    if array.size <= VDOT_SIZE and math.isfinite(np.vdot(array, array)):
+        return True
+    return bool(np.isfinite(array).all())
 
 
 def parts(space: spaces.Space, observation: Any) -> list[Any]:
@@ -162,11 +242,15 @@ def plain(space: spaces.Space, observation: Any) -> Any:
 
 
 def cast(space: spaces.Space, space_leaves: tuple[Leaf, ...], observation: Any) -> Any:
-    """Returns a batch of observations as plain dicts and tuples of arrays of the stored dtypes; copies only if needed."""
+    """Returns a batch of observations as plain dicts and tuples of arrays of the stored dtypes; copies only if needed.
+
+    Raises:
+        ValueError: if these cannot hold them; see :func:`as_stored`.
+    """
     import jax
 
     arrays, tree = jax.tree.flatten(plain(space, observation))
-    return jax.tree.unflatten(tree, [np.asarray(a, leaf.dtype) for a, leaf in zip(arrays, space_leaves, strict=True)])
+    return jax.tree.unflatten(tree, [as_stored(a, leaf) for a, leaf in zip(arrays, space_leaves, strict=True)])
 
 
 def check_policy(policy: str, space: spaces.Space, normalize_images: bool = True) -> None:
@@ -359,7 +443,9 @@ def action_scaler(space: spaces.Space, xp: Any = np) -> Callable[[Any], Any]:
         return lambda action: nested_action(space, action, lambda part, numbers: scale_action(part, numbers, xp))
     shape, dtype = (-1, *(space.shape or ())), space.dtype if xp is np else narrow(space.dtype)
     if isinstance(space, spaces.Box):
-        return box_scaler(space, shape, dtype, xp)
+        return box_scaler(space, shape, dtype if xp is np else stored_dtype(space), xp)
+    if xp is not np:
+        check_32_bits(space)
     if isinstance(space, spaces.Discrete):
         first = int(space.start)
         return lambda action: action.astype(dtype) + first
@@ -481,17 +567,11 @@ def describe(space: spaces.Space, single: bool = False) -> Any:
     if isinstance(space, spaces.Tuple):
         return {"Tuple": [describe(part, single) for part in space.spaces]}
     if isinstance(space, spaces.Box):
-        is_float = space.dtype.kind == "f"
-        dtype = np.dtype(np.float32 if is_float and single else space.dtype)
+        dtype = space.dtype
+        if single if dtype.kind == "f" else stored_dtype(space) != "float32":
+            dtype = np.dtype(stored_dtype(space))
         low, high = (_bounds(bound, dtype) for bound in (space.low, space.high))
-        return {
-            "Box": {
-                "low": low,
-                "high": high,
-                "shape": list(space.shape),
-                "dtype": dtype.name if is_float else narrow(dtype),
-            }
-        }
+        return {"Box": {"low": low, "high": high, "shape": list(space.shape), "dtype": dtype.name}}
     if isinstance(space, spaces.Discrete):
         return {"Discrete": {"n": int(space.n), "start": int(space.start)}}
     if isinstance(space, spaces.MultiDiscrete):
@@ -546,11 +626,15 @@ def rebuild(description: Any, largest: int = MAX_NUMBERS) -> spaces.Space:
 
 
 def _bound(value: Any, dtype: np.dtype) -> np.ndarray:
-    """Returns a bound of a Box; 64-bit integers that became 32-bit ones are clipped."""
+    """Returns a bound of a Box; of integers the nearest one of the dtype."""
     bound = np.asarray(value, np.float64)
-    if dtype.kind != "f":
-        bound = bound.clip(np.iinfo(dtype).min, np.iinfo(dtype).max)
-    return bound.astype(dtype)
+    if dtype.kind == "f":
+        return bound.astype(dtype)
+    limits = np.iinfo(dtype)
+    nearest = [
+        min(max(int(one), limits.min), limits.max) for one in bound.ravel()
+    ]  # floats may round beyond the largest
+    return np.array(nearest, dtype).reshape(bound.shape)
 
 
 def _bounds(bounds: np.ndarray, dtype: Any) -> Any:
@@ -579,25 +663,33 @@ def batch_arrays(observation: Any, space: spaces.Space, leaves: Sequence[Leaf]) 
         leaves: of ``space``.
 
     Raises:
-        ValueError: if structure or shapes do not match, or the parts are batches of different sizes.
+        ValueError: if structure or shapes do not match, the parts are batches of different sizes, or numbers are not finite
+            or cannot be what the space declares.
     """
     try:
-        found = parts(space, observation)
-        arrays = [np.asarray(one, leaf.dtype) for one, leaf in zip(found, leaves, strict=True)]
+        arrays = [np.asarray(one) for one in parts(space, observation)]
+        if not {array.dtype.kind for array in arrays} <= {*"biuf"}:
+            raise TypeError("there is something else than numbers")
+        single = arrays[0].ndim == len(leaves[0].shape)
     except (KeyError, IndexError, TypeError, ValueError) as error:
         raise ValueError(
             f"the observation has the structure {described(observation)}, expected {space}, or a batch of it: "
             f"{' '.join(str(error).split())[:200]}"
         ) from None
-    single = arrays[0].ndim == len(leaves[0].shape)
     if not single and len({array.shape[:1] for array in arrays}) > 1:
         raise ValueError(
             f"the parts of the observations are batches of {[a.shape[:1] for a in arrays]}, not of one size"
         )
-    for array, leaf in zip(arrays, leaves, strict=True):
-        if (array.shape if single else array.shape[1:]) != leaf.shape:
-            where = f" of {leaf.path!r}" if leaf.path else ""
-            raise ValueError(f"the observation{where} has shape {array.shape}, expected {leaf.shape}, or a batch of it")
+    for i, leaf in enumerate(leaves):
+        array = arrays[i]
+        try:
+            if (array.shape if single else array.shape[1:]) != leaf.shape:
+                raise ValueError(f"shape {array.shape}, expected {leaf.shape}, or a batch of it")
+            arrays[i] = as_stored(array, leaf)
+            if not is_finite(arrays[i]):
+                raise ValueError("numbers that are NaN or infinite, expected finite numbers")
+        except ValueError as error:
+            raise ValueError(f"the observation{f' of {leaf.path!r}' if leaf.path else ''} has {error}") from None
     return [array[None] if single else array for array in arrays], single
 
 

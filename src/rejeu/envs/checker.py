@@ -194,6 +194,9 @@ def _play(env: gym.Env, found: dict[str, Finding], effort: Effort) -> list[SeenS
             return None
         obs, reward, terminated, truncated, info = validation.convert_step(answer)
         kept = jax.tree.map(np.array, plain(space, obs))
+        is_next = effort.is_patient and length > 0
+        if is_next and (lost := validation.lost_change(space, seen[-1].obs, kept)) is not None:
+            found.setdefault("resolution", Finding("warning", lost))
         seen.append(SeenStep(kept, reward, terminated, truncated, copy.deepcopy(info)))
         length += 1
         if terminated or truncated:
@@ -437,4 +440,4 @@ def advice_on_observations(space: spaces.Space, path: str = "", dtypes: bool = T
     elif len(space.shape) > 1:
         yield f"the observation{where} has the shape {space.shape}; arrays of two axes are flattened"
     elif dtypes and space.dtype != np.float32 and space.dtype != np.uint8:
-        yield f"the observation{where} has the dtype {space.dtype}; use float32, which it is turned into"
+        yield f"the observation{where} has the dtype {space.dtype}; use float32, which networks compute with"

@@ -61,11 +61,16 @@ def attribute(env: Any, name: str) -> Any:
     return None if getattr(found, "__isabstractmethod__", False) else found
 
 
-def info_fault(name: str, error: KeyError) -> BadEnvironmentError:
-    """Returns what to raise where a function of goals reads a key of the info that is not there."""
+def goal_fault(name: str, error: Exception, goal: np.ndarray) -> BadEnvironmentError:
+    """Returns what to raise where a function of goals raises an error of one goal."""
+    if isinstance(error, KeyError):
+        return BadEnvironmentError(
+            f"{name} found no key {error}: the info is empty in hindsight replay; let it depend on the goals alone, or "
+            "keep infos with replay_buffer_kwargs={'copy_info_dict': True}"
+        )
     return BadEnvironmentError(
-        f"{name} found no key {error}: the info is empty in hindsight replay; let it depend on the goals alone, or "
-        "keep infos with replay_buffer_kwargs={'copy_info_dict': True}"
+        f"{name} raised {type(error).__name__} of goals of the shape {goal.shape}: {error}; it must take two goals of one "
+        "step, and may take many at once: compute over the last axis"
     )
 
 
@@ -86,8 +91,8 @@ def over_batches(function: Callable[..., Any], dtype: Any) -> Callable[..., np.n
         each = [{}] * len(achieved) if infos is None else infos
         try:
             rows = [function(a, d, info) for a, d, info in zip(achieved, desired, each, strict=True)]
-        except KeyError as error:
-            raise info_fault(name, error) from error
+        except Exception as error:  # a function that takes batches only can raise anything of one goal
+            raise goal_fault(name, error, achieved[0]) from error
         if not set(map(type, rows)) <= NUMBERS:  # of any other kind, each is looked at, which takes far longer
             rows = [one_number(row) for row in rows]
             wrong = [row for row in rows if row is None or np.shape(row) != ()]

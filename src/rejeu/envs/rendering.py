@@ -16,7 +16,8 @@ import gymnasium as gym
 import numpy as np
 
 from rejeu.core import hardware
-from rejeu.envs.validation import describe_value, keeps_values
+from rejeu.core.spaces import keeps_values
+from rejeu.envs.validation import describe_value
 
 DEFAULT_FPS = 30.0
 """Frames per second of environments that declare none."""

@@ -21,7 +21,7 @@ import numpy as np
 from gymnasium import spaces
 
 from rejeu.core.errors import BadEnvironmentError
-from rejeu.core.spaces import Leaf, cast, leaves, parts
+from rejeu.core.spaces import Leaf, as_stored, cast, keeps_values, leaves, limits, parts
 
 FLAGS = frozenset((bool, np.bool_))
 """Types of ``terminated`` and ``truncated``."""
@@ -32,33 +32,23 @@ LARGEST = float(np.finfo(np.float32).max)
 STEP_VALUES = "(obs, reward, terminated, truncated, info)"
 FAR = 10.0
 """Warn if an observation is outside its bounds by more than this multiple of their distance."""
+LEAST_CHANGE = 1e-4
+"""Smallest change of a number in a step that must not be lost."""
 TERMINATED_AND_TRUNCATED = (
     "terminated says that the task itself ended, truncated that a time limit cut the episode off; return both as bools"
 )
 
 
-def keeps_values(array: np.ndarray, dtype: Any) -> bool:
-    """Returns whether casting to ``dtype`` keeps the values, except for precision."""
-    if array.dtype.kind not in "fiub":
-        return False
-    if np.can_cast(array.dtype, dtype, "same_kind"):
-        return True
-    with np.errstate(invalid="ignore", over="ignore"):
-        return bool((array.astype(dtype) == array).all())
-
-
-def to_array(value: Any, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
-    """Returns an array of that shape whose values can be cast to that dtype.
+def to_array(value: Any, leaf: Leaf) -> np.ndarray:
+    """Returns one value of a leaf as an array of its shape and dtype.
 
     Raises:
-        ValueError: if the shape differs, or if an integer dtype cannot hold the values.
+        ValueError: if the shape differs, or for values of :func:`rejeu.core.spaces.as_stored`.
     """
     array = np.asarray(value)
-    if array.shape != shape:
+    if array.shape != leaf.shape:
         raise ValueError(f"shape {array.shape}")
-    if not keeps_values(array, dtype):
-        raise ValueError(f"dtype {array.dtype}")
-    return array
+    return as_stored(array, leaf)
 
 
 def convert_step(answer: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -113,24 +103,29 @@ def make_writer(space: spaces.Space, stores: Sequence[np.ndarray]) -> Callable[[
     observation; :func:`observation_fault` then describes what is wrong.
     """
     slots = [
-        (store, leaf.shape, math.prod(leaf.shape), part.dtype, np.ndarray)
+        (store, leaf, math.prod(leaf.shape), part.dtype if is_free(leaf, part) else None, np.ndarray)
         for store, leaf, part in zip(stores, leaves(space), parts(space, space), strict=True)
     ]
-    store, shape, size, dtype, array = slots[0]
+    store, leaf, size, dtype, array = slots[0]
 
     def put_array(i: int, obs: Any) -> None:
         # As many numbers as are expected can only be broadcast from shapes with leading ones, which is harmless.
         if type(obs) is not array or obs.size != size or obs.dtype is not dtype:
-            obs = to_array(obs, shape, store.dtype)
+            obs = to_array(obs, leaf)
         store[i] = obs
 
     def put_parts(i: int, obs: Any) -> None:
-        for (store, shape, size, dtype, array), part in zip(slots, parts(space, obs), strict=True):
+        for (store, leaf, size, dtype, array), part in zip(slots, parts(space, obs), strict=True):
             if type(part) is not array or part.size != size or part.dtype is not dtype:
-                part = to_array(part, shape, store.dtype)
+                part = to_array(part, leaf)
             store[i] = part
 
     return put_parts if isinstance(space, spaces.Dict | spaces.Tuple) else put_array
+
+
+def is_free(leaf: Leaf, space: spaces.Space) -> bool:
+    """Returns whether a leaf holds every value of the space's dtype, which then needs no look."""
+    return isinstance(space, spaces.Box) and (leaf.dtype[0] == "f" or np.can_cast(space.dtype, leaf.dtype))
 
 
 def called_reset(env: gym.Env, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
@@ -426,10 +421,13 @@ def _array_fault(space: spaces.Space, obs: Any, what: str, strict: bool) -> str 
         with np.errstate(invalid="ignore", over="ignore"):
             at = tuple(np.argwhere(array.astype(leaf.dtype) != array)[0].tolist())
         fix = "multiply by 255 first if the numbers lie in [0, 1], or " if leaf.kind == "image" else ""
-        return (
-            f"{what} of dtype {array.dtype}, expected {space.dtype}, which cannot hold {array[at]}{_place(at)}; {fix}"
-            f"declare Box(..., dtype=np.{'float32' if array.dtype.kind == 'f' else array.dtype})"
-        )
+        fix += f"declare Box(..., dtype=np.{'float32' if array.dtype.kind == 'f' else array.dtype})"
+        if array.dtype == space.dtype:
+            fix = "declare the bounds that it really has"
+        held = f"{what} of dtype {array.dtype}, expected {leaf.dtype if array.dtype == space.dtype else space.dtype}"
+        return f"{held}, which cannot hold {array[at]}{_place(at)}; {fix}"
+    if not strict and leaf.kind in ("categorical", "binary") and (outside := bounds_fault(space, obs)) is not None:
+        return outside[1].replace(leaf_name(""), what, 1)
     if strict and isinstance(space, spaces.Box) and array.dtype != space.dtype:
         return f"{what} of dtype {array.dtype}, expected {space.dtype}; return it with .astype(np.{space.dtype})"
     if strict and not isinstance(space, spaces.Discrete) and not isinstance(obs, np.ndarray | np.generic):
@@ -457,11 +455,8 @@ def bounds_fault(space: spaces.Space, obs: Any) -> tuple[Literal["error", "warni
         array = np.asarray(value)
         if isinstance(part, spaces.Box):
             low, high = part.low, part.high
-        elif leaf.kind == "categorical":
-            low = np.reshape(leaf.starts, leaf.shape)
-            high = low + np.reshape(leaf.sizes, leaf.shape) - 1
         else:
-            low, high = np.zeros(leaf.shape, int), np.ones(leaf.shape, int)
+            low, high = limits(leaf)
         outside = np.argwhere((array < low) | (array > high))
         if len(outside):
             at = tuple(outside[0].tolist())
@@ -493,6 +488,26 @@ def far_outside(space: spaces.Space, obs: Any) -> str | None:
                 f"{leaf_name(leaf.path)} with {array[env, *where]:.4g}{_place(where)} in environment {env}, far outside of "
                 f"the declared bounds [{part.low[where]:.4g}, {part.high[where]:.4g}]"
             )
+    return None
+
+
+def lost_change(space: spaces.Space, before: Any, after: Any) -> str | None:
+    """Describes which number of an observation changed in a step, and not in float32; None if there is none.
+
+    Changes of less than ``LEAST_CHANGE`` do not count: they are the rounding of simulations.
+    """
+    for leaf, old, new in zip(leaves(space), parts(space, before), parts(space, after), strict=True):
+        old, new = np.asarray(old), np.asarray(new)
+        if leaf.kind == "continuous" and new.dtype.itemsize > 4:
+            with np.errstate(over="ignore", invalid="ignore"):
+                is_same = old.astype(np.float32) == new.astype(np.float32)
+                lost = np.argwhere((np.abs(new.astype(np.float64) - old) > LEAST_CHANGE) & is_same)
+            if len(lost):
+                at = tuple(lost[0].tolist())
+                return (
+                    f"{leaf_name(leaf.path)} went from {old[at]} to {new[at]}{_place(at)} in a step, and networks compute "
+                    f"with float32, which holds both as {np.float32(new[at])}; subtract an offset, or scale it"
+                )
     return None
 
 

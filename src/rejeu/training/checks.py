@@ -10,14 +10,11 @@ import numpy as np
 
 from rejeu.core.algorithm import Masked, PyTree
 from rejeu.core.errors import BadEnvironmentError, NonFiniteError
-from rejeu.core.spaces import leaves
+from rejeu.core.spaces import is_finite, leaves
 from rejeu.envs import validation
 from rejeu.envs.base import Step
 from rejeu.training.learner import Learner
 from rejeu.training.run import Run, restart, timed
-
-VDOT_SIZE = 2**13
-"""Number of elements up to which an array is checked by its square; beyond it BLAS would use its threads."""
 
 
 @timed("env")
@@ -38,15 +35,6 @@ def checked_step(run: Run, action: np.ndarray, active: np.ndarray | None = None)
     if run.step >= run.next_look:
         check_bounds(run, step.obs)
     return step
-
-
-def is_finite(array: np.ndarray) -> bool:
-    """Returns whether all numbers are finite. For small arrays the square is the fastest check."""
-    if array.dtype.kind != "f":
-        return True
-    if array.size <= VDOT_SIZE and math.isfinite(np.vdot(array, array)):
-        return True
-    return bool(np.isfinite(array).all())
 
 
 def check_finite(run: Run, step: Step, taken: int) -> None:

@@ -9,6 +9,7 @@ import gymnasium as gym
 import jax
 import numpy as np
 
+from rejeu.core.spaces import plain
 from rejeu.envs import functional
 from rejeu.envs.canvas import Drawing, Scene
 from rejeu.envs.functional.protocol import FunctionalEnv
@@ -93,7 +94,7 @@ class GymnasiumEnv(gym.Env[Any, Any]):
         self.over = False
         self._scene = Scene([], None, False)
         self._show(None)
-        return _first(obs), self._info()
+        return _first(self.observation_space, obs), self._info()
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Steps the environment.
@@ -105,7 +106,7 @@ class GymnasiumEnv(gym.Env[Any, Any]):
         terminated, truncated = bool(step.terminated[0]), bool(step.truncated[0])
         self.over = terminated or truncated
         self._show(action)
-        return _first(step.obs), float(step.reward[0]), terminated, truncated, self._info()
+        return _first(self.observation_space, step.obs), float(step.reward[0]), terminated, truncated, self._info()
 
     def render(self) -> np.ndarray | None:
         """Returns an image, ``uint8 (height, width, 3)``, or None if it is shown in a window.
@@ -164,6 +165,6 @@ class GymnasiumEnv(gym.Env[Any, Any]):
             self.render()
 
 
-def _first(obs: Any) -> Any:
-    """Returns the observation of the only environment of a vector."""
-    return jax.tree.map(lambda part: np.array(part[0]), obs)
+def _first(space: gym.Space, obs: Any) -> Any:
+    """Returns the observation of the only environment of a vector, with the declared dtypes, which JAX may not have."""
+    return jax.tree.map(lambda part, one: np.array(part[0], one.dtype), obs, plain(space, space))
