@@ -294,20 +294,22 @@ def test_the_last_info_of_an_episode_outlasts_the_reset():
     assert infos[0]["time"] == 9
 
 
-def test_final_observations_that_a_reset_overwrote_are_told_once():
-    def walked(kind):
-        vector = make_vector(AsyncVectorEnv([kind], autoreset_mode=AutoresetMode.SAME_STEP, context="forkserver"))
-        vector.reset(0)
-        for _ in range(50):
-            step = vector.step(np.zeros((1, 1)))
-            vector.reset_done(step.truncated)
-        vector.close()
+@pytest.mark.parametrize("mode", [AutoresetMode.SAME_STEP, AutoresetMode.DISABLED])
+def test_final_observations_that_a_reset_would_overwrite_are_refused(mode):
+    def made(kind):
+        env = AsyncVectorEnv([kind], autoreset_mode=mode, context="forkserver")
+        try:
+            return make_vector(env)
+        finally:
+            env.close()
 
-    with pytest.warns(UserWarning, match="final observations .* are those of the resets") as caught:
-        walked(SameArray)
-    assert len(caught) == 1
-    walked(Good)
-    walked(seeing("Constant", lambda env: np.zeros(3, np.float32)))
+    made(Good)
+    made(seeing("Constant", lambda env: np.zeros(3, np.float32)))
+    if mode == AutoresetMode.DISABLED:
+        made(SameArray)
+    else:
+        with pytest.raises(ValueError, match=r"SameArray writes all observations into one array.*DISABLED"):
+            made(SameArray)
 
 
 class SeveralAgents:

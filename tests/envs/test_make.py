@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from collections import OrderedDict
@@ -120,8 +121,17 @@ def test_a_vector_that_resets_itself_beyond_repair_is_refused():
     class Own(gym.vector.VectorEnv):
         metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP}
 
-    with pytest.raises(ValueError, match=r"Own resets by itself .*AutoresetMode.DISABLED or SAME_STEP"):
+    with pytest.raises(ValueError, match=r"Own resets by itself .*AutoresetMode.SAME_STEP"):
         GymnasiumVector(Own())
+
+
+def test_advice_for_gymnasiums_own_vector_of_cart_poles_can_be_typed():
+    with pytest.raises(ValueError, match="CartPoleVectorEnv resets by itself") as caught:
+        make_vector(gym.make_vec("CartPole-v1", num_envs=4))
+    (call,) = re.findall(r"rejeu\.make_vector\([^)]*\)", str(caught.value))
+    assert "vectorization_mode='sync'" in str(caught.value)
+    for vector in (eval(call, {"rejeu": rejeu}), gym.make_vec("CartPole-v1", num_envs=4, vectorization_mode="sync")):
+        assert rejeu.DQN("MlpPolicy", vector, learning_starts=100, buffer_size=100, seed=0).learn(8).num_timesteps == 8
 
 
 # Observations of Dict spaces.

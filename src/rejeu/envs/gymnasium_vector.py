@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import traceback
-import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 import gymnasium as gym
 import jax
 import numpy as np
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode
+from gymnasium.vector.async_vector_env import AsyncState
 
 from rejeu.core.errors import BadEnvironmentError, WorkerError
 from rejeu.core.spaces import leaves, plain
@@ -18,11 +19,7 @@ from rejeu.envs import base, goals as goals_module, validation
 from rejeu.envs.base import Seed, Step, VectorEnv, describe_spec, each_info, each_seed, step_whole
 from rejeu.envs.goals import GoalFunctions
 
-SAME_ARRAY = (
-    "the final observations of the first episodes of {} are those of the resets that followed: does it write all of them into "
-    "one array? Return a copy, or make the vector with autoreset_mode=AutoresetMode.DISABLED"
-)
-"""Warning, where an environment overwrites its final observations before they are copied."""
+DISABLED = "make the vector with autoreset_mode=gymnasium.vector.AutoresetMode.DISABLED"
 
 
 class GymnasiumVector(VectorEnv):
@@ -31,16 +28,20 @@ class GymnasiumVector(VectorEnv):
     def __init__(self, env: gym.vector.VectorEnv, seed: Seed = None) -> None:
         mode = AutoresetMode(env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP))
         unwrapped = env.unwrapped
+        name = type(unwrapped).__name__
         if mode == AutoresetMode.NEXT_STEP and not isinstance(unwrapped, AsyncVectorEnv | gym.vector.SyncVectorEnv):
+            single = "" if env.spec is None else f"use rejeu.make_vector({env.spec.id!r}, n_envs={env.num_envs}), or "
             raise ValueError(
-                f"{type(unwrapped).__name__} resets by itself at the next step, which cannot be undone; make it with "
-                "autoreset_mode=AutoresetMode.DISABLED or SAME_STEP"
+                f"{name} resets by itself at the next step, which cannot be undone; {single}give gymnasium.make_vec "
+                "vectorization_mode='sync'; a class of your own can reset by AutoresetMode.SAME_STEP, or not (DISABLED)"
             )
         if mode == AutoresetMode.NEXT_STEP and isinstance(unwrapped, AsyncVectorEnv) and not unwrapped.shared_memory:
             raise ValueError(
                 "an AsyncVectorEnv without shared memory that resets by itself at the next step resets twice when it is "
-                "reset by hand; make it with autoreset_mode=AutoresetMode.DISABLED"
+                f"reset by hand; {DISABLED}"
             )
+        if mode == AutoresetMode.SAME_STEP:
+            check_final_observations(unwrapped)
         self.env = env
         self._same_step = mode == AutoresetMode.SAME_STEP
         self.n_envs = env.num_envs
@@ -54,7 +55,6 @@ class GymnasiumVector(VectorEnv):
         self._after_reset: Any = None
         self._reset_info: Any = None
         """What the last reset said besides, or the last step that contained one."""
-        self._endings_to_compare = 3
         self._flags = (np.zeros(self.n_envs, bool),) * 2
         """Flags of terminated and of truncated environments that await a reset. All False with automatic resets."""
         self._desynced = np.zeros(self.n_envs, bool)
@@ -94,22 +94,12 @@ class GymnasiumVector(VectorEnv):
                 obs = jax.tree.map(np.copy, obs)
                 for i in done.tolist():
                     final = plain(self.observation_space, info["final_obs"][i])
-                    self._compare(final, i)
                     for store, part in zip(jax.tree.leaves(obs), jax.tree.leaves(final), strict=True):
                         store[i] = part
         else:
             self._flags = terminated, truncated
         self._obs = obs
         return Step(obs, reward, terminated, truncated, info)
-
-    def _compare(self, final: Any, i: int) -> None:
-        """Warns if the final observations of the first endings are those of the resets that followed, and not constant."""
-        if self._endings_to_compare:
-            rows = [jax.tree.leaves(jax.tree.map(lambda leaf: leaf[i], one)) for one in (self._after_reset, self._obs)]
-            is_reset, is_last = (all(map(np.array_equal, jax.tree.leaves(final), row)) for row in rows)
-            self._endings_to_compare = self._endings_to_compare - 1 if is_reset and not is_last else 0
-            if is_reset and not is_last and not self._endings_to_compare:
-                warnings.warn(SAME_ARRAY.format(self.env_id), UserWarning, stacklevel=2)
 
     def _step_some(self, action: np.ndarray, active: np.ndarray) -> Step:
         over = (self._flags[0] | self._flags[1]) & ~active
@@ -144,6 +134,15 @@ class GymnasiumVector(VectorEnv):
         return self._obs
 
     def _reset(self, **arguments: Any) -> Any:
+        vector: Any = self.env.unwrapped
+        if isinstance(vector, AsyncVectorEnv):
+            if vector.closed or None in vector.parent_pipes:
+                raise WorkerError(
+                    "a worker process of this AsyncVectorEnv ended with an exception; make the vector again and give it to "
+                    "set_env, or use rejeu.make_vector(function, n_envs, 'gymnasium-async'), whose workers stay"
+                )
+            if vector._state != AsyncState.DEFAULT:  # an interrupted call has asked for something
+                getattr(vector, f"{vector._state.value}_wait")()
         answer = self._called(self.env.reset, **arguments)
         if not isinstance(answer, tuple) or len(answer) != 2:
             raise self._bad(None, f"reset returned {validation.describe_value(answer)}, expected (obs, info)")
@@ -197,6 +196,23 @@ class GymnasiumVector(VectorEnv):
 
     def close(self) -> None:
         self.env.close()
+
+
+def check_final_observations(env: gym.vector.VectorEnv) -> None:
+    """Raises ``ValueError`` if resets in the same step overwrite final observations: one array is used for all of them."""
+    for make in getattr(env, "env_fns", ())[:1]:
+        one, obs = make(), ()
+        with suppress(Exception):  # of what is not valid, such as an action that is forbidden
+            obs = one.reset(seed=0)[0]
+            obs = one.step(one.action_space.sample())[0]
+        kept = jax.tree.map(np.array, obs)
+        one.reset()
+        one.close()
+        if not all(map(np.array_equal, jax.tree.leaves(kept), jax.tree.leaves(obs))):
+            raise ValueError(
+                f"{type(one.unwrapped).__name__} writes all observations into one array, so that those of a reset replace the "
+                f"final ones; return a copy, or {DISABLED}"
+            )
 
 
 def is_raised_by_vector(error: Exception) -> bool:
