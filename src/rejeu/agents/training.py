@@ -19,6 +19,7 @@ from rejeu.callbacks.base import Callback, called, in_order, listed, listening, 
 from rejeu.callbacks.progress_bar import ProgressBar
 from rejeu.core import schedules, xla
 from rejeu.core.interrupt import Interrupt
+from rejeu.envs import snapshot
 from rejeu.exploration.noise import warn_without_noise
 from rejeu.logs.logging import Console, RetryingSink, Sink, guarded, next_folder, open_log
 from rejeu.training import finite
@@ -157,7 +158,8 @@ def start_call(
             episodes_before=run.episode - agent.reset_episode,
             seconds_before=run.seconds["total"] - agent.reset_seconds,
         )
-    if run.env.venv is not None and (reset_num_timesteps or resumes):  # may have been stepped by hand since
+    is_touched = run.fingerprint not in (None, snapshot.fingerprint(run.env))
+    if is_touched or (run.env.venv is not None and (reset_num_timesteps or resumes)):  # or stepped by hand unseen
         run.obs = run.action = None
     return call
 
@@ -232,6 +234,7 @@ def session(
     agent.run.success_threshold = agent.success_threshold
     agent.failed_writes.forget_written()
     with ExitStack() as stack:
+        stack.callback(lambda: setattr(agent.run, "fingerprint", snapshot.fingerprint(agent.run.env)))
         stack.callback(agent.failed_writes.warn)
         outputs = open_outputs(agent, sinks, tb_log_name, stack)
         stack.callback(agent.failed_writes.retry)
@@ -249,7 +252,12 @@ def session(
             over = call.is_over(turn.step, agent.run.episode)
             return over or any(isinstance(answer, bool | np.bool_) and not answer for answer in answers)
 
-        yield record
+        try:
+            yield record
+        except BaseException:  # perhaps of an environment, some of which have taken a step that was not stored
+            if agent.stops is None:  # a chunk on the device is completed
+                agent.run.obs = agent.run.action = None
+            raise
 
 
 def hint_at_more_environments(agent: BaseAgent) -> None:

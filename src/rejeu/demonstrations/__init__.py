@@ -135,10 +135,10 @@ def read(path: str | Path) -> Demonstrations:
 
 def check_end(path: Path, name: str, rewards: np.ndarray, terminations: np.ndarray, truncations: np.ndarray) -> None:
     """Raises ``ValueError`` if an episode of a dataset goes on after a step that ended it."""
-    for kind, flags in (("terminations", terminations), ("truncations", truncations)):
+    for ending, flags in (("terminations", terminations), ("truncations", truncations)):
         if np.any(flags[:-1]):
             raise ValueError(
-                f"{name} of {path} has {kind} at step {np.argmax(flags)} of {len(rewards)}; an episode ends where one is "
+                f"{name} of {path} has {ending} at step {np.argmax(flags)} of {len(rewards)}; an episode ends where one is "
                 "true: record each episode by itself"
             )
 

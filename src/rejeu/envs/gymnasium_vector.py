@@ -141,8 +141,9 @@ class GymnasiumVector(VectorEnv):
                     "a worker process of this AsyncVectorEnv ended with an exception; make the vector again and give it to "
                     "set_env, or use rejeu.make_vector(function, n_envs, 'gymnasium-async'), whose workers stay"
                 )
-            if vector._state != AsyncState.DEFAULT:  # an interrupted call has asked for something
-                getattr(vector, f"{vector._state.value}_wait")()
+            pending = vars(vector)["_state"]
+            if pending != AsyncState.DEFAULT:  # an interrupted call has asked for something
+                getattr(vector, f"{pending.value}_wait")()
         answer = self._called(self.env.reset, **arguments)
         if not isinstance(answer, tuple) or len(answer) != 2:
             raise self._bad(None, f"reset returned {validation.describe_value(answer)}, expected (obs, info)")
@@ -201,17 +202,17 @@ class GymnasiumVector(VectorEnv):
 def check_final_observations(env: gym.vector.VectorEnv) -> None:
     """Raises ``ValueError`` if resets in the same step overwrite final observations: one array is used for all of them."""
     for make in getattr(env, "env_fns", ())[:1]:
-        one, obs = make(), ()
+        single, obs = make(), ()
         with suppress(Exception):  # of what is not valid, such as an action that is forbidden
-            obs = one.reset(seed=0)[0]
-            obs = one.step(one.action_space.sample())[0]
-        kept = jax.tree.map(np.array, obs)
-        one.reset()
-        one.close()
-        if not all(map(np.array_equal, jax.tree.leaves(kept), jax.tree.leaves(obs))):
+            obs = single.reset(seed=0)[0]
+            obs = single.step(single.action_space.sample())[0]
+        copies = jax.tree.map(np.array, obs)
+        single.reset()
+        single.close()
+        if not all(map(np.array_equal, jax.tree.leaves(copies), jax.tree.leaves(obs))):
             raise ValueError(
-                f"{type(one.unwrapped).__name__} writes all observations into one array, so that those of a reset replace the "
-                f"final ones; return a copy, or {DISABLED}"
+                f"{type(single.unwrapped).__name__} writes all observations into one array, so that those of a reset "
+                f"replace the final ones; return a copy, or {DISABLED}"
             )
 
 

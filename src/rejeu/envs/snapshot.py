@@ -14,7 +14,10 @@ not supported, because their state is not plain data.
 from __future__ import annotations
 
 import copy
+import types
 import warnings
+import zlib
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from typing import Annotated, Any, Literal
 
@@ -70,6 +73,8 @@ REMEMBERED: dict[type, dict[str, Any]] = {
 }
 """Attributes with the full state of wrappers and environments, except for random numbers, and their types in a file."""
 MUJOCO = "gymnasium.envs.mujoco."
+MOST_OBJECTS, MOST_ITEMS, MOST_NUMBERS = 10_000, 1_000, 2**14
+"""Upper limits of a fingerprint: its objects, the last items of each, and the numbers of an array, which is sampled."""
 
 
 def state_of(env: gym.Env) -> list[Any] | None:
@@ -238,3 +243,30 @@ def _put_mujoco(env: Any, state: dict[str, Any]) -> None:
     mujoco.mj_setState(env.model, env.data, given, kind)
     mujoco.mj_forward(env.model, env.data)
     mujoco.mj_setState(env.model, env.data, given, kind)  # mj_forward changed the warm start of the solver
+
+
+def fingerprint(env: Any) -> int:
+    """Returns a number that differs after environments, or a vector of them, were stepped or reset.
+
+    It is computed from all numbers, strings and arrays within the Python objects that are reached from ``env``, the nearest
+    ones first. What only objects of other languages hold is not seen; counters of wrappers such as ``TimeLimit`` are.
+    """
+    seen, waiting, digest = dict[int, Any](), deque([env]), 0  # seen keeps objects, so that no other gets their id
+    while waiting and len(seen) < MOST_OBJECTS:
+        value, content = waiting.popleft(), b""
+        if isinstance(value, bool | int | float | str | bytes | np.generic | None):
+            content = repr(value).encode()
+        elif isinstance(value, np.ndarray) and value.dtype.kind != "O":
+            content = value.ravel()[:: 1 + value.size // MOST_NUMBERS].tobytes()
+        elif id(value) not in seen and not isinstance(
+            value, type | types.ModuleType | gym.Space
+        ):  # no step changes these
+            seen[id(value)], content = value, type(value).__qualname__.encode()
+            items = [len(value), *value] if isinstance(value, dict | list | tuple | set | deque) else []
+            items += value.values() if isinstance(value, dict) else []
+            inside = (
+                value.bit_generator.state if isinstance(value, np.random.Generator) else getattr(value, "__dict__", {})
+            )
+            waiting.extend([*items[-MOST_ITEMS:], *inside.values()])
+        digest = zlib.crc32(content, digest)
+    return digest

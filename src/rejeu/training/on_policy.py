@@ -109,13 +109,13 @@ def update(run: Run, learner: Learner, config: RolloutConfig, clock: Clock) -> N
 def begin_episodes(run: Run, config: RolloutConfig, learner: Learner | None = None) -> None:
     """Starts an episode in every environment, which ends the running ones.
 
-    The current rollout keeps its steps, unless rollouts hold whole episodes: then it starts again too, and with it what
-    ``learner`` carries from step to step, such as the number of the episode.
+    The current rollout keeps its steps, unless it is full, because an error prevented the update, or rollouts hold whole
+    episodes: then it starts again too, and with it what ``learner`` carries, such as the number of the episode.
     """
     checked_restart(run)
     if config.n_episodes is not None and learner is not None:
         run.carry = learner.initial_carry(run.env.n_envs)
-    if run.replay.length and config.n_episodes is None:
+    if 0 < run.replay.length < run.replay.n_steps and config.n_episodes is None:
         run.replay.cut()
     else:
         begin(run, config)

@@ -119,6 +119,8 @@ class Run:
     """When training would have begun had it not been interrupted; see :func:`start_clock`."""
     next_look: float = 0
     """The environment step of the next check that observations are within their declared bounds."""
+    fingerprint: int | None = None
+    """Of the environments when the last ``learn`` ended, to notice steps and resets by others; None before."""
     fetch: Callable[[], None] | None = None
     """Copies steps from the device to ``buffer``; None if it holds them all."""
 

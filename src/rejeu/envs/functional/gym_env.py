@@ -167,4 +167,4 @@ class GymnasiumEnv(gym.Env[Any, Any]):
 
 def _first(space: gym.Space, obs: Any) -> Any:
     """Returns the observation of the only environment of a vector, with the declared dtypes, which JAX may not have."""
-    return jax.tree.map(lambda part, one: np.array(part[0], one.dtype), obs, plain(space, space))
+    return jax.tree.map(lambda batch, declared: np.array(batch[0], declared.dtype), obs, plain(space, space))

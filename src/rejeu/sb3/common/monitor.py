@@ -95,9 +95,10 @@ class Monitor(gym.Wrapper, gym.utils.RecordConstructorArgs):
             if kwargs.get(key) is None:
                 raise ValueError(f"reset needs the argument {key!r}, one of reset_keywords={self.reset_keywords}")
             self.current_reset_info[key] = kwargs[key]
-        self.rewards = []
+        self.rewards, self.needs_reset = [], True  # also after an exception
+        result = self.env.reset(**kwargs)
         self.needs_reset = False
-        return self.env.reset(**kwargs)
+        return result
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Steps the environment.
@@ -108,11 +109,12 @@ class Monitor(gym.Wrapper, gym.utils.RecordConstructorArgs):
         """
         if self.needs_reset:
             raise RuntimeError("step after the episode has ended; call reset() first")
+        self.needs_reset = True  # also after an exception
         obs, reward, terminated, truncated, info = self.env.step(action)
+        self.needs_reset = bool(terminated or truncated)
         self.rewards.append(float(reward))
         self.total_steps += 1
-        if terminated or truncated:
-            self.needs_reset = True
+        if self.needs_reset:
             info["episode"] = self._end_episode(info)
         return obs, reward, terminated, truncated, info
 
