@@ -9,6 +9,7 @@
 
 from __future__ import annotations
 
+import enum
 import importlib
 import inspect
 import json
@@ -78,7 +79,9 @@ def accepted(one: Any) -> set[str]:
 
 
 def takes_any(one: Any) -> bool:
-    """Returns whether a function passes arguments of any name on."""
+    """Returns whether a function passes arguments of any name on, or depends on Python's version, as of enumerations."""
+    if inspect.isclass(one) and issubclass(one, enum.Enum):
+        return True
     try:
         kinds = [given.kind for given in inspect.signature(one).parameters.values()]
     except (TypeError, ValueError):

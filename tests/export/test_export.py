@@ -174,6 +174,7 @@ class Counting(gym.Env):
 
 @pytest.mark.parametrize(("padding", "target"), crossed(["reset", "zero"], ["onnx", "c"]))
 def test_frames_are_stacked_inside_of_a_file(padding, target, tmp_path, monkeypatch):
+    skip_without_compiler(target)
     make = lambda: FrameStackObservation(Counting(), 4, padding_type=padding)  # noqa: E731
     agent = made("PPO", "MlpPolicy", make(), policy_kwargs={"net_arch": [16]})
     monkeypatch.setattr(exporting, "environment", lambda *_: (agent.make_envs(make(), 1, seed=0), None))
@@ -195,6 +196,7 @@ def test_the_frames_of_replay_and_of_channels_are_stacked_too(tmp_path):
     frames, stack, start = np.zeros((5, 3, 8), np.uint8), np.zeros((5, 4, 3, 8), np.uint8), np.zeros(5, bool)
     assert session.run(None, {"observation": frames, "state_0": stack, "episode_start": start})[1].shape == stack.shape
     vectors = agent_of("SAC", "Box")
+    skip_without_compiler("c")
     found = vectors.export(tmp_path / "vectors.c", frame_stack=2)
     assert found.check.difference <= 1e-5
     assert "_OBSERVATION_SIZE 2" in (tmp_path / "vectors.h").read_text()
