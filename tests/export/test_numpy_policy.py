@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import io
 import json
 import subprocess
@@ -197,3 +198,15 @@ def test_numbers_are_counted_before_they_are_computed():
     assert numpy_policy.count("broadcast_in_dim", {"shape": [-1, 7, 8]}, [x]) == 56
     assert numpy_policy.count("concatenate", {}, [x, x]) == 20_000
     assert numpy_policy.count("matmul", {}, [x, x.T]) == 10 * 10 * 1000 // 256
+
+
+def test_members_that_overlap_are_not_read():
+    """The table of contents names one array of 1 MiB a hundred times."""
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as archive:
+        archive.writestr("c0.npy", bytes(2**20))
+        for i in range(1, 100):
+            archive.filelist.append(copy.copy(archive.filelist[0]))
+            archive.filelist[-1].filename = f"c{i}.npy"
+    with pytest.raises(ValueError, match="its members overlap"):
+        numpy_policy.parse(file.getvalue())

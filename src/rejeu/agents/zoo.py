@@ -122,7 +122,10 @@ def read_yaml(path: Path) -> dict[str, Any]:
         raise ImportError('PyYAML is not installed; pip install "rejeu[zoo]"') from None
 
     class Reader(yaml.SafeLoader):
-        """Creates numbers, texts, lists and dicts only."""
+        """Creates numbers, texts, lists and dicts only. Merged dicts, which may double with each line, are refused."""
+
+        def flatten_mapping(self, node: Any) -> None:
+            """Leaves the keys as they are."""
 
     def items(reader: Any, node: Any) -> list[Any]:
         return list(reader.construct_sequence(node, deep=True))

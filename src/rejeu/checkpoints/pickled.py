@@ -25,7 +25,7 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 
 from rejeu.core.errors import CheckpointError
-from rejeu.core.records import WRONG, Malformed, brief, shown
+from rejeu.core.records import MAX_DEPTH, WRONG, Malformed, brief, shown
 
 PACKAGES = {"collections", "copyreg", "gym", "gymnasium", "numpy", "sb3_contrib", "stable_baselines3", "torch"}
 """Packages whose names a pickle may mention."""
@@ -37,6 +37,10 @@ MOST_TEXT = 4 * 2**20
 """Upper limit on the bytes of a pickle without the arrays."""
 MOST_FIELD = 4 * 2**20
 """Upper limit on the bytes of one of its values, and of a ``VecNormalize`` file."""
+MOST_NAME = 200
+"""Upper limit on the length of the name of a module, class or function."""
+MOST_DTYPE = 8
+"""Length of the longest name of a dtype of numbers; longer ones describe tables."""
 MOST_WRITTEN = 32 * 2**20
 """Upper limit on the size of a value when each part counts as often as it occurs: 64 bytes, and those of texts and arrays. A
 part that is shared many times takes little memory, and endless time to print, hash or convert."""
@@ -76,7 +80,7 @@ def parse(
     data: bytes | BinaryIO,
     call: Callable[[Any, tuple[Any, ...]], Any] = PickledCall,
     storage: Any = None,
-    most: int = MOST_WRITTEN,
+    arrays: int = 0,
 ) -> Any:
     """Returns the value of a pickle. A set becomes a list.
 
@@ -84,7 +88,7 @@ def parse(
         data: the pickle, or a file that is read to its end.
         call: returns the value that stands for a call of a name with arguments.
         storage: returns the value that stands for a reference to something outside of the pickle.
-        most: upper limit on the size of the value; see :data:`MOST_WRITTEN`.
+        arrays: upper limit on the bytes of the arrays in the value, each as often as it occurs.
 
     Raises:
         Malformed: for an opcode or a name that is not known, a damaged pickle, or a value that is too large.
@@ -123,8 +127,8 @@ def parse(
             add(stack[-1], items, code == "SETITEM")
         elif code in ("GLOBAL", "STACK_GLOBAL"):
             module, name = value.split(" ") if code == "GLOBAL" else popped(stack, 2)
-            is_known = isinstance(module, str) and isinstance(name, str) and module.split(".")[0] in PACKAGES
-            if not is_known and (module, name) not in SETS:
+            is_name = all(isinstance(text, str) and len(text) <= MOST_NAME for text in (module, name))
+            if not is_name or (module.split(".")[0] not in PACKAGES and (module, name) not in SETS):
                 raise Malformed(f"it names {named(module)}.{named(name)}, which has no place in such a file")
             stack.append(Name(module, name))
         elif code in ("REDUCE", "NEWOBJ"):
@@ -132,7 +136,10 @@ def parse(
             if not isinstance(arguments, tuple):
                 raise Malformed("it calls something without arguments")
             if isinstance(function, Name) and function in SETS:
-                stack.append([*arguments[0]] if arguments else [])
+                items = arguments[0] if arguments else []
+                if not isinstance(items, list | tuple):
+                    raise Malformed(f"it makes a set of a {type(items).__name__}, expected a list")
+                stack.append(items)
                 continue
             stack.append(
                 {} if function == ("collections", "OrderedDict") and not arguments else call(function, arguments)
@@ -145,26 +152,34 @@ def parse(
             stack.append(storage(stack.pop()))
         elif code == "STOP":
             (result,) = stack
-            check_size(result, most)
+            check_size(result, MOST_WRITTEN, arrays)
             return result
         elif code not in ("PROTO", "FRAME"):
             raise Malformed(f"it has the opcode {code}, which such files do not use")
     raise Malformed("it is cut short")
 
 
-def check_size(value: Any, most: int) -> None:
-    """Raises ``Malformed`` if a value is larger than ``most``; see :data:`MOST_WRITTEN`."""
-    parts = [value]
-    while parts:
-        one = parts.pop()
-        if isinstance(one, PickledCall):
-            inside: Any = [one.arguments, one.state]
-        else:
-            inside = [*one.values()] if isinstance(one, dict) else one if isinstance(one, list | tuple) else []
-        most -= 64 * len(inside) + (len(one) if isinstance(one, str | bytes | bytearray) else getattr(one, "nbytes", 0))
-        if most < 0:
-            raise Malformed("its parts are shared so often that they have no end, or are larger than the file")
-        parts += inside
+def check_size(value: Any, most: int, arrays: int = 0) -> None:
+    """Raises ``Malformed`` if a value is larger than ``most``, see :data:`MOST_WRITTEN`, or its arrays than ``arrays``.
+
+    Neither may it have more than :data:`MAX_DEPTH` levels: Python's hash of a tuple ends the process at some ten thousand.
+    """
+    level = [value]
+    for _ in range(MAX_DEPTH):
+        below: list[Any] = []
+        for one in level:
+            if isinstance(one, PickledCall):
+                inside: Any = [one.arguments, one.state]
+            else:
+                inside = one.values() if isinstance(one, dict) else one if isinstance(one, list | tuple) else ()
+            most -= 64 * len(inside) + (len(one) if isinstance(one, str | bytes | bytearray) else 0)
+            arrays -= one.nbytes if isinstance(one, np.ndarray) else 0
+            if most < 0 or arrays < 0:
+                raise Malformed("its parts are shared so often that they have no end, or are larger than the file")
+            below.extend(inside)
+        level = below
+    if level:
+        raise Malformed(f"it is nested in more than {MAX_DEPTH} levels")
 
 
 def popped(stack: list[Any], n: int) -> list[Any]:
@@ -225,7 +240,7 @@ def dtype_of(value: Any) -> np.dtype:
     """Returns the dtype of numbers that a record of NumPy's, or the name of a class of scalars, describes."""
     if isinstance(value, Name) and value.module == "numpy":
         dtype = np.dtype(value.name)
-    elif isinstance(value, PickledCall) and value.name == "numpy.dtype":
+    elif isinstance(value, PickledCall) and value.name == "numpy.dtype" and len(value.arguments[0]) <= MOST_DTYPE:
         dtype = np.dtype(value.arguments[0])
         if isinstance(value.state, tuple) and value.state[1] == ">":
             dtype = dtype.newbyteorder(">")
@@ -295,11 +310,13 @@ def structure(data: bytes, content: Callable[[str], bytes], room: int) -> Any:
             raise Malformed(f"the tensor {shown(key, 40)} has {storages[key].nbytes} bytes, expected {n} numbers")
         return storages[key]
 
-    return parse(data, tensor, storage, MOST_WRITTEN + 4 * room)
+    return parse(data, tensor, storage, 4 * room)
 
 
 def kind_of(reference: Any) -> tuple[str, np.dtype, int]:
     """Returns name, dtype and number of values of the storage to which a structure refers."""
+    if not isinstance(reference, tuple) or len(reference) > 6:
+        raise Malformed("it has a tensor whose storage is not described by a tuple of five or six")
     _, kind, key, _, n, *view = reference
     code = STORAGES.get(kind.name.removesuffix("Storage")) if isinstance(kind, Name) else None
     if code is None:
@@ -316,10 +333,10 @@ def tensor(function: Any, arguments: tuple[Any, ...]) -> Any:
     if function != ("torch._utils", "_rebuild_tensor_v2"):
         raise Malformed(f"it calls {named(function)}, expected tensors only")
     storage, first, shape, strides = arguments[:4]
+    if not all(isinstance(one, tuple) and len(one) <= 8 for one in (shape, strides)):
+        raise Malformed("it has a tensor whose shape or strides are no tuple of at most 8 numbers")
     if not isinstance(storage, np.ndarray) or not all(type(n) is int and n >= 0 for n in (first, *shape, *strides)):
         raise Malformed("it has a tensor whose shape is not valid")
-    if len(shape) > 8:
-        raise Malformed(f"it has a tensor with {len(shape)} axes, expected at most 8")
     n = math.prod(shape)
     last = first + sum((size - 1) * stride for size, stride in zip(shape, strides, strict=True))
     if n > storage.size or (n and last >= storage.size):
@@ -357,7 +374,7 @@ def opened(file: BinaryIO, room: int = 0) -> Iterator[zipfile.ZipFile]:
     with zipfile.ZipFile(file) as archive:
         infos = archive.infolist()
         if not room and any(info.compress_type or info.file_size != info.compress_size for info in infos):
-            raise Malformed("it is compressed, as PyTorch's files are not")
+            raise Malformed("it is compressed, as such files are not")
         if any(info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) for info in infos):
             raise Malformed("it has a member that is neither stored nor deflated")
         if (total := sum(info.file_size for info in infos)) > (room or size):

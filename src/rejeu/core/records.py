@@ -139,7 +139,7 @@ def shown(value: Any, length: int = 100) -> str:
     >>> print(shown("héros\u202e\n"))
     héros\u202e\n
     """
-    text = "".join(one if one.isprintable() else ascii(one)[1:-1] for one in str(value))
+    text = "".join(one if one.isprintable() else ascii(one)[1:-1] for one in str(value)[: length + 1])
     return text if len(text) <= length else text[: length - 3] + "..."
 
 

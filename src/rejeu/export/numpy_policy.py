@@ -213,8 +213,9 @@ def parse(content: bytes) -> NumpyPolicy:
         ValueError: if it is not valid, or others of :data:`rejeu.core.records.WRONG`.
     """
     with zipfile.ZipFile(io.BytesIO(content)) as file:
-        if any(member.compress_type != zipfile.ZIP_STORED for member in file.infolist()):
-            raise ValueError("it is compressed")
+        members = file.infolist()
+        if any(member.compress_type for member in members) or sum(member.file_size for member in members) > len(content):
+            raise ValueError("it is compressed, or its members overlap")
     with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
         description = parse_json(arrays[POLICY].tobytes())
         constants = [arrays[f"c{i}"] for i in range(len(arrays.files) - 1)]
