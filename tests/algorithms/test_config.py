@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import inspect
 import json
 
@@ -9,6 +10,7 @@ import pytest
 
 import rejeu
 from rejeu.algorithms import config as configs
+from rejeu.algorithms.catalog import CATALOG
 from rejeu.algorithms.sac import Config
 from rejeu.core import validation
 from rejeu.core.errors import MissingObjectError
@@ -136,3 +138,34 @@ def test_a_mix_of_strategies_is_written_by_names_and_read_again():
     assert saved["replay_buffer_kwargs"]["goal_selection_strategy"] == {"future": 2, "desired": 2}
     assert configs.rebuild(Config, saved, {}) == config
     assert hash(config.hindsight) == hash(configs.rebuild(Config, saved, {}).hindsight)
+
+
+COUNTED = {"gradient_steps", "learning_starts", "policy_delay", "renorm_warmup_steps", "sde_sample_freq"}
+COUNTED |= {"target_update_interval", "train_freq"}
+"""Settings of which nothing is built."""
+IN_MEMORY = {"batch_size", "buffer_size", "n_episodes", "n_steps"}
+"""Those that the memory bounds, where it is reserved."""
+
+
+def test_every_number_of_which_something_is_built_has_an_upper_limit():
+    """So that no file asks for a network, a stack of frames or a loop without end."""
+    kinds = [entry.load().Config for entry in CATALOG.values()]
+    unlimited, limited = set(), set()
+    for kind in {*kinds, *(one.policy_kwargs_class for one in kinds), HindsightConfig, configs.RndConfig}:
+        for name in (one.name for one in dataclasses.fields(kind) if "int" in str(one.type)):
+            try:
+                kind(**{name: 10**9})
+            except (TypeError, ValueError) as error:
+                limited |= {name} if "at most" in str(error) else set()
+            else:
+                unlimited.add(name)
+    assert unlimited == COUNTED | IN_MEMORY
+    assert limited >= validation.MOST.keys()
+
+
+@pytest.mark.parametrize(
+    "settings", [{"net_arch": [8] * 257}, {"qf": [2**21]}, {"state_layers": [8] * 257}, {"n_blocks": 257}]
+)
+def test_networks_have_limits_that_are_checked_before_they_are_built(settings):
+    with pytest.raises(ValueError, match=r"at most|up to 1048576"):
+        Config(policy_kwargs=settings)

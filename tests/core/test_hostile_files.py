@@ -212,7 +212,7 @@ def test_a_hole_makes_no_room_for_a_space_or_a_network(tmp_path):
         one = next(hostile_files.sparse(hostile_files.changed(CONTENTS["agent"], change)))
         path.write_bytes(one.content)
         os.truncate(path, one.size)
-        with pytest.raises(CheckpointError, match=r"1000000000( numbers|, 4, 3\])"):
+        with pytest.raises(CheckpointError, match=r"1000000000( numbers| must be a whole number)"):
             rejeu.load(path)
 
 

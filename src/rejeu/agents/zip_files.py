@@ -21,7 +21,6 @@ import numpy as np
 from rejeu.agents import BUILT_IN, zoo
 from rejeu.agents.agent import Agent
 from rejeu.agents.conversion import EXTRACTORS, OriginalPolicy, action_layers, converted, parts_of, shares_extractor
-from rejeu.checkpoints.model_files import check_depths
 from rejeu.checkpoints.pickled import (
     MOST_FIELD,
     UNREADABLE,
@@ -485,7 +484,7 @@ def load_zip(
         with explained(vecnormalize):
             settings["normalize"], arrays = statistics_of(read_normalization(vecnormalize), policy.leaves, notes)
     with explained(path):
-        check_depths(cls.algorithm.Config(**settings))
+        cls.algorithm.Config(**settings)  # what the file says is judged apart from what the user says
     agent: Agent = cls.__new__(cls)
     agent.notes = notes  # before it is built, when only known attributes can be set
     agent.configure(name_of(policy), build(cls.algorithm.Config, settings | changes), **own)

@@ -70,7 +70,7 @@ from rejeu.core.distributions import forbid
 from rejeu.core.prng import nth
 from rejeu.core.schedules import Exponential, Linear, Schedule, at
 from rejeu.core.spaces import Leaf, check_discrete_action, nth_allowed
-from rejeu.core.validation import LARGEST_VALUE, MOST_OUTPUTS, choice, coerce, flag, number, whole
+from rejeu.core.validation import LARGEST_VALUE, choice, coerce, flag, number, whole
 from rejeu.exploration.noise import NoiseProcess
 from rejeu.networks import MLP, Network, PolicyConfig, Torso, Widths, make_encoder, make_head, make_torso, with_memory
 from rejeu.networks.noisy import drawn, noisy
@@ -181,7 +181,7 @@ class Config(QLearningConfig):
         coerce(self, "clip_grad_value", number, above=0, optional=True)
         coerce(self, "distribution", choice, among=("expected", "categorical"))
         coerce(self, ("v_min", "v_max"), number, least=-LARGEST_VALUE, most=LARGEST_VALUE)
-        coerce(self, "n_atoms", whole, least=2, most=MOST_OUTPUTS)
+        coerce(self, "n_atoms", whole, least=2)
         if self.v_min >= self.v_max:
             raise ValueError(f"v_min={self.v_min} must be below v_max={self.v_max}")
 

@@ -40,7 +40,7 @@ from rejeu.algorithms.soft import EntropyConfig
 from rejeu.core.algorithm import Algorithm, PyTree, Transition, weighted_mean
 from rejeu.core.normalization import NormalizationConfig
 from rejeu.core.schedules import Linear, Schedule
-from rejeu.core.validation import LARGEST_VALUE, MOST_OUTPUTS, coerce, number, whole
+from rejeu.core.validation import LARGEST_VALUE, coerce, number, whole
 from rejeu.networks import Widths
 from rejeu.networks.projected import InvertedResidual, head, projected
 
@@ -86,7 +86,7 @@ class Config(EntropyConfig):
 
     def __post_init__(self) -> None:
         EntropyConfig.__post_init__(self)
-        coerce(self, "n_bins", whole, least=2, most=MOST_OUTPUTS)
+        coerce(self, "n_bins", whole, least=2)
         coerce(self, "value_limit", number, above=0, most=LARGEST_VALUE)
         check_shape(self.policy_kwargs, self.name)
         self.check_widths()

@@ -36,7 +36,7 @@ from rejeu.algorithms.quantile_loss import quantile_fractions
 from rejeu.core.algorithm import Algorithm, PyTree, rows_read
 from rejeu.core.schedules import Schedule
 from rejeu.core.spaces import Leaf
-from rejeu.core.validation import MOST_OUTPUTS, coerce, whole
+from rejeu.core.validation import coerce, whole
 from rejeu.networks import Linear, Network, PolicyConfig, Torso, make_encoder, make_torso
 
 
@@ -61,13 +61,7 @@ class Config(QLearningConfig):
 
     def __post_init__(self) -> None:
         QLearningConfig.__post_init__(self)
-        coerce(
-            self,
-            ("n_quantiles", "n_target_quantiles", "n_policy_quantiles", "n_cosines"),
-            whole,
-            least=1,
-            most=MOST_OUTPUTS,
-        )
+        coerce(self, ("n_quantiles", "n_target_quantiles", "n_policy_quantiles", "n_cosines"), whole, least=1)
 
 
 def make(config: Config, observation_space: spaces.Space, action_space: spaces.Space) -> Algorithm:

@@ -30,7 +30,7 @@ from rejeu.algorithms.dqn import QLearningConfig, Returns, q_learning, taken, va
 from rejeu.algorithms.quantile_loss import quantile_huber_loss
 from rejeu.core.algorithm import Algorithm, PyTree
 from rejeu.core.schedules import Schedule
-from rejeu.core.validation import MOST_OUTPUTS, coerce, whole
+from rejeu.core.validation import coerce, whole
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,7 +48,7 @@ class Config(QLearningConfig):
 
     def __post_init__(self) -> None:
         QLearningConfig.__post_init__(self)
-        coerce(self, "n_quantiles", whole, least=1, most=MOST_OUTPUTS)
+        coerce(self, "n_quantiles", whole, least=1)
 
 
 def make(config: Config, observation_space: spaces.Space, action_space: spaces.Space) -> Algorithm:

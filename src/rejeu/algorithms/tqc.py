@@ -30,7 +30,7 @@ from rejeu.algorithms.quantile_loss import quantile_huber_loss
 from rejeu.algorithms.sac.continuous import Config as SACConfig, SdeActor, make_with, policy
 from rejeu.algorithms.search import Integers, SearchSpace
 from rejeu.core.algorithm import Algorithm, PyTree, Transition, weighted_mean
-from rejeu.core.validation import MOST_OUTPUTS, coerce, whole
+from rejeu.core.validation import coerce, whole
 from rejeu.networks import Network, QNetwork, each
 
 
@@ -48,7 +48,7 @@ class Config(SACConfig):
 
     def __post_init__(self) -> None:
         SACConfig.__post_init__(self)
-        coerce(self, "n_quantiles", whole, least=1, most=MOST_OUTPUTS)
+        coerce(self, "n_quantiles", whole, least=1)
         coerce(self, "top_quantiles_to_drop_per_net", whole, least=0)
         if self.top_quantiles_to_drop_per_net >= self.n_quantiles:
             raise ValueError(

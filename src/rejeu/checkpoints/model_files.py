@@ -24,8 +24,6 @@ ARGUMENTS = ("policy", "seed", "stats_window_size", "success_threshold", "best_w
 """Arguments of an agent that its model file holds."""
 OUTPUTS = ("verbose", "log", "tensorboard_log")
 """Arguments that say where rows of statistics go."""
-MAX_LAYERS = 256
-"""Upper limit on the layers of any kind in the networks of a file: each takes time to build, even if it is empty."""
 
 Count32 = Annotated[int, Meta(ge=0, lt=2**32)]
 
@@ -96,7 +94,6 @@ def interpret(header: Mapping[str, Any], room: int, kind: Any, changes: Mapping[
         raise
     except WRONG as error:
         raise CheckpointError(f"the header is damaged or of another version: {brief(error)}") from None
-    check_depths(config)
     return Saved(
         saved, configs.rebuild(kind, saved.config, changes) if changes else config, observation_space, action_space
     )
@@ -115,17 +112,6 @@ def check_space(description: Any, own: gym.Space, kind: str) -> None:
     other = spaces.rebuild(description, max(spaces.MAX_NUMBERS, sum(leaf.nbytes for leaf in spaces.leaves(own))))
     if not spaces.same(other, own, bounds=kind == "action"):
         raise ValueError(f"it is of the {kind} space {other}, and this agent was made for {own}")
-
-
-def check_depths(config: Any) -> None:
-    """Raises ``CheckpointError`` if the networks of a configuration have more layers than :data:`MAX_LAYERS`.
-
-    Shapes are compared before anything is allocated, but each layer takes time.
-    """
-    layers = {key: len(value) for key, value in vars(config.policy_kwargs).items() if isinstance(value, tuple)}
-    for key, depth in {**layers, "n_blocks": config.policy_kwargs.n_blocks}.items():
-        if depth > MAX_LAYERS:
-            raise CheckpointError(f"{key} has {depth} layers, expected {MAX_LAYERS} at most")
 
 
 A = TypeVar("A", bound=BaseAgent)

@@ -16,8 +16,20 @@ from functools import cache
 from typing import Any, TypeVar
 
 C = TypeVar("C")
-MOST_OUTPUTS = 10_000
-"""Upper limit on the numbers that describe the distribution of one value: atoms, quantiles, bins."""
+MOST_OUTPUTS, MOST_WIDTH, MOST_LAYERS = 10_000, 2**20, 256
+MOST = {
+    **dict.fromkeys(
+        ("n_atoms", "n_bins", "n_cosines", "n_quantiles", "n_policy_quantiles", "n_target_quantiles"), MOST_OUTPUTS
+    ),
+    **dict.fromkeys(("width", "cnn_features", "lstm_hidden_size", "n_features"), MOST_WIDTH),
+    **dict.fromkeys(("n_critics", "n_epochs", "noise_repeat", "target_subset", "n_sampled_goal"), 10_000),
+    **dict.fromkeys(("sequence_length", "burn_in", "n_delta", "n_eval_episodes", "n_critic_updates"), 1_000_000),
+    **dict.fromkeys(("cg_max_steps", "line_search_max_iter", "sub_sampling_factor"), 1_000_000),
+    "n_blocks": MOST_LAYERS,
+    "frame_stack": 1_000,
+}
+"""Upper limits on the numbers of configurations of which something is built, so that no file can ask for more than there is:
+:func:`coerce` compares them before that. Those of steps in memory are bounded by the memory, where it is reserved."""
 LARGEST_VALUE = 1e30
 """Upper limit on returns; sums of products with them are finite in single precision."""
 
@@ -85,12 +97,13 @@ def coerce(
         keys: the names of the fields.
         converter: :func:`whole`, :func:`number`, :func:`flag`, or another function of that form.
         optional: whether None stays None.
-        limits: passed to the converter.
+        limits: passed to the converter; of numbers in :data:`MOST` the upper one is there.
     """
     for key in (keys,) if isinstance(keys, str) else keys:
         value = getattr(config, key)
         if not (optional and value is None):
-            assign(config, **{key: converter(key, value, **limits)})
+            most = {"most": MOST[key]} if converter is whole and key in MOST else {}
+            assign(config, **{key: converter(key, value, **{**most, **limits})})
 
 
 def assign(config: Any, **values: Any) -> None:

@@ -9,7 +9,7 @@ from typing import Any, Literal, NamedTuple
 from jax import Array
 
 from rejeu.core.spaces import Leaf
-from rejeu.core.validation import assign, choice, coerce, flag, number, whole
+from rejeu.core.validation import MOST_LAYERS, MOST_WIDTH, assign, choice, coerce, flag, number, whole
 from rejeu.networks.layers import ACTIVATIONS, find_encoder
 
 
@@ -176,6 +176,8 @@ def layer_widths(key: str, value: Any) -> tuple[int, ...]:
         return ()
     if isinstance(value, str) or not isinstance(value, Sequence):
         raise TypeError(f"{key}={value!r} must be a list of layer widths, such as [256, 256]")
-    if not all(isinstance(width, int) and not isinstance(width, bool) and width > 0 for width in value):
-        raise ValueError(f"{key}={list(value)} must hold positive whole numbers, such as [256, 256]")
+    if len(value) > MOST_LAYERS:
+        raise ValueError(f"{key} has {len(value)} layers, expected {MOST_LAYERS} at most")
+    if not all(isinstance(width, int) and not isinstance(width, bool) and 0 < width <= MOST_WIDTH for width in value):
+        raise ValueError(f"{key}={list(value)} must hold positive whole numbers up to {MOST_WIDTH}, such as [256, 256]")
     return tuple(value)

@@ -19,7 +19,7 @@ from msgspec import Meta
 
 from rejeu.agents import AGENTS, choose_algorithm, find_agent, find_preset, presets
 from rejeu.core import devices, spaces
-from rejeu.core.records import Seed, convert, shown
+from rejeu.core.records import MAX_DEPTH, Seed, convert, is_deep, shown
 from rejeu.core.validation import build, check_names, choice, field_names
 from rejeu.envs.make import BACKENDS, make_vector
 from rejeu.envs.registry import are_plain, is_plain_id, maker, register
@@ -118,6 +118,8 @@ def read_plan(plan: str | Path | Mapping[str, Any]) -> tuple[Plan, str | None]:
         try:
             text = path.read_bytes().decode("utf-8-sig").replace("\r\n", "\n")
             content = tomllib.loads(text)
+            if is_deep(content, MAX_DEPTH):
+                raise RecursionError("it is nested too deeply")
         except (ValueError, RecursionError) as error:
             raise ValueError(f"{str(error)[:200]}; expected TOML, such as steps = 20000") from None
     return parse(content, str(path)), text
