@@ -9,6 +9,7 @@ import shutil
 import sys
 import time
 import tracemalloc
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -258,6 +259,27 @@ def compressed(data: Path, episode: Any) -> None:
     array[:1_000_000] = 0
 
 
+def never_written(data: Path, episode: Any) -> None:
+    """A fiftieth of what the file could hold if all of it were packed."""
+    episode["noise"] = np.random.default_rng(0).random(200_000)
+    episode.create_dataset("rewards", (100_000_000,), "f8", compression="gzip", chunks=(1_000_000,))[:10] = 0
+
+
+def packed_chunks(data: Path, episode: Any) -> None:
+    """Three chunks of 128 MiB, of which each takes 128 KiB."""
+    array = episode.create_dataset("rewards", (3 * 2**24,), "f8", compression="gzip", chunks=(2**24,))
+    packer = zlib.compressobj(9)
+    chunk = b"".join([*(packer.compress(bytes(2**23)) for _ in range(16)), packer.flush()])
+    for i in range(3):
+        array.id.write_direct_chunk((i * 2**24,), chunk)
+
+
+def large_chunk(data: Path, episode: Any) -> None:
+    """Three numbers in a chunk of 2 GB."""
+    array = episode.create_dataset("rewards", (3,), "f8", maxshape=(None,), compression="gzip", chunks=(2**28,))
+    array.id.write_direct_chunk((0,), zlib.compress(bytes(2**20)))
+
+
 def same_episode(data: Path, episode: Any) -> None:
     episode["rewards"] = np.zeros(20_000)
     for i in range(1000):
@@ -312,6 +334,10 @@ FILES: dict[str, tuple[str | None, Any]] = {
         np.ones(1), dest_sel=np.s_[-1:]
     )),
     "compressed": ("rewards", compressed),
+    "never written": ("rewards", never_written),
+    "packed chunks": ("rewards", packed_chunks),
+    "large chunk": ("rewards", large_chunk),
+    "filter": ("rewards", lambda data, episode: episode.create_dataset("rewards", data=np.arange(3), scaleoffset=4)),
     "the same episode": ("rewards", same_episode),
     "storage": ("rewards", storage),
     "virtual": ("rewards", virtual),
@@ -354,6 +380,37 @@ def test_a_hostile_dataset_is_refused_on_one_line_in_little_time_and_memory(name
     assert time.perf_counter() - began < 5
     assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < 1000
+
+
+@pytest.mark.parametrize("content", [b"", b"no HDF5", None])
+def test_one_damaged_episode_is_left_out_with_a_warning_and_the_others_are_read(
+    content: bytes | None, tmp_path: Path
+) -> None:
+    record(tmp_path / "shown", Shaped(VECTOR, Discrete(2)), n=3, close=False)
+    path = next((tmp_path / "shown").rglob("episode_1.hdf5"))
+    path.write_bytes(path.read_bytes()[:-500] if content is None else content)
+    (path.parent / "episode_of_mine.hdf5").write_bytes(b"stray")
+    with pytest.warns(
+        UserWarning,
+        match=r"is read without episode_1\.hdf5, which is damaged \(.+; episode_of_mine\.hdf5, which is damaged \(.+\)$",
+    ) as warned:
+        found = demonstrations.read(tmp_path / "shown")
+    assert len(found.episodes) == 2
+    assert len(warned) == 1
+
+
+@pytest.mark.parametrize("name", ["observations", "actions", *dataset.SERIES])
+def test_an_episode_whose_parts_differ_in_length_is_left_out(name: str, tmp_path: Path) -> None:
+    data = plain(tmp_path)
+    whole = len(demonstrations.read(data).episodes)
+    with h5py.File(data / dataset.MAIN, "r+") as file:
+        rows = file["episode_0"][name][()]
+        del file["episode_0"][name]
+        file["episode_0"][name] = rows[:-1]
+    with pytest.warns(
+        UserWarning, match=r"is read without episode_0 of main_data.hdf5, it has \d+ rewards and \d+ \w+, expected"
+    ):
+        assert len(demonstrations.read(data).episodes) == whole - 1
 
 
 def test_a_dataset_without_spaces_runs_no_code_to_find_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

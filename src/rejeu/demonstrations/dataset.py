@@ -13,11 +13,13 @@ import json
 import math
 import re
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import jax
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
@@ -30,9 +32,12 @@ SPACES = ("observation_space", "action_space")
 SERIES = ("rewards", "terminations", "truncations")
 MOST_METADATA = 16 * 2**20
 """Upper limit on the bytes of the metadata; the bounds of images are written as numbers."""
-SLACK, ROOM, PACKED, IMAGES = 2**20, 16, 32, 256
-"""How many bytes may be read: a fixed number, and multiples of those of the file, because some disks compress files. Of bytes
-that the file itself has compressed only a part counts, of general ones and of JPEG images."""
+SLACK, ROOM = 2**20, 16
+"""How many bytes may be read: a fixed number, and a multiple of those of the file, because some disks compress files."""
+UNPACKED, PACKED = 2**28, 64
+"""Of those that the file itself has compressed as many, or a multiple of those of the file if that is more."""
+FILTERS = {1: 1032, 2: 1, 3: 1, 32000: 88}
+"""The filters of HDF5 that are read, and how many bytes each makes of one at most: deflate, shuffle, checksum, LZF."""
 
 
 class ArrayReader:
@@ -41,7 +46,9 @@ class ArrayReader:
     def __init__(self, files: list[Path], is_jpeg: bool) -> None:
         self.is_jpeg = is_jpeg
         found = [file.stat() for file in files]
-        self.left = SLACK + ROOM * sum(min(one.st_size, 512 * getattr(one, "st_blocks", one.st_size)) for one in found)
+        real = sum(min(one.st_size, 512 * getattr(one, "st_blocks", one.st_size)) for one in found)
+        self.size, self.left = sum(one.st_size for one in found), SLACK + ROOM * real
+        self.unpacked = max(UNPACKED, PACKED * real)
 
     def part(self, group: Any, path: str, space: gym.Space | None) -> Any:
         """Returns a part of an episode: arrays in the structure of a space, or one array."""
@@ -59,17 +66,24 @@ class ArrayReader:
             raise ValueError(f"{shown(path)} is no array that the file itself holds")
         shape = () if space is None else space.shape or ()
         if self.is_jpeg and len(shape) > 1 and (group.dtype.kind == "O" or group.ndim != 1 + len(shape)):
-            self._take(path, len(group) * math.prod(shape), IMAGES)
+            self._take(path, len(group) * math.prod(shape), self.unpacked)
             pictures = (picture(row, shape) for row in group)
             return np.fromiter(pictures, np.dtype((np.uint8, shape)), len(group))
         if group.dtype.kind not in "biuf":
             raise ValueError(f"{shown(path)} has the dtype {group.dtype}, expected numbers")
-        self._take(path, group.nbytes, PACKED if group.id.get_create_plist().get_nfilters() else 1)
+        plist = group.id.get_create_plist()
+        filters = [plist.get_filter(i)[0] for i in range(plist.get_nfilters())]
+        if other := {*filters} - FILTERS.keys():
+            raise ValueError(f"{shown(path)} is packed by the filters {shown(sorted(other))}, expected gzip or lzf")
+        most = min(group.id.get_storage_size(), self.size) * math.prod(FILTERS[one] for one in filters)
+        chunk = math.prod(group.chunks or ()) * group.dtype.itemsize  # one is unpacked as a whole
+        self._take(path, max(group.nbytes, chunk if group.nbytes else 0), most, bool(filters))
         return group[()]
 
-    def _take(self, path: str, n: int, packed: int) -> None:
-        self.left -= n // packed
-        if self.left < 0:
+    def _take(self, path: str, n: int, most: int, is_packed: bool = True) -> None:
+        self.left -= 0 if is_packed else n
+        self.unpacked -= n if is_packed else 0
+        if n > most or min(self.left, self.unpacked) < 0:
             raise ValueError(f"{shown(path)} has {n:,} bytes, more than the file holds")
 
 
@@ -95,15 +109,45 @@ def read(data: Path) -> tuple[list[tuple[Any, ...]], gym.Space, gym.Space, EnvSp
         both = [spaces.rebuild(described(json.loads(metadata[name])), most) for name in SPACES]
         keys = dict(zip(("observations", "actions", *SERIES), (*both, None, None, None), strict=True))
         found: dict[int, tuple[Any, ...]] = {}
+        left_out: list[str] = []
         for path in files:
-            with h5py.File(path, "r") as file:
+            with passed_over(path, left_out), h5py.File(path, "r") as file:
                 for name in file:
                     if (match := EPISODE.fullmatch(name)) and (i := int(match[1])) not in found:
-                        found[i] = name, *(rows.part(file, f"{name}/{key}", space) for key, space in keys.items())
+                        episode = tuple(rows.part(file, f"{name}/{key}", space) for key, space in keys.items())
+                        if problem := problem_of(*episode):
+                            left_out.append(f"{name} of {path.name}, {problem}")
+                        else:
+                            found[i] = name, *episode
+        if left_out:
+            more = f", and {len(left_out) - 3} more" if len(left_out) > 3 else ""
+            warnings.warn(f"{atomic.shortened(data)} is read without {'; '.join(left_out[:3])}{more}", stacklevel=3)
         return [found[i] for i in sorted(found)], both[0], both[1], spec_of(metadata.get("env_spec"))
     except (*WRONG, OSError, RuntimeError) as error:
         problem = f"{atomic.shortened(data)} is damaged or of another kind ({brief(error)})"
         raise ValueError(f"{problem}; copy or record it again") from error
+
+
+@contextmanager
+def passed_over(path: Path, left_out: list[str]) -> Iterator[None]:
+    """Context in which the file of a single episode is read: a damaged one is added to those that are left out."""
+    try:
+        yield
+    except (*WRONG, OSError, RuntimeError) as error:
+        if path.name == MAIN:
+            raise
+        left_out.append(f"{path.name}, which is damaged ({brief(error)})")
+
+
+def problem_of(observations: Any, actions: Any, rewards: np.ndarray, *ends: np.ndarray) -> str:
+    """Returns the part of an episode whose length does not fit its rewards, as text; empty if all fit."""
+    n = len(rewards)
+    parts = {"observations": (observations, n + 1), "actions": (actions, n)}
+    parts |= {key: (flags, n) for key, flags in zip(SERIES[1:], ends, strict=True)}
+    for key, (part, expected) in parts.items():
+        if wrong := {len(one) for one in jax.tree.leaves(part)} - {expected}:
+            return f"it has {n} rewards and {wrong.pop()} {key}, expected {expected}"
+    return ""
 
 
 def metadata_of(data: Path, files: list[Path]) -> Mapping[str, Any]:
@@ -120,11 +164,12 @@ def metadata_of(data: Path, files: list[Path]) -> Mapping[str, Any]:
         return found
     except (ValueError, RecursionError) as error:
         for path in files:
-            with h5py.File(path, "r") as file:
+            with suppress(OSError), h5py.File(path, "r") as file:
                 if file.attrs.keys() >= {*SPACES}:
                     where = atomic.shortened(data / METADATA)
                     warnings.warn(f"{where} is damaged ({brief(error)}); {path.name} is read without it", stacklevel=4)
-                    return dict(file.attrs)
+                    sizes = {name: file.attrs.get_id(name).get_storage_size() for name in file.attrs}
+                    return {name: file.attrs[name] for name, size in sizes.items() if size <= MOST_METADATA}
         raise
 
 
