@@ -398,3 +398,32 @@ def test_worker_processes_do_not_import_jax():
     """It would take a second and 100 MB in each of them."""
     code = "import sys, rejeu.envs.workers.process, tests.worker_environments; print('jax' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout == "False\n"
+
+
+@exhaustive
+def test_files_of_the_current_folder_take_no_place_of_modules_in_a_worker(tmp_path):
+    """As where the command rejeu runs, whose path begins with the folder of its script."""
+    (tmp_path / "here").mkdir()
+    for name in ("random", "socket", "tempfile"):
+        (tmp_path / "here" / f"{name}.py").write_text("open('ran', 'w')", encoding="utf-8")
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import os, rejeu\n"
+        "if __name__ == '__main__':\n"
+        "    env = rejeu.make_vector('CartPole-v1', 2, 'gymnasium-async')\n"
+        "    env.reset(); env.close()\n"
+        "    print('PYTHONSAFEPATH' in os.environ)\n",
+        encoding="utf-8",
+    )
+    ended = subprocess.run([sys.executable, str(script)], cwd=tmp_path / "here", capture_output=True, text=True)
+    assert (ended.returncode, ended.stdout.strip()) == (0, "False"), ended.stderr
+    assert not (tmp_path / "here" / "ran").exists()
+
+
+def test_an_environment_of_a_worker_starts_processes_as_in_this_process():
+    class Asked(Counter):
+        def variable(self):
+            return os.environ.get("PYTHONSAFEPATH")
+
+    with contextlib.closing(make_vector(lambda: Asked((3,)), 1, "gymnasium-async")) as vector:
+        assert vector.call("variable") == [os.environ.get("PYTHONSAFEPATH")]

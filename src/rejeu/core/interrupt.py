@@ -183,6 +183,11 @@ TAKEN = 75
 """Exit status if another process holds the lock all the time."""
 
 
+def program(*words: str) -> list[str]:
+    """Returns the command line of a process of Python. Files of the current folder do not take the place of its modules."""
+    return [sys.executable, "-P", *words]
+
+
 @contextmanager
 def by_parent() -> Iterator[None]:
     """Context of a process that another one supervises; without the environment variable it does nothing."""

@@ -1,13 +1,17 @@
 """Commands that the studio starts. No browser and no server."""
 
 import os
+import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
 pytest.importorskip("nicegui", reason="needs nicegui, which is in the extra studio")
 
+import rejeu
 from rejeu.checkpoints.run_folder import RunFolder
+from rejeu.core import interrupt
 from rejeu.lab.cli.resume import run_resume
 from rejeu.lab.runs import requests
 from rejeu.lab.runs.arguments import Resume
@@ -84,3 +88,21 @@ def test_a_folder_with_a_link_is_not_resumed(tmp_path, name):
     with pytest.raises(OSError, match=f"{name} is a symbolic link; remove it"):
         run_resume(Resume(run=tmp_path / "run"))
     assert not (tmp_path / "home").exists()
+
+
+def test_every_process_of_python_leaves_out_the_current_folder():
+    """Else a file random.py there would take the place of the module."""
+    assert interrupt.program("-m", "rejeu") == [sys.executable, "-P", "-m", "rejeu"]
+    source = Path(rejeu.__file__).parent
+    named = {path.name for path in source.rglob("*.py") if "sys.executable" in path.read_text(encoding="utf-8")}
+    assert named == {"interrupt.py"}
+
+
+def test_files_of_the_current_folder_take_no_place_of_modules(tmp_path, monkeypatch):
+    for name in ("random", "socket", "rejeu"):
+        (tmp_path / f"{name}.py").write_text("open('ran', 'w')\nraise ImportError", encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    process = processes.start(["status", "nowhere"], tmp_path / "mine")
+    assert process.wait(60) == 2
+    assert "there is no run folder nowhere" in processes.read_log(tmp_path / "mine")
+    assert not (tmp_path / "ran").exists()

@@ -413,7 +413,8 @@ class ProcessWorker(Worker):
         self._ended: str | None = None
         arguments = (theirs, CloudpickleWrapper(make), handover)
         self.process = context.Process(target=process.serve, args=arguments, daemon=True)
-        self.process.start()
+        with process.safe_path():
+            self.process.start()
         theirs.close()
 
     @property

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import random
 import signal
 import socket
 import threading
 import traceback
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from functools import partial
 from multiprocessing.connection import Connection
 from multiprocessing.reduction import ForkingPickler
@@ -27,6 +28,10 @@ TOKEN_BYTES = 32
 """Length of the token that a worker on another machine presents."""
 CONNECT_SECONDS = 30.0
 """Seconds that a worker has to connect to the machine that has started it."""
+
+
+SAFE_PATH, OURS = "PYTHONSAFEPATH", "rejeu"
+"""The variable with which Python leaves the current folder out, and our value of it; any other is the user's."""
 
 
 class WorkerFailure(NamedTuple):
@@ -109,6 +114,25 @@ def as_declared(space: gym.Space) -> Encoders:
     return Encoders(*[partial(validation.copy_observation, space)] * 2)
 
 
+@contextmanager
+def safe_path() -> Iterator[None]:
+    """Context in which processes of Python begin without files of the current folder in place of its own modules.
+
+    What they then import is found as in this process.
+    """
+    os.environ.setdefault(SAFE_PATH, OURS)
+    try:
+        yield
+    finally:
+        _end_safe_path()
+
+
+def _end_safe_path() -> None:
+    """Removes the variable, which is not for processes that an environment starts."""
+    if os.environ.get(SAFE_PATH) == OURS:
+        del os.environ[SAFE_PATH]
+
+
 def serve(pipe: Connection, make: CloudpickleWrapper, handover: Handover) -> None:
     """Answers requests for one environment, until it is closed or the main process exits.
 
@@ -123,6 +147,7 @@ def serve(pipe: Connection, make: CloudpickleWrapper, handover: Handover) -> Non
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # the main process handles Ctrl-C, and may take another step
     env: gym.Env | None = None
+    _end_safe_path()
     seed_globals(None)  # the fork server has imported NumPy, so that all its children would draw the same
     try:
         env = make.fn()

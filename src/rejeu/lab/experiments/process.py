@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import subprocess
-import sys
 from contextlib import suppress
 from pathlib import Path
 
@@ -35,7 +34,7 @@ class Process:
         """
         with atomic.open_file(log) as file:
             self._process = subprocess.Popen(
-                program(task),
+                interrupt.program("-m", "rejeu", "--task", str(task)),
                 stdin=subprocess.PIPE,
                 stdout=file,
                 stderr=subprocess.STDOUT,
@@ -63,11 +62,6 @@ class Process:
         self._process.kill()
         self._process.wait()
         self.stop()
-
-
-def program(task: Path) -> list[str]:
-    """Returns the command line of a process."""
-    return [sys.executable, "-m", "rejeu", "--task", str(task)]
 
 
 def last_line(log: Path) -> str:

@@ -7,7 +7,6 @@ import os
 import re
 import shlex
 import subprocess
-import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,6 +17,7 @@ from nicegui import ui
 
 from rejeu.agents import AGENTS, presets
 from rejeu.checkpoints.run_folder import dated
+from rejeu.core.interrupt import program
 from rejeu.core.records import shown
 from rejeu.core.validation import field_docs
 from rejeu.envs.registry import in_envpool, is_plain_id, register, unknown_environment
@@ -239,7 +239,7 @@ async def check(arguments: Train) -> tuple[int, str]:
 
     A thread waits for it: a process of uvloop's own is a fork, against which JAX warns.
     """
-    command = [sys.executable, "-m", "rejeu", "check", *arguments.environment_words()]
+    command = program("-m", "rejeu", "check", *arguments.environment_words())
     process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
     with stoppable(process):
         printed, _ = await asyncio.to_thread(process.communicate)

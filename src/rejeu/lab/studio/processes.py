@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from rejeu.core import atomic
+from rejeu.core.interrupt import program
 from rejeu.lab.runs.read import is_file
 
 HIDDEN = ".studio"
@@ -38,7 +39,7 @@ def start(words: Sequence[str], run: Path) -> subprocess.Popen[bytes]:
     atomic.make_folder(log.parent)
     with atomic.open_file(log) as out:
         process = STARTED[key] = subprocess.Popen(
-            [sys.executable, "-m", "rejeu", *words], stdin=subprocess.DEVNULL, stdout=out, stderr=out, **APART
+            program("-m", "rejeu", *words), stdin=subprocess.DEVNULL, stdout=out, stderr=out, **APART
         )
         return process
 

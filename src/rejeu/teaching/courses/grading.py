@@ -19,6 +19,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from rejeu.core import interrupt
 from rejeu.core.language import Language, chosen, said
 from rejeu.teaching.courses import checks
 from rejeu.teaching.courses.notebooks import jupytext
@@ -67,7 +68,7 @@ def grade(path: Path, seconds: float = SECONDS) -> Grade:
         return Grade(path, {}, said("it has no checks of a course"))
     spoken = SPEAK.search("\n".join(cells))
     language = chosen(spoken and spoken[1])
-    command = [sys.executable, "-c", "from rejeu.teaching.courses.grading import main; main()"]
+    command = interrupt.program("-c", "from rejeu.teaching.courses.grading import main; main()")
     quiet = {"MPLBACKEND": "agg", "PYTHONIOENCODING": "utf-8"}
     say, found, why = partial(said, language=language), {}, ""
     try:
@@ -90,6 +91,7 @@ def grade(path: Path, seconds: float = SECONDS) -> Grade:
 
 def main() -> None:
     """Executes the cells that come as JSON on standard input, and prints what the checks found as the last line."""
+    sys.path.append(os.getcwd())  # last, as `rejeu` does
     cells = json.load(sys.stdin)
     with contextlib.redirect_stdout(io.StringIO()):
         execute(cells)
