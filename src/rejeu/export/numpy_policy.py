@@ -214,7 +214,9 @@ def parse(content: bytes) -> NumpyPolicy:
     """
     with zipfile.ZipFile(io.BytesIO(content)) as file:
         members = file.infolist()
-        if any(member.compress_type for member in members) or sum(member.file_size for member in members) > len(content):
+        if any(member.compress_type for member in members) or sum(member.file_size for member in members) > len(
+            content
+        ):
             raise ValueError("it is compressed, or its members overlap")
     with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
         description = parse_json(arrays[POLICY].tobytes())

@@ -4,15 +4,24 @@ import asyncio
 import http.client
 import os
 import socket
+import stat
 import subprocess
 import sys
+import tempfile
+from pathlib import Path
+from urllib.parse import urlsplit
+from urllib.request import url2pathname
 
 import pytest
+
+from rejeu.core import interrupt
+from rejeu.lab.cli import studio as cli
 
 pytest.importorskip("nicegui", reason="needs nicegui, which is in the extra studio")
 
 from starlette.responses import PlainTextResponse
 
+from rejeu.lab.studio import server
 from rejeu.lab.studio.guard import Guard
 from rejeu.lab.studio.layout import address
 from tests.lab.studio.conftest import Served, opened, serving
@@ -143,3 +152,32 @@ def test_an_empty_folder_says_so_and_leads_to_a_new_run(browser, served):
 def test_ctrl_c_ends_it(tmp_path):
     printed = Served(tmp_path).end()
     assert "Traceback" not in printed
+
+
+@pytest.mark.parametrize("path", ["//evil.example/x", "/\\evil.example/x", "/%5Cevil.example/x", "///evil.example"])
+def test_an_address_with_the_token_leads_to_no_other_host(served, path):
+    status, headers = asked(served, f"{path}?token={served.token}")
+    assert status == 303
+    assert urlsplit(headers["location"]).netloc == ""
+    assert headers["location"][:2] not in ("//", "/\\")
+
+
+def test_the_browser_is_not_started_with_the_token(monkeypatch, tmp_path):
+    """Every user of a computer can read command lines."""
+    opened = []
+
+    def look(address):
+        path = Path(url2pathname(urlsplit(address).path))
+        opened.append(address)
+        assert path in interrupt.unfinished  # which Ctrl-C removes
+        assert "http://127.0.0.1:1/?run=a&amp;b&amp;token=secret&lt;" in path.read_text(encoding="utf-8")
+        assert os.name != "posix" or stat.S_IMODE(path.stat().st_mode) == 0o600
+
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr(cli.webbrowser, "open", look)
+    monkeypatch.setattr(
+        server, "serve", lambda studio, port, ready, *_: ready("http://127.0.0.1:1/?run=a&b&token=secret<")
+    )
+    cli.open_studio(tmp_path)
+    assert "secret" not in opened[0]
+    assert [*tmp_path.iterdir()] == []

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import html
+import os
+import tempfile
 import webbrowser
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import fields
 from pathlib import Path
 
-from rejeu.core import devices
+from rejeu.core import devices, interrupt
 from rejeu.core.errors import requires
 from rejeu.lab.cli.commands import PORT, Studio
 from rejeu.lab.runs.arguments import RunOptions
@@ -61,9 +65,28 @@ def open_studio(
     def ready(address: str) -> None:
         print(f"{address} (Ctrl-C ends it; runs go on)", flush=True)
         if has_browser:
-            webbrowser.open(address)
+            webbrowser.open(pages.enter_context(redirection(address)))
 
     env_id = "" if given.env is None else from_arguments(given.env, given).env_id
     options = {one.name: getattr(given, one.name) for one in fields(EnvironmentOptions)}
     typed = RunConfig(env=env_id, env_argument=given.env or "", **options)
-    server.serve(state.Studio(folder, guests, typed), port, ready, page, hosts)
+    with ExitStack() as pages:
+        server.serve(state.Studio(folder, guests, typed), port, ready, page, hosts)
+
+
+@contextmanager
+def redirection(address: str) -> Iterator[str]:
+    """Context with the address of a file that leads to another address, whose token is then on no command line.
+
+    Only this user may read the file; every user of a computer may read command lines.
+    """
+    handle, name = tempfile.mkstemp(".html", "rejeu-studio-")
+    path = Path(name)
+    interrupt.unfinished.add(path)  # a signal removes it too
+    try:
+        with os.fdopen(handle, "w", encoding="utf-8") as file:
+            file.write(f'<!DOCTYPE html><meta http-equiv="refresh" content="0; url={html.escape(address)}">')
+        yield path.as_uri()
+    finally:
+        path.unlink(missing_ok=True)
+        interrupt.unfinished.discard(path)

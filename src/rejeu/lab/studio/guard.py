@@ -64,7 +64,8 @@ class Guard:
     def welcome(self, asked: HTTPConnection) -> RedirectResponse:
         """Returns the answer that sets the cookie and leads to the same page without the token in its address."""
         rest = urlencode([pair for pair in parse_qsl(asked.url.query) if pair[0] != "token"])
-        answer = RedirectResponse(asked.url.path + (f"?{rest}" if rest else ""), 303)
+        path = "/" + asked.url.path.lstrip("/\\")  # two at the beginning would lead to another host
+        answer = RedirectResponse(path + (f"?{rest}" if rest else ""), 303)
         answer.set_cookie(self.cookie, self.token, httponly=True, samesite="lax")
         return answer
 
