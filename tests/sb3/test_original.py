@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import warnings
 
 import equinox as eqx
@@ -16,7 +17,7 @@ from gymnasium import spaces
 from rejeu import sb3
 from rejeu.algorithms.actor_critic.network import sde_std
 from rejeu.core.distributions import Normal, TanhNormal
-from rejeu.sb3.common import env_checker, logger as loggers
+from rejeu.sb3.common import env_checker, logger as loggers, torch_layers
 from rejeu.sb3.common.buffers import HerReplayBuffer
 from rejeu.sb3.common.distributions import Distribution, half_widths
 from rejeu.sb3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise, VectorizedActionNoise
@@ -86,6 +87,21 @@ def test_a_features_extractor_is_used_saved_and_loaded(tmp_path):
     assert sb3.PPO.load(tmp_path / "model").predict(obs, deterministic=True) == model.predict(obs, deterministic=True)
     with pytest.raises(TypeError, match="equinox"):
         ppo(policy_kwargs={"features_extractor_class": AdamW})
+
+
+@pytest.mark.parametrize(
+    ("settings", "is_known"),
+    [
+        ({"features_dim": 7, "widths": [8, 8], "kind": "relu", "extra": None}, True),
+        ({"features_dim": 10**9}, False),
+        ({"weights": "../secret.npy"}, False),
+        ({"widths": [[8]]}, False),
+    ],
+)
+def test_a_file_gives_a_features_extractor_numbers_and_words_only(settings, is_known):
+    name = f"{torch_layers.PREFIX}Features {json.dumps([settings, True])}"
+    torch_layers.register_again(name)
+    assert (torch_layers.ENCODERS.pop(name, None) is not None) == is_known
 
 
 def test_the_width_of_convolutions_and_images_that_are_scaled_already():

@@ -34,7 +34,9 @@ from gymnasium import spaces
 from jax import Array
 
 from rejeu.core.algorithm import PyTree
+from rejeu.core.records import convert, parse_json
 from rejeu.core.spaces import Leaf
+from rejeu.envs.registry import are_plain
 from rejeu.networks import ENCODERS, register_encoder
 from rejeu.networks.layers import own_module
 from rejeu.sb3.common.preprocessing import is_image_space, is_image_space_channels_first, preprocess_obs
@@ -200,13 +202,20 @@ def _register(name: str, extractor: type[eqx.Module], settings: Mapping[str, Any
 
 
 def register_again(name: Any) -> None:
-    """Makes the extractor that a model file names known again, if a class of that name is defined. Imports nothing."""
+    """Makes the extractor that a model file names known again, if a class of that name is defined. Imports nothing.
+
+    Its arguments must be numbers up to a million, words, or lists of these; else it must be given again.
+    """
     if not isinstance(name, str) or not name.startswith(PREFIX) or name in ENCODERS:
         return
-    title, _, settings = name.removeprefix(PREFIX).partition(" ")
+    title, _, text = name.removeprefix(PREFIX).partition(" ")
+    settings, normalize_images = convert(parse_json(text), tuple[dict[str, Any], bool])
+    each = [one for value in settings.values() for one in (value if isinstance(value, list) else [value])]
+    if not all(one is None or are_plain({"value": one}) for one in each):
+        return  # a file may ask the user's class for no path and no size without end
     for extractor in subclasses(BaseFeaturesExtractor):
         if extractor.__name__ == title:
-            _register(name, extractor, *json.loads(settings))
+            _register(name, extractor, settings, normalize_images)
 
 
 def subclasses(kind: type[Any]) -> Iterator[type[Any]]:
