@@ -59,12 +59,13 @@ def test_a_pipe_is_not_waited_for(tmp_path):
         atomic.open_file(tmp_path / "log")
 
 
-def test_a_link_is_found_at_any_depth_of_a_folder(tmp_path):
-    (tmp_path / "run" / "checkpoints").mkdir(parents=True)
-    atomic.check_no_links(tmp_path)
-    (tmp_path / "run" / "checkpoints" / "lock").symlink_to(tmp_path / "nowhere")
+def test_a_link_that_leads_out_of_a_folder_is_found_at_any_depth(tmp_path):
+    (tmp_path / "run" / "wandb" / "run-1").mkdir(parents=True)
+    (tmp_path / "run" / "wandb" / "latest-run").symlink_to("run-1", target_is_directory=True)  # as wandb makes it
+    atomic.check_no_links(tmp_path / "run")
+    (tmp_path / "run" / "wandb" / "run-1" / "lock").symlink_to(tmp_path / "nowhere")
     with pytest.raises(OSError, match="lock is a symbolic link"):
-        atomic.check_no_links(tmp_path)
+        atomic.check_no_links(tmp_path / "run")
 
 
 OPENED_ELSEWHERE = {
@@ -73,8 +74,8 @@ OPENED_ELSEWHERE = {
     ("logging.py", "__init__"),  # likewise
     ("ray.py", "write_marker"),  # likewise, of a name of its own
     ("hub.py", "lay_out"),  # in a new folder
-    ("resume.py", "run_branch"),
-    ("resume.py", "begin"),
+    ("branch.py", "branch"),
+    ("branch.py", "begin"),
     ("work.py", "move_aside"),  # a folder, in one without links
     ("web_file.py", "node"),  # in a temporary folder
     ("c_file.py", "c_run"),

@@ -163,10 +163,15 @@ def check_no_link(path: Path) -> None:
 
 
 def check_no_links(folder: Path) -> None:
-    """Raises ``OSError`` if anything in a folder, at any depth, is a symbolic link: before libraries write into it."""
+    """Raises ``OSError`` if a symbolic link in a folder, at any depth, leads out of it: before libraries write into it.
+
+    Some of these make links inside of it, such as wandb's ``latest-run``.
+    """
+    inside = folder.resolve()
     for root, folders, names in os.walk(folder):
-        for name in (*folders, *names):
-            check_no_link(Path(root, name))
+        for path in (Path(root, name) for name in (*folders, *names)):
+            if path.is_symlink() and not path.resolve().is_relative_to(inside):
+                check_no_link(path)
 
 
 def remove_stale(path: Path, age: float = STALE) -> None:

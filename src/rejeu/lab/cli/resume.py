@@ -24,7 +24,7 @@ def run_resume(arguments: Resume) -> tuple[int, dict[str, Any]]:
     Raises:
         ValueError: for options of a sweep with the folder of a run, or of a run with that of a sweep or a study.
         RunInUseError: if another process trains there.
-        OSError: if there is a symbolic link in the folder.
+        OSError: if a symbolic link leads out of the folder.
     """
     atomic.check_no_links(arguments.run)
     holds_sweep = is_sweep(arguments.run)
