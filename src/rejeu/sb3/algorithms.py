@@ -377,7 +377,7 @@ class Original(Agent):
         """Starts a run; without a GPU on the CPU, whatever ``device`` is."""
         if self.device == "gpu" and jax.default_backend() != "gpu":
             self.device = "cpu"
-        super().start_run(env, state)  # type: ignore[safe-super]
+        super().start_run(env, state)
 
     def make_buffer(self, env: Any) -> Any:
         """Returns a new buffer; one for ``VecNormalize`` stores what was not normalized, and scales what is drawn."""

@@ -192,7 +192,7 @@ def test_sweep_and_its_resume(spy):
     assert main(["sweep", "plan.toml", "--out", "there", "--workers", "3", "--ray", "auto"]) == 0
     assert includes(prepared, plan=Path("plan.toml"), folder=Path("there"), workers=3, ray="auto")
     assert includes(completed, folder="folder", workers=3, ray="auto", retry=False)
-    with mock.patch.object(resume, "is_sweep", return_value=True):
+    with mock.patch("rejeu.lab.cli.resume.is_sweep", return_value=True):
         argv = ["resume", "there", "--env", TYPED, "--env-kwargs", "g=2", "--workers", "3", "--ray", "auto"]
         assert main(argv) == 0
     assert read[-1]["typed"] == RunConfig(env=TYPED, env_kwargs={"g": 2})

@@ -149,9 +149,7 @@ class HumanOutputFormat(KVWriter):
     def __init__(self, filename_or_file: Any, max_length: int = 36) -> None:
         self.max_length = max_length
         self._owns = isinstance(filename_or_file, str | Path)
-        self.file: TextIO = (
-            atomic.open_file(filename_or_file, "w", encoding="utf-8") if self._owns else filename_or_file
-        )
+        self.file: Any = atomic.open_file(filename_or_file, "w", encoding="utf-8") if self._owns else filename_or_file
         if not hasattr(self.file, "write"):
             raise ValueError(f"Expected file or str, got {filename_or_file}")
 
