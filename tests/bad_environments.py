@@ -233,6 +233,86 @@ class RewardWithAxis(Line):
         return self._observe(), float(reward), False, self.time == 10, {}
 
 
+class RewardReadsPosition(Line):
+    """The achieved goal of a relabeled step is not where the environment is."""
+
+    def compute_reward(self, achieved, desired, info):
+        return super().compute_reward(self.position, desired, info)
+
+
+class RewardReadsGoal(Line):
+    def compute_reward(self, achieved, desired, info):
+        return -np.abs(achieved - self.goal)[..., 0]
+
+    def step(self, action):
+        obs, _, *flags, info = super().step(action)
+        return obs, float(self.compute_reward(self.position, self.goal, {})), *flags, info
+
+
+class RewardCounts(Line):
+    def compute_reward(self, achieved, desired, info):
+        self.calls = getattr(self, "calls", 0) + 1
+        return super().compute_reward(achieved, desired, info) - 0.01 * self.calls
+
+
+class RewardInPlace(Line):
+    def step(self, action):
+        position = self.position + action
+        answer = super().step(action)
+        self.position = position
+        return self._observe(), *answer[1:]
+
+    def compute_reward(self, achieved, desired, info):
+        achieved -= desired
+        return super().compute_reward(achieved, 0.0, info)
+
+
+class SameReward(Line):
+    """Has a tolerance that no goal passes."""
+
+    def compute_reward(self, achieved, desired, info):
+        return np.zeros(np.shape(achieved)[:-1], np.float32) - 1.0
+
+
+class RewardOfNothing(Line):
+    """Divides by the distance where ``step`` does not."""
+
+    def compute_reward(self, achieved, desired, info):
+        return np.where(achieved == desired, np.nan, super().compute_reward(achieved, desired, info)[..., None])[..., 0]
+
+
+class RewardsAsText(Line):
+    def compute_reward(self, achieved, desired, info):
+        reward = super().compute_reward(achieved, desired, info)
+        return reward.astype(str) if np.ndim(reward) else reward
+
+
+class EndsAtGoal(Line):
+    def __init__(self):
+        super().__init__(stops=True)
+
+
+class TerminatedReadsPosition(EndsAtGoal):
+    def compute_terminated(self, achieved, desired, info):
+        return (np.abs(self.position - desired) < 0.5)[..., 0]
+
+
+class TerminatedAsReward(Line):
+    def compute_terminated(self, achieved, desired, info):
+        return self.compute_reward(achieved, desired, info)
+
+
+class SuccessAsText(Line):
+    success: Any = "yes"
+
+    def step(self, action):
+        return *super().step(action)[:4], {"is_success": self.success}
+
+
+class SuccessOfParts(SuccessAsText):
+    success = np.array([True, False])
+
+
 class OddTerminated(Line):
     def compute_terminated(self, achieved, desired, info):
         return np.ones(np.shape(achieved)[:-1], bool)
@@ -320,5 +400,26 @@ EVERY: dict[str, Fault] = {
     "mean reward": Fault(MeanReward, "error", "of many goals at once .* of the same goals one by one", None),
     "row reward": Fault(RowReward, "warning", r"compute_reward .*\(.*rejeu then calls it row by row", None),
     "reward with axis": Fault(RewardWithAxis, "warning", r"compute_reward .*\(.*rejeu then calls it row by row", None),
+    "reward reads position": Fault(
+        RewardReadsPosition,
+        "error",
+        "compute_reward of the same two goals gave -?0.0 after one step and -1.0 later",
+        None,
+    ),
+    "reward reads goal": Fault(RewardReadsGoal, "error", "same two goals gave .* it reads something else", None),
+    "reward counts": Fault(RewardCounts, "error", "same two goals gave .* it reads something else", None),
+    "reward in place": Fault(RewardInPlace, "error", "compute_reward changes its arguments in place", None),
+    "same reward": Fault(SameReward, "warning", r"gave -1.0 for each of \d+ pairs of goals, also of equal ones", None),
+    "reward of nothing": Fault(
+        RewardOfNothing, "error", "compute_reward of goals of other steps returned the reward nan, expected", None
+    ),
+    "rewards as text": Fault(RewardsAsText, "warning", r"dtype <U32, expected numbers \(\d+,\)", None),
+    "ends at goal": Fault(EndsAtGoal, "warning", "terminated at its goal, and there is no compute_terminated", None),
+    "terminated reads position": Fault(
+        TerminatedReadsPosition, "error", "compute_terminated of the same two goals gave True after one step", None
+    ),
+    "terminated as reward": Fault(TerminatedAsReward, "error", "of one goal returned terminated=.*-1.0.*a bool", None),
+    "success as text": Fault(SuccessAsText, "warning", "'is_success': 'yes'}, expected one bool", None),
+    "success of parts": Fault(SuccessOfParts, "warning", r"'is_success': array\(.*, expected one bool", None),
     "odd terminated": Fault(OddTerminated, "error", "compute_terminated .* True .* step .*terminated=False", None),
 }

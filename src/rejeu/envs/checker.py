@@ -28,10 +28,10 @@ from rejeu.core.spaces import (
     random_action,
 )
 from rejeu.envs import masks, validation
-from rejeu.envs.base import SEEDS_END
+from rejeu.envs.base import SEEDS_END, success_of
 from rejeu.envs.functional.gym_env import GymnasiumEnv
 from rejeu.envs.functional.protocol import FunctionalEnv
-from rejeu.envs.goals import attribute, one_number
+from rejeu.envs.goals import attribute, goal_functions, is_batch, one_number
 
 MOST_STEPS = 2_000
 """Random steps after which episodes are assumed never to end, in an environment that declares no time limit."""
@@ -80,15 +80,18 @@ class SeenStep(NamedTuple):
     terminated: bool
     truncated: bool
     info: dict[str, Any]
+    judged: dict[str, list[Any]]
+    """Results of each function of goals for the :func:`_pairs`, right after the step."""
 
 
 def check_env(env: gym.Env | FunctionalEnv, warn: bool = True, skip_render_check: bool = True) -> None:
     """Runs some episodes of an environment; raises its errors and warns about its other problems.
 
     Errors: observations whose structure, shape or dtype differs from the space, numbers that are not finite, rewards and
-    flags of the wrong type, a reset without seed or info, a ``compute_reward`` that disagrees with ``step``. Warnings:
-    numbers outside of the bounds, time limits reported as ``terminated``, episodes that never end, what Gymnasium's checker
-    finds (such as resets that a seed does not reproduce), and observations that are hard to learn from.
+    flags of the wrong type, a reset without seed or info, a ``compute_reward`` that disagrees with ``step`` or reads more than
+    its arguments. Warnings: numbers outside of the bounds, time limits reported as ``terminated``, episodes that never end,
+    those that end at a goal without ``compute_terminated``, what Gymnasium's checker finds (such as resets that a seed does
+    not reproduce), and observations that are hard to learn from.
     :func:`findings` returns all of them; ``rejeu check ENV`` prints them.
 
     Args:
@@ -178,11 +181,15 @@ def _play(env: gym.Env, found: dict[str, Finding], effort: Effort) -> list[SeenS
             _check_step(env.step(env.action_space.sample()), space, found)
         return None
     seen: list[SeenStep] = []
+    functions = _functions_of_goals(env)
+    seeks_end = effort.is_patient and _lacks_terminated(env)
     limit, length = known_limit(env), 0
     lengths: list[int] = []
     at_limit: list[bool] = []
     until, info = time.monotonic() + effort.seconds, begun[1]
-    while len(seen) < effort.most_steps and not (len(seen) >= effort.enough_steps and len(lengths) >= ENOUGH_EPISODES):
+    while len(seen) < effort.most_steps:
+        if len(seen) >= effort.enough_steps and len(lengths) >= ENOUGH_EPISODES and not seeks_end:
+            break
         is_endless = effort.is_patient and not lengths and limit is None
         if len(seen) >= effort.enough_steps and time.monotonic() > until and not is_endless:
             break
@@ -197,7 +204,10 @@ def _play(env: gym.Env, found: dict[str, Finding], effort: Effort) -> list[SeenS
         is_next = effort.is_patient and length > 0
         if is_next and (lost := validation.lost_change(space, seen[-1].obs, kept)) is not None:
             found.setdefault("resolution", Finding("warning", lost))
-        seen.append(SeenStep(kept, reward, terminated, truncated, copy.deepcopy(info)))
+        seen.append(SeenStep(kept, reward, terminated, truncated, copy.deepcopy(info), {}))
+        seeks_end = seeks_end and not terminated and success_of(info) != 1.0 and len(seen) < QUICK.most_steps
+        for name, function in functions.items() if len(seen) <= MOST_GOALS else ():
+            seen[-1].judged[name] = [_attempt(function, *pair, info) for pair in _pairs(seen[0], seen[-1])]
         length += 1
         if terminated or truncated:
             lengths.append(length)
@@ -247,6 +257,13 @@ def _check_step(answer: Any, space: gym.Space, found: dict[str, Finding]) -> boo
     obs, _, terminated, truncated, info = answer
     if "step" not in faults:
         _check_observation(obs, space, found, "step")
+    success = info.get("is_success", info.get("success")) if isinstance(info, dict) else None
+    if success is not None and (np.size(success) != 1 or np.asarray(success).dtype.kind not in "biuf"):
+        text = (
+            f"step returned the info {{'is_success': {success!r:.80}}}, expected one bool; an array counts as a success "
+            "where all its numbers are at least 1, and what is no number as unknown"
+        )
+        found.setdefault("success", Finding("warning", text))
     if isinstance(info, dict) and info.get("TimeLimit.truncated") and not truncated:
         text = (
             f"step returned info['TimeLimit.truncated']={info['TimeLimit.truncated']!r} with terminated={terminated} and "
@@ -307,8 +324,8 @@ def goal_findings(env: gym.Env, seen: Sequence[SeenStep], keeps_infos: bool = Fa
         check_goal_space(env.observation_space)
     except ValueError as error:
         return [Finding("error", str(error))]
-    functions = {name: attribute(env, name) for name in ("compute_reward", "compute_terminated")}
-    if functions["compute_reward"] is None:
+    functions = _functions_of_goals(env)
+    if "compute_reward" not in functions:
         text = (
             "observations with a desired_goal need the method compute_reward(achieved_goal, desired_goal, info), and "
             "there is none; add it, for hindsight replay"
@@ -316,8 +333,42 @@ def goal_findings(env: gym.Env, seen: Sequence[SeenStep], keeps_infos: bool = Fa
         return [Finding("error", text)]
     ended = [one for one in seen if one.terminated][: MOST_GOALS // 4]
     rows = [*seen[:MOST_GOALS], *ended]
-    first = [next(_goal_faults(name, f, rows, keeps_infos), None) for name, f in functions.items() if f is not None]
+    env.reset()  # to another state than that of any step
+    first = [next(_goal_faults(name, f, rows, keeps_infos), None) for name, f in functions.items()]
+    if _lacks_terminated(env):
+        first.append(next(_ends_at_goals(functions["compute_reward"], ended), None))
     return [Finding(*fault) for fault in first if fault is not None]
+
+
+def _functions_of_goals(env: gym.Env) -> dict[str, Callable[..., Any]]:
+    """Returns those functions that an environment with goals has, by name."""
+    keys = env.observation_space.spaces if isinstance(env.observation_space, spaces.Dict) else ()
+    names = ("compute_reward", "compute_terminated") if {*GOAL_KEYS} <= {*keys} else ()
+    return {name: function for name in names if (function := attribute(env, name)) is not None}
+
+
+def _lacks_terminated(env: gym.Env) -> bool:
+    """Returns whether hindsight replay does not know where the goals of an environment end its episodes."""
+    functions = goal_functions(env)
+    return functions is not None and functions.terminated is None
+
+
+def _pairs(first: SeenStep, row: SeenStep) -> tuple[tuple[Any, Any], tuple[Any, Any]]:
+    """Returns goals that are met if achieved is read from the environment after ``row``, and if desired is."""
+    return (_goals(first)[0], _goals(row)[0]), (_goals(row)[1], _goals(first)[0])
+
+
+def _ends_at_goals(reward: Callable[..., Any], ended: Sequence[SeenStep]) -> Iterator[tuple[Level, str]]:
+    """Yields advice where an episode ended at its goal, in an environment without ``compute_terminated``."""
+    for row in ended:
+        _, desired = _goals(row)
+        is_best = _agree(row.reward, one_number(_attempt(reward, desired, desired, row.info)))
+        if is_best or success_of(row.info) == 1.0:
+            yield (
+                "warning",
+                "an episode terminated at its goal, and there is no compute_terminated(achieved_goal, desired_goal, info); "
+                "add it, or hindsight replay teaches that episodes go on at all other goals",
+            )
 
 
 def _goal_faults(
@@ -325,12 +376,23 @@ def _goal_faults(
 ) -> Iterator[tuple[Level, str]]:
     """Yields the problems with ``compute_reward`` or ``compute_terminated``, the worst first."""
     for row in rows:
-        own = one_number(function(*_goals(row), row.info))
-        if np.shape(own) != ():
-            yield "error", f"{name} returned the shape {np.shape(own)} of one goal, expected one number; index it"
+        goals = copy.deepcopy(_goals(row))
+        own = one_number(function(*goals, row.info))
+        if (fault := _result_fault(name, own)) is not None:
+            yield "error", f"{name} of one goal returned {fault}"
+        if not all(map(np.array_equal, goals, _goals(row))):
+            yield "error", f"{name} changes its arguments in place; compute new arrays: achieved_goal - desired_goal"
+        for pair, before in zip(_pairs(rows[0], row), row.judged.get(name, ()), strict=False):
+            after = _attempt(function, *pair, row.info)
+            if not _agree(one_number(before), one_number(after)):
+                yield (
+                    "error",
+                    f"{name} of the same two goals gave {before} after one step and {after} later: it reads something else, "
+                    "such as the state of the environment; compute it from its arguments alone",
+                )
         yield from _against_step(name, own, row)
         alone = own if keeps_infos else _attempt(function, *_goals(row), {})
-        if isinstance(alone, Exception) or not _agree(own, one_number(alone)):
+        if not _agree(own, one_number(alone)):
             yield (
                 "error",
                 f"{name} gave {own} with the info of the step, and {_describe_result(alone)} with an empty info; let it "
@@ -361,17 +423,20 @@ def _against_batches(name: str, function: Callable[..., Any], rows: Sequence[See
     achieved, desired = np.concatenate([achieved] * 2), np.concatenate([np.roll(desired, 1, axis=0), achieved])
     single = [one_number(_attempt(function, a, d, {})) for a, d in zip(achieved, desired, strict=True)]
     for one in single:
-        if isinstance(one, Exception):
-            yield (
-                "error",
-                f"{name} of goals of other steps {_describe_result(one)}; it must take any goals of the space",
-            )
-    whole = _attempt(function, achieved, desired, {})
-    if isinstance(whole, Exception) or np.shape(whole) != (len(achieved),):
-        what = _describe_result(whole) if isinstance(whole, Exception) else f"gave the shape {np.shape(whole)}"
+        if (fault := _result_fault(name, one)) is not None:
+            yield "error", f"{name} of goals of other steps returned {fault}; it must take any goals of the space"
+    if name == "compute_reward" and _agree(single, single[0]):
         yield (
             "warning",
-            f"{name} of {len(achieved)} goals at once {what}, expected ({len(achieved)},); rejeu then calls it row by "
+            f"compute_reward gave {single[0]} for each of {len(single)} pairs of goals, also of equal ones; let it compare "
+            "achieved_goal with desired_goal, with a tolerance that some pass and some do not",
+        )
+    whole = _attempt(function, achieved, desired, {})
+    if isinstance(whole, Exception) or not is_batch(whole, len(achieved)):
+        what = _describe_result(whole) if isinstance(whole, Exception) else f"gave {validation.describe_value(whole)}"
+        yield (
+            "warning",
+            f"{name} of {len(achieved)} goals at once {what}, expected numbers ({len(achieved)},); rejeu then calls it row by "
             "row, which is slow: compute over the last axis, as np.linalg.norm(achieved - desired, axis=-1) does",
         )
     elif not _agree(whole, np.array(single)):
@@ -383,6 +448,14 @@ def _against_batches(name: str, function: Callable[..., Any], rows: Sequence[See
         )
 
 
+def _result_fault(name: str, result: Any) -> str | None:
+    """Returns the fault of the result for one pair of goals, None without one."""
+    if isinstance(result, Exception):
+        return f"nothing, but {_describe_result(result)}"
+    is_reward = name == "compute_reward"
+    return validation.reward_fault(result, strict=True) if is_reward else validation.flag_fault("terminated", result)
+
+
 def _goals(row: SeenStep) -> tuple[Any, Any]:
     _, achieved, desired = (row.obs[key] for key in GOAL_KEYS)
     return achieved, desired
@@ -391,14 +464,17 @@ def _goals(row: SeenStep) -> tuple[Any, Any]:
 def _attempt(function: Callable[..., Any], *arguments: Any) -> Any:
     """Returns the result of a function, or the exception that it raised."""
     try:
-        return function(*arguments)
+        return function(*copy.deepcopy(arguments))
     except Exception as error:  # whatever it raises of goals that it did not expect
         return error
 
 
 def _agree(one: Any, two: Any) -> bool:
-    first, second = np.asarray(one, np.float64), np.asarray(two, np.float64)
-    return bool(np.allclose(first, second, rtol=1e-4, atol=1e-5))
+    try:
+        first, second = np.asarray(one, np.float64), np.asarray(two, np.float64)
+    except (TypeError, ValueError):  # of errors, and of what is no number
+        return type(one) is type(two)
+    return bool(np.allclose(first, second, rtol=1e-4, atol=1e-5, equal_nan=True))
 
 
 def _describe_result(result: Any) -> str:

@@ -119,6 +119,11 @@ def one_number(value: Any) -> Any:
     return np.asarray(value).reshape(()) if np.shape(value) == (1,) else value
 
 
+def is_batch(values: Any, n: int) -> bool:
+    """Returns whether these are ``n`` numbers or bools."""
+    return np.shape(values) == (n,) and np.asarray(values).dtype.kind in "biuf"
+
+
 def is_vectorized(
     function: Callable[..., Any], by_row: Callable[..., np.ndarray], achieved: np.ndarray, desired: np.ndarray
 ) -> bool:
@@ -127,7 +132,7 @@ def is_vectorized(
         whole = np.asarray(function(achieved, desired, {}))
     except Exception:  # a function of one row can raise anything for a batch; it is then called row by row
         return False
-    if whole.shape != (len(achieved),):
+    if not is_batch(whole, len(achieved)):
         return False
     rows = by_row(achieved[:8], desired[:8])
     return np.allclose(whole[:8].astype(np.float64), rows.astype(np.float64), rtol=1e-4, atol=1e-5)
