@@ -121,3 +121,29 @@ def test_what_an_agent_does_not_have_is_said(tmp_path):
     loaded = rejeu.SAC.load(small_sac(Counter()).save(tmp_path / "model"))
     with pytest.raises(ValueError, match="no environment and so no replay buffer"):
         loaded.save_replay_buffer(tmp_path / "buffer")
+
+
+def test_numbers_of_numpy_are_taken_as_those_of_python():
+    env = rejeu.make_vector(Counter, np.int64(2))
+    shape = {"net_arch": [np.int64(8)]}
+    config = rejeu.SAC(
+        "MlpPolicy",
+        env,
+        batch_size=np.int64(8),
+        train_freq=(np.int32(1), "episode"),
+        gamma=np.float32(0.5),
+        use_sde=np.bool_(False),
+        policy_kwargs=shape,
+        seed=0,
+    ).config
+    values = config.batch_size, config.train_freq[0], config.gamma, config.use_sde, config.policy_kwargs.net_arch[0]
+    assert values == (8, 1, 0.5, False, 8)
+    assert [*map(type, values)] == [int, int, float, bool, int]
+    with pytest.raises(ValueError, match="batch_size=0 must be a whole number of at least 1"):
+        sac(Counter(), batch_size=np.int64(0))()
+
+
+@pytest.mark.parametrize("callback", [5, [5], "Checkpoint"])
+def test_a_callback_that_cannot_be_called_is_named(callback):
+    with pytest.raises(TypeError, match=r"callback=.* must be a function \(agent, progress\), or a list of such"):
+        small_sac(Counter()).learn(5, callback=callback)

@@ -80,8 +80,20 @@ def step_before(agent: Any, progress: Progress, n_steps: int | None = None) -> i
 
 
 def listed(callback: Callback | Iterable[Callback] | None) -> list[Callback]:
-    """Returns one callback, several or none as a list."""
-    return [] if callback is None else [callback] if callable(callback) else [*callback]
+    """Returns one callback, several or none as a list.
+
+    Raises:
+        TypeError: if one cannot be called.
+    """
+    if callback is None:
+        return []
+    callbacks = [*callback] if isinstance(callback, Iterable) and not callable(callback) else [callback]
+    for function in callbacks:
+        if not callable(function):
+            raise TypeError(
+                f"callback={function!r:.80} must be a function (agent, progress), or a list of such functions"
+            )
+    return callbacks
 
 
 def in_order(callbacks: Iterable[Callback]) -> list[Callback]:

@@ -72,8 +72,14 @@ def whole_seed(seed: Any) -> int:
 
 
 def is_number(value: Any) -> bool:
-    """Returns whether a value is a number that is finite as a float, and not True or False; one of 400 digits is not."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
+    """Returns whether a value is a number that is finite as a float, and not True or False; one of 400 digits is not.
+
+    >>> import numpy as np
+    >>> is_number(np.int64(3)), is_number(np.bool_(True)), is_number("3")
+    (True, False, False)
+    """
+    is_real = isinstance(value, numbers.Integral | float) and not isinstance(value, bool)
+    return is_real and abs(value) <= sys.float_info.max
 
 
 def flag(key: str, value: Any) -> bool:
@@ -87,10 +93,19 @@ def flag(key: str, value: Any) -> bool:
     return value
 
 
+def without_numpy(value: Any) -> Any:
+    """Returns numbers and bools of NumPy as Python's, also those in lists and tuples; anything else unchanged."""
+    if type(value).__module__ == "numpy" and getattr(value, "shape", None) == ():  # which is not imported for --help
+        return value.item()
+    return type(value)(map(without_numpy, value)) if type(value) in (list, tuple) else value
+
+
 def coerce(
     config: Any, keys: str | tuple[str, ...], converter: Callable[..., Any], optional: bool = False, **limits: Any
 ) -> None:
     """Replaces fields of a frozen dataclass by ``converter(key, value, **limits)``; for use in ``__post_init__``.
+
+    Numbers of NumPy are converted to Python's before.
 
     Args:
         config: the dataclass under construction.
@@ -103,7 +118,7 @@ def coerce(
         value = getattr(config, key)
         if not (optional and value is None):
             most = {"most": MOST[key]} if converter is whole and key in MOST else {}
-            assign(config, **{key: converter(key, value, **{**most, **limits})})
+            assign(config, **{key: converter(key, without_numpy(value), **{**most, **limits})})
 
 
 def assign(config: Any, **values: Any) -> None:

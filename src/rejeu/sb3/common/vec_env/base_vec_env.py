@@ -199,7 +199,8 @@ class VecEnv(ABC):
             )
 
     def _get_indices(self, indices: Indices) -> list[int]:
-        chosen = range(self.num_envs) if indices is None else [indices] if isinstance(indices, int) else indices
+        is_index = isinstance(indices, int | np.integer)
+        chosen: Any = range(self.num_envs) if indices is None else [indices] if is_index else indices
         return [range(self.num_envs)[i] for i in chosen]
 
 
