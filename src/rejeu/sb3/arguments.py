@@ -96,7 +96,7 @@ def convert_buffer(settings: dict[str, Any]) -> None:
     if isinstance(kind, type) and issubclass(kind, buffers.ReplayBuffer):
         if kind.__name__ not in REPLAY_BUFFERS and kind.__module__ != buffers.__name__:
             raise TypeError(
-                f"replay_buffer_class={kind.__name__}: a class of your own derives from rejeu.replay.ReplayBuffer, "
+                f"replay_buffer_class={kind.__name__}: a class of your own derives from rejeu.ReplayBuffer, "
                 "which stores every observation once; the classes of rejeu.sb3.common.buffers show an agent's"
             )
         if kind is buffers.NStepReplayBuffer:

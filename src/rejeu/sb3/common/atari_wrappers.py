@@ -130,7 +130,7 @@ class WarpFrame(gym.ObservationWrapper):
 
     def __init__(self, env: gym.Env, width: int = 84, height: int = 84) -> None:
         super().__init__(env)
-        with requires("WarpFrame", "opencv-python-headless", "opencv-python-headless"):
+        with requires("WarpFrame", "opencv-python-headless"):
             import cv2
         self._cv2 = cv2
         self.width, self.height = width, height
