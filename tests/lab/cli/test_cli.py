@@ -198,6 +198,12 @@ def test_an_environment_that_fails_to_render_has_no_video(tmp_path, capsys):
     assert {path.name for path in (tmp_path / "run").iterdir()} - {"warnings.txt"} == FILES - {"video.mp4"}
 
 
+def test_where_jax_is_not_installed_a_command_says_what_to_install(capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rejeu.lab.cli.list", None)
+    monkeypatch.setattr(cli.errors, "installed", {"msgspec": "0.19"}.get)
+    assert "only rejeu.load_policy can do without: install them" in error_of(capsys, "list")
+
+
 def test_without_the_video_extra_the_run_goes_on_and_says_so(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)

@@ -105,6 +105,10 @@ def place_of(error: Exception) -> str:
         is_installed = "site-packages" in path.parts or any(path.is_relative_to(folder) for folder in not_own)
         if path.is_file() and not is_installed:
             return f" ({path.name}, line {line}, in {frame.f_code.co_name})"
+    if isinstance(error, ModuleNotFoundError) and errors.installed("jax") is None:
+        return (
+            "; rejeu is installed without its dependencies, which only rejeu.load_policy can do without: install them"
+        )
     if "values to unpack (expected 5" in str(error):  # by a wrapper of Gymnasium
         return "; step must return observation, reward, terminated, truncated and info"
     return ""
