@@ -4,11 +4,14 @@
     python scripts/sb3_parity.py           # prints the comparison of names
 
 ``record`` writes the public classes and functions of each module, with their arguments and methods, to
-``tests/data/sb3/signatures.json``. Names that begin with an underscore are left out.
+``tests/data/sb3/signatures.json``, and to ``visible_names.json`` beside it what else can be imported from each module: its
+constants and types, and what it passes on of other modules of the packages. Names that begin with an underscore are left out,
+and so are type variables.
 """
 
 from __future__ import annotations
 
+import ast
 import enum
 import importlib
 import inspect
@@ -16,11 +19,14 @@ import json
 import pkgutil
 import statistics
 import sys
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from types import ModuleType
+from typing import Any, TypeVar
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA = ROOT / "tests" / "data" / "sb3" / "signatures.json"
+VISIBLE = DATA.with_name("visible_names.json")
 GUIDE = ROOT / "trials" / "results" / "sb3_guide.json"
 PACKAGES = {"stable_baselines3": "rejeu.sb3", "sb3_contrib": "rejeu.sb3_contrib"}
 """The original's packages, and where their names are here."""
@@ -35,25 +41,52 @@ def arguments_of(function: Any) -> list[str]:
     return [one.name for one in given if one.kind not in (one.VAR_POSITIONAL, one.VAR_KEYWORD) and one.name != "self"]
 
 
+def modules_of(package: str) -> Iterator[ModuleType]:
+    """Yields an installed package and its modules."""
+    parent = importlib.import_module(package)
+    yield parent
+    for info in pkgutil.walk_packages(parent.__path__, f"{package}."):
+        try:
+            yield importlib.import_module(info.name)
+        except ImportError:  # of something optional
+            continue
+
+
 def recorded() -> dict[str, Any]:
     """Returns the public classes and functions of the installed packages, by module."""
-    found: dict[str, Any] = {}
+    signatures: dict[str, Any] = {}
     for package in PACKAGES:
-        module = importlib.import_module(package)
-        names = [package, *(info.name for info in pkgutil.walk_packages(module.__path__, f"{package}."))]
-        for name in names:
-            try:
-                importlib.import_module(name)
-            except ImportError:  # of something optional
-                continue
+        for module in modules_of(package):
             own = {
-                key: described(one, package)
-                for key, one in vars(importlib.import_module(name)).items()
-                if callable(one) and not key.startswith("_") and getattr(one, "__module__", None) == name
+                key: described(value, package)
+                for key, value in vars(module).items()
+                if callable(value) and not key.startswith("_") and getattr(value, "__module__", None) == module.__name__
             }
             if own:
-                found[name] = own
-    return found
+                signatures[module.__name__] = own
+    return signatures
+
+
+def visible() -> dict[str, list[str]]:
+    """Returns what can be imported from each module of the installed packages, without what is of third parties."""
+    return {module.__name__: sorted({*bound_by(module)}) for package in PACKAGES for module in modules_of(package)}
+
+
+def bound_by(module: ModuleType) -> Iterator[str]:
+    """Yields the public names that the code of a module defines, or imports from the packages."""
+    for node in ast.walk(ast.parse(Path(str(module.__file__)).read_text(encoding="utf-8"))):
+        names: list[str] = []
+        if isinstance(node, ast.Module | ast.If | ast.Try):
+            statements = [*node.body, *getattr(node, "orelse", ())]
+            names += [one.name for one in statements if isinstance(one, ast.FunctionDef | ast.ClassDef)]
+            targets = [target for one in statements if isinstance(one, ast.Assign) for target in one.targets]
+            names += [target.id for target in targets if isinstance(target, ast.Name)]
+        elif isinstance(node, ast.ImportFrom) and (node.module or "").partition(".")[0] in PACKAGES:
+            names += [alias.asname or alias.name for alias in node.names]
+        for name in names:
+            value = getattr(module, name, None)
+            if not name.startswith("_") and value is not None and not isinstance(value, ModuleType | TypeVar):
+                yield name
 
 
 def described(one: Any, package: str) -> dict[str, list[str]]:
@@ -117,6 +150,21 @@ def compared() -> tuple[dict[str, tuple[int, int, list[str]]], dict[str, set[str
     return modules, arguments, methods
 
 
+def importable() -> dict[str, list[tuple[str, bool]]]:
+    """Returns the modules that have each name in the original, and whether it can be imported from them here."""
+    modules: dict[str, list[tuple[str, bool]]] = {}
+    for path, names in json.loads(VISIBLE.read_text(encoding="utf-8")).items():
+        package = path.partition(".")[0]
+        here = PACKAGES[package] + path[len(package) :]
+        try:
+            module: Any = importlib.import_module(here)
+        except ModuleNotFoundError:
+            module = None
+        for name in names:
+            modules.setdefault(name, []).append((here, hasattr(module, name)))
+    return modules
+
+
 def names_of(lacking: dict[str, set[str]]) -> str:
     """Returns what is lacking, with the class or function that lacks it and the number of others."""
     shown = []
@@ -136,7 +184,16 @@ def text() -> str:
     for path, (there, total, missing) in modules.items():
         if missing:
             lines.append(f"| `{path}` | {there} of {total} | {', '.join(f'`{name}`' for name in missing)} |")
+    visible_names = importable()
+    present = [has for modules_with_it in visible_names.values() for _, has in modules_with_it]
+    nowhere = sorted(
+        name for name, modules_with_it in visible_names.items() if not any(has for _, has in modules_with_it)
+    )
     lines += [
+        "",
+        f"{sum(present)} of {len(present)} names, with constants, types and those that a module passes on, can be "
+        f"imported from the modules where the original has them. In no module are "
+        f"{', '.join(f'`{name}`' for name in nowhere)}.",
         "",
         f"Arguments that are not taken: {names_of(arguments)}.",
         "",
@@ -218,7 +275,8 @@ def same_scripts() -> str:
 
 if __name__ == "__main__":
     if sys.argv[1:] == ["record"]:
-        one_line = ",\n".join(f"{json.dumps(path)}: {json.dumps(names)}" for path, names in recorded().items())
-        DATA.write_text(f"{{\n{one_line}\n}}\n", encoding="utf-8")
+        for path, content in ((DATA, recorded()), (VISIBLE, visible())):
+            rows = ",\n".join(f"{json.dumps(name)}: {json.dumps(value)}" for name, value in content.items())
+            path.write_text(f"{{\n{rows}\n}}\n", encoding="utf-8")
     else:
         print(text())

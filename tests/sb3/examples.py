@@ -20,6 +20,7 @@ import numpy as np
 from rejeu.sb3 import A2C, DQN, PPO, SAC, HerReplayBuffer
 from rejeu.sb3.common import callbacks as cb
 from rejeu.sb3.common.env_util import make_vec_env
+from rejeu.sb3.common.envs import BitFlippingEnv, FakeImageEnv, SimpleMultiObsEnv
 from rejeu.sb3.common.evaluation import evaluate_policy
 from rejeu.sb3.common.logger import TensorBoardOutputFormat
 from rejeu.sb3.common.policies import ActorCriticPolicy
@@ -29,7 +30,7 @@ from rejeu.sb3.common.vec_env import (
     SubprocVecEnv,
     VecNormalize,
 )
-from tests.sb3.envs import BitFlippingEnv, FakeImageEnv, InvalidActionEnvDiscrete, SimpleMultiObsEnv
+from rejeu.sb3_contrib.common.envs import InvalidActionEnvDiscrete
 
 
 @dataclass(frozen=True)

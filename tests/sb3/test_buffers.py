@@ -11,8 +11,8 @@ import pytest
 from rejeu.replay.ring import Ring
 from rejeu.sb3 import A2C, DQN, SAC, HerReplayBuffer
 from rejeu.sb3.common import buffers
+from rejeu.sb3.common.envs import BitFlippingEnv
 from rejeu.sb3.common.vec_env import DummyVecEnv, VecNormalize
-from tests.sb3.envs import BitFlippingEnv
 from tests.tiers import only
 
 pytestmark = pytest.mark.usefixtures("learners_are_shared")

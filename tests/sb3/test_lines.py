@@ -18,6 +18,7 @@ from rejeu.sb3.common import (
     atari_wrappers,
     base_class,
     distributions,
+    envs,
     logger as loggers,
     save_util,
     torch_layers,
@@ -29,7 +30,6 @@ from rejeu.sb3.common.env_util import make_atari_env, make_vec_env
 from rejeu.sb3.common.monitor import ResultsWriter, load_results
 from rejeu.sb3.common.vec_env import DummyVecEnv, VecNormalize, VecTransposeImage, is_vecenv_wrapped
 from rejeu.sb3.common.vec_env.base_vec_env import VecEnvWrapper
-from tests.sb3 import envs
 from tests.sb3.test_original import Features
 from tests.tiers import crossed, exhaustive
 

@@ -17,7 +17,7 @@ from gymnasium import spaces
 from rejeu import sb3
 from rejeu.algorithms.actor_critic.network import sde_std
 from rejeu.core.distributions import Normal, TanhNormal
-from rejeu.sb3.common import env_checker, logger as loggers, torch_layers
+from rejeu.sb3.common import env_checker, envs, logger as loggers, torch_layers
 from rejeu.sb3.common.buffers import HerReplayBuffer
 from rejeu.sb3.common.distributions import Distribution, half_widths
 from rejeu.sb3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise, VectorizedActionNoise
@@ -25,7 +25,6 @@ from rejeu.sb3.common.torch_layers import BaseFeaturesExtractor
 from rejeu.sb3.common.utils import get_parameters_by_name
 from rejeu.sb3.common.vec_env import DummyVecEnv, VecCheckNan, VecNormalize
 from rejeu.sb3.policy import ActorCriticPolicy
-from tests.sb3 import envs
 from tests.tiers import exhaustive, only
 
 pytestmark = pytest.mark.usefixtures("learners_are_shared")
@@ -411,12 +410,13 @@ def test_the_checker_renders_if_it_is_asked_to():
 
 def test_contrib_modules_and_masks():
     from rejeu.sb3_contrib import MaskablePPO
+    from rejeu.sb3_contrib.common.envs import InvalidActionEnvDiscrete
     from rejeu.sb3_contrib.common.maskable.evaluation import evaluate_policy
     from rejeu.sb3_contrib.common.maskable.utils import get_action_masks
     from rejeu.sb3_contrib.common.wrappers import ActionMasker, TimeFeatureWrapper
     from rejeu.sb3_contrib.ppo_recurrent import MlpLstmPolicy  # noqa: F401
 
-    env = envs.InvalidActionEnvDiscrete(dim=6, n_invalid_actions=5)
+    env = InvalidActionEnvDiscrete(dim=6, n_invalid_actions=5)
     model = MaskablePPO("MlpPolicy", env, n_steps=8, batch_size=8, **SMALL)
     assert evaluate_policy(model, env, n_eval_episodes=2)[0] == 100.0  # only the right action is left
     assert get_action_masks(ActionMasker(env, lambda inner: np.ones(6))).tolist() == [True] * 6

@@ -53,6 +53,49 @@ PATHS = {
 """Where Stable-Baselines3 has what."""
 
 
+PASSED_ON = {
+    "sb3.ppo.ppo": ["ActorCriticPolicy", "OnPolicyAlgorithm", "RolloutBuffer", "explained_variance"],
+    "sb3.ppo.policies": ["ActorCriticCnnPolicy", "ActorCriticPolicy", "MultiInputActorCriticPolicy"],
+    "sb3.sac.policies": ["BasePolicy", "ContinuousCritic", "NatureCNN", "create_mlp", "get_actor_critic_arch"],
+    "sb3.dqn.dqn": ["LinearSchedule", "OffPolicyAlgorithm", "ReplayBuffer", "polyak_update"],
+    "sb3.common.base_class": ["BaseCallback", "Logger", "Monitor", "VecEnv", "VecNormalize", "set_random_seed"],
+    "sb3.common.policies": ["BaseFeaturesExtractor", "NatureCNN", "create_mlp", "is_image_space", "obs_as_tensor"],
+    "sb3.common.off_policy_algorithm": ["BaseAlgorithm", "HerReplayBuffer", "ReplayBuffer", "VecEnv", "safe_mean"],
+    "sb3.common.callbacks": ["DummyVecEnv", "Logger"],
+    "sb3.common.env_util": ["SubprocVecEnv"],
+    "sb3.common.vec_env.base_vec_env": ["VecEnvIndices", "VecEnvObs", "VecEnvStepReturn"],
+    "sb3.common.vec_env.dummy_vec_env": ["VecEnv"],
+    "sb3.common.envs.bit_flipping_env": ["BitFlippingEnv"],
+    "sb3.common.envs.identity_env": ["FakeImageEnv", "IdentityEnvMultiBinary", "IdentityEnvMultiDiscrete"],
+    "sb3.her.goal_selection_strategy": ["GoalSelectionStrategy", "KEY_TO_GOAL_STRATEGY"],
+    "sb3_contrib.ppo_mask.policies": ["MaskableActorCriticPolicy", "MaskableMultiInputActorCriticPolicy"],
+    "sb3_contrib.ppo_recurrent.policies": ["RecurrentActorCriticCnnPolicy", "RecurrentActorCriticPolicy"],
+    "sb3_contrib.ppo_recurrent.ppo_recurrent": ["BasePolicy", "MlpLstmPolicy"],
+    "sb3_contrib.tqc.tqc": ["OffPolicyAlgorithm", "TQCPolicy"],
+    "sb3_contrib.trpo.policies": ["ActorCriticPolicy"],
+    "sb3_contrib.common.maskable.callbacks": ["EvalCallback", "evaluate_policy"],
+}
+"""What the modules of both packages import from others, and scripts from them."""
+
+
+@pytest.mark.parametrize("path", PASSED_ON)
+def test_modules_pass_names_on_as_those_of_stable_baselines3_do(path):
+    module = importlib.import_module(f"rejeu.{path}")
+    for name in PASSED_ON[path]:
+        assert getattr(module, name) is not None, name
+    with pytest.raises(AttributeError, match=f"module '{module.__name__}' has no attribute 'Polcy'"):
+        module.Polcy  # noqa: B018
+
+
+def test_a_name_is_passed_on_from_the_nearest_module():
+    from rejeu import sb3_contrib
+    from rejeu.sb3.common.evaluation import evaluate_policy
+    from rejeu.sb3_contrib.common.maskable import callbacks
+
+    assert sb3_contrib.common.maskable.evaluation.evaluate_policy is callbacks.evaluate_policy is not evaluate_policy
+    assert importlib.import_module("rejeu.sb3.common.callbacks").evaluate_policy is evaluate_policy
+
+
 @pytest.fixture
 def in_tmp_path(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
@@ -65,6 +108,40 @@ def test_names_stand_where_stable_baselines3_has_them(path):
     for name in PATHS[path]:
         assert hasattr(module, name), name
         assert name in module.__all__
+
+
+@pytest.mark.parametrize("continuous", [False, True])
+def test_bits_are_flipped_until_all_are_one(continuous):
+    from rejeu.sb3.common.envs import BitFlippingEnv
+
+    env = BitFlippingEnv(n_bits=4, continuous=continuous, max_steps=9)
+    obs, _ = env.reset(seed=1)
+    begin = obs["observation"].copy()
+    assert 0 < begin.sum() < 4
+    bits = np.flatnonzero(begin == 0)
+    actions = np.where(np.eye(4)[bits] > 0, 0.5, -0.5) if continuous else bits
+    episode = [env.step(action) for action in actions]
+    assert [step[1] for step in episode] == [-1.0] * (len(episode) - 1) + [0.0]
+    assert [step[2] for step in episode] == [False] * (len(episode) - 1) + [True]
+    assert episode[-1][0]["achieved_goal"].tolist() == [1, 1, 1, 1] == episode[-1][0]["desired_goal"].tolist()
+    assert obs["observation"].tolist() == begin.tolist(), "observations are not changed later"
+    assert env.compute_reward(np.array([[1, 1], [1, 0]]), np.ones((2, 2)), [{}, {}]).tolist() == [0.0, -1.0]
+
+
+def test_the_grid_ends_at_its_last_cell_and_has_walls():
+    from rejeu.sb3.common.envs import SimpleMultiObsEnv
+
+    env = SimpleMultiObsEnv(num_col=2, num_row=3, random_start=False)
+    begin, _ = env.reset(seed=0)
+    left, down, right, up = range(4)
+    for wall in (left, up):
+        obs, reward, *ends, _ = env.step(wall)
+        assert (reward, ends) == (-0.1, [False, False])
+        assert all(np.array_equal(obs[key], begin[key]) for key in begin)
+    path = [env.step(action) for action in (right, down, right, down)]
+    assert [step[1] for step in path] == [-0.1, -0.1, -0.1, 1.0]
+    assert [step[4]["got_to_end"] for step in path] == [step[2] for step in path] == [False, False, False, True]
+    assert env.observation_space.contains(path[-1][0])
 
 
 def test_seeds_and_schedules():

@@ -15,12 +15,11 @@ import pytest
 from gymnasium import spaces
 
 from rejeu.core.distributions import TanhNormal
-from rejeu.sb3.common import distributions, logger as loggers, preprocessing, save_util, utils
+from rejeu.sb3.common import distributions, envs, logger as loggers, preprocessing, save_util, utils
 from rejeu.sb3.common.results_plotter import rolling_window
 from rejeu.sb3.common.torch_layers import create_mlp
 from rejeu.sb3.common.vec_env import DummyVecEnv, VecCheckNan, VecMonitor, VecTransposeImage
 from tests.golden.vec_env_script import Walk
-from tests.sb3 import envs
 
 IMAGE = spaces.Box(0, 255, (36, 40, 3), np.uint8)
 FIRST = spaces.Box(0, 255, (3, 36, 40), np.uint8)

@@ -10,12 +10,10 @@ A function given as a schedule is called with the remaining progress here, from 
 """
 
 import importlib
-import sys
-from collections.abc import Mapping
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from rejeu.algorithms.catalog import CATALOG
+from rejeu.sb3.modules import alias, define
 
 if TYPE_CHECKING:
     from rejeu.agents.zip_files import load_zip
@@ -58,43 +56,11 @@ def __dir__() -> list[str]:
     return sorted({*globals(), *__all__})
 
 
-def define(path: str, names: Mapping[str, Any]) -> None:
-    """Makes names importable from the module ``path``, which has no file of its own. Its parents must exist."""
-    module = ModuleType(path, f"Part of {path.split('.')[1]}'s API.")
-    module.__dict__.update(names, __all__=[*names], __path__=[])
-    sys.modules[path] = module
-    parent, _, last = path.rpartition(".")
-    setattr(sys.modules[parent], last, module)
-
-
-def alias(module: str, *names: str) -> None:
-    """Makes a module known as submodules of itself too, where Stable-Baselines3 has a package of small modules."""
-    for name in names:
-        sys.modules[f"{module}.{name}"] = sys.modules[module]
-        setattr(sys.modules[module], name, sys.modules[module])
-
-
-def define_lazily(path: str, names: Mapping[str, str]) -> None:
-    """Makes names importable from the module ``path``, each by the module that has it, which is imported when it is used."""
-
-    def found(name: str) -> Any:
-        if name not in names:
-            raise AttributeError(f"module {path!r} has no attribute {name!r}")
-        return getattr(importlib.import_module(names[name]), name)
-
-    define(path, {})
-    sys.modules[path].__dict__.update(__getattr__=found, __all__=[*names])
-
-
 POLICIES = ("CnnPolicy", "MlpPolicy", "MultiInputPolicy", "Actor", "DQNPolicy", "QNetwork", "SACPolicy", "TD3Policy")
 for _name, _entry in CATALOG.items():
     _package, _, _last = _entry.original.partition(".")
     if _package == "stable_baselines3":
-        _names = {_name: f"{__name__}.algorithms"} | dict.fromkeys(POLICIES, f"{__name__}.policy")
-        define_lazily(f"{__name__}.{_last}", _names)
+        define(f"{__name__}.{_last}", {}, _name, *POLICIES)
         alias(f"{__name__}.{_last}", _last, "policies")
-define_lazily(
-    f"{__name__}.her",
-    {"HerReplayBuffer": f"{__name__}.common.buffers", "GoalSelectionStrategy": "rejeu.replay.hindsight"},
-)
+define(f"{__name__}.her", {}, "HerReplayBuffer", "GoalSelectionStrategy", "KEY_TO_GOAL_STRATEGY")
 alias(f"{__name__}.her", "goal_selection_strategy", "her_replay_buffer")

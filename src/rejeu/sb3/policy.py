@@ -27,6 +27,7 @@ from rejeu.sb3.common.preprocessing import maybe_transpose
 from rejeu.sb3.common.utils import Tensor, is_vectorized_observation
 
 __all__ = [
+    "Actor",
     "ActorCriticCnnPolicy",
     "ActorCriticPolicy",
     "BaseModel",
@@ -37,6 +38,7 @@ __all__ = [
     "MlpPolicy",
     "MultiInputActorCriticPolicy",
     "MultiInputPolicy",
+    "QNetwork",
     "SACPolicy",
     "TD3Policy",
 ]

@@ -18,13 +18,14 @@ import numpy as np
 from gymnasium import spaces
 
 from rejeu.algorithms.catalog import CATALOG
-from rejeu.sb3 import define
 from rejeu.sb3.algorithms import ARS, QRDQN, TQC, TRPO, CrossQ, MaskablePPO, RecurrentPPO
 from rejeu.sb3.common import distributions
 from rejeu.sb3.common.callbacks import EvalCallback
+from rejeu.sb3.common.envs import IdentityEnv
 from rejeu.sb3.common.evaluation import evaluate_policy as evaluate_by_masks
 from rejeu.sb3.common.policies import ActorCriticPolicy, CnnPolicy, MlpPolicy, MultiInputPolicy
 from rejeu.sb3.common.vec_env.base_vec_env import VecEnv
+from rejeu.sb3.modules import HOMES, alias, define
 from rejeu.sb3.policy import Actor, ContinuousCritic, DQNPolicy, QNetwork, SACPolicy
 
 __all__ = ["ARS", "QRDQN", "TQC", "TRPO", "CrossQ", "MaskablePPO", "MaskableRecurrentPPO", "RecurrentPPO"]
@@ -150,8 +151,23 @@ def is_masking_supported(env: Any) -> bool:
     return not isinstance(env, gym.Env) or env.has_wrapper_attr("action_masks")
 
 
+class InvalidActionEnvDiscrete(IdentityEnv):
+    """An :class:`IdentityEnv` of ``dim`` choices, of which ``n_invalid_actions`` wrong ones are masked."""
+
+    def __init__(self, dim: int | None = None, ep_length: int = 100, n_invalid_actions: int = 0) -> None:
+        super().__init__(dim, ep_length=ep_length)
+        self.n_invalid_actions = n_invalid_actions
+
+    def action_masks(self) -> np.ndarray:
+        """Returns which choices are allowed, ``bool (dim,)``; the right one always is."""
+        n = self.action_space.n  # type: ignore[attr-defined]
+        wrong = np.delete(np.arange(n), self.state)
+        return ~np.isin(np.arange(n), self.np_random.choice(wrong, self.n_invalid_actions, replace=False))
+
+
 MODULES: dict[str, dict[str, Any]] = {
     "common": {},
+    "common.envs": {"InvalidActionEnvDiscrete": InvalidActionEnvDiscrete},
     "common.wrappers": {"ActionMasker": ActionMasker, "TimeFeatureWrapper": TimeFeatureWrapper},
     "common.wrappers.action_masker": {"ActionMasker": ActionMasker},
     "common.wrappers.time_feature": {"TimeFeatureWrapper": TimeFeatureWrapper},
@@ -177,19 +193,20 @@ MODULES: dict[str, dict[str, Any]] = {
     },
 }
 """Names by the module in which sb3-contrib has them."""
+named = {"CnnPolicy": CnnPolicy, "MlpPolicy": MlpPolicy, "MultiInputPolicy": MultiInputPolicy}
 for kind in (QRDQN, TQC, CrossQ, MaskablePPO, TRPO):
-    folder = CATALOG[kind.__name__].original.rpartition(".")[2]
-    named = {"CnnPolicy": CnnPolicy, "MlpPolicy": MlpPolicy, "MultiInputPolicy": MultiInputPolicy}
-    MODULES |= {folder: {kind.__name__: kind, **named}, f"{folder}.{folder}": {kind.__name__: kind}}
     parts = {f"{kind.__name__}Policy": SACPolicy, "Actor": Actor, "Critic": ContinuousCritic}
     parts |= {"QRDQNPolicy": DQNPolicy, "QuantileNetwork": QNetwork, "CrossQCritic": ContinuousCritic}
-    MODULES[f"{folder}.policies"] = named | (parts if CATALOG[kind.__name__].policy else {})
-linear = dict.fromkeys(("LinearPolicy", "ARSLinearPolicy"), "LinearPolicy") | {"MlpPolicy": "MlpPolicy"}
-linear["ARSPolicy"] = "MlpPolicy"
-MODULES |= {"ars": {"ARS": ARS, **linear}, "ars.ars": {"ARS": ARS}, "ars.policies": linear}
+    folder = CATALOG[kind.__name__].original.rpartition(".")[2]
+    MODULES[folder] = {kind.__name__: kind, **named, **(parts if CATALOG[kind.__name__].policy else {})}
+linear = dict.fromkeys(("LinearPolicy", "ARSLinearPolicy"), "LinearPolicy")
+MODULES["ars"] = {"ARS": ARS, **linear, **dict.fromkeys(("MlpPolicy", "ARSPolicy"), "MlpPolicy")}
 lstm = {"CnnLstmPolicy": CnnPolicy, "MlpLstmPolicy": MlpPolicy, "MultiInputLstmPolicy": MultiInputPolicy}
-MODULES |= {"ppo_recurrent": {"RecurrentPPO": RecurrentPPO, **lstm}, "ppo_recurrent.policies": lstm}
-MODULES["ppo_recurrent.ppo_recurrent"] = {"RecurrentPPO": RecurrentPPO}
+MODULES["ppo_recurrent"] = {"RecurrentPPO": RecurrentPPO, **lstm}
 
 for path, names in MODULES.items():
     define(f"{__name__}.{path}", names)
+    HOMES.append(f"{__name__}.{path}")
+    if "." not in path and path != "common":
+        alias(f"{__name__}.{path}", path, "policies")
+alias(f"{__name__}.common.envs", "invalid_actions_env")

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from rejeu.sb3 import define
+from rejeu.sb3.modules import define
 
 
 class RMSpropTFLike:

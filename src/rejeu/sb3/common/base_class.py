@@ -2,11 +2,15 @@
 
 from typing import Any
 
-from rejeu.agents import Agent as BaseAlgorithm, OffPolicyAgent, OnPolicyAgent
+from rejeu.agents import (
+    Agent as BaseAlgorithm,
+    OffPolicyAgent as OffPolicyAlgorithm,
+    OnPolicyAgent as OnPolicyAlgorithm,
+)
 from rejeu.envs.registry import make_env
-from rejeu.sb3 import define
+from rejeu.sb3.modules import define, passes_on
 
-__all__ = ["BaseAlgorithm", "maybe_make_env"]
+__all__ = ["BaseAlgorithm", "OffPolicyAlgorithm", "OnPolicyAlgorithm", "maybe_make_env"]
 
 
 def maybe_make_env(env: Any, verbose: int = 0) -> Any:
@@ -14,5 +18,6 @@ def maybe_make_env(env: Any, verbose: int = 0) -> Any:
     return make_env(env, render_mode="rgb_array") if isinstance(env, str) else env
 
 
-define("rejeu.sb3.common.on_policy_algorithm", {"OnPolicyAlgorithm": OnPolicyAgent})
-define("rejeu.sb3.common.off_policy_algorithm", {"OffPolicyAlgorithm": OffPolicyAgent})
+define("rejeu.sb3.common.on_policy_algorithm", {"OnPolicyAlgorithm": OnPolicyAlgorithm})
+define("rejeu.sb3.common.off_policy_algorithm", {"OffPolicyAlgorithm": OffPolicyAlgorithm})
+passes_on(__name__)

@@ -14,6 +14,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from rejeu.core.algorithm import unmasked
+from rejeu.replay.hindsight import GoalSelectionStrategy
 from rejeu.replay.ring import LAST, TERMINATED
 from rejeu.sb3.common.preprocessing import get_action_dim, get_obs_shape
 from rejeu.sb3.common.type_aliases import (
@@ -26,14 +27,19 @@ from rejeu.sb3.common.utils import Tensor
 from rejeu.sb3.common.vec_env.base_vec_env import TIME_LIMIT_TRUNCATED
 
 __all__ = [
+    "KEY_TO_GOAL_STRATEGY",
     "BaseBuffer",
     "DictReplayBuffer",
     "DictRolloutBuffer",
+    "GoalSelectionStrategy",
     "HerReplayBuffer",
     "NStepReplayBuffer",
     "ReplayBuffer",
     "RolloutBuffer",
 ]
+
+KEY_TO_GOAL_STRATEGY = {strategy.value: strategy for strategy in GoalSelectionStrategy}
+"""Where the goals of hindsight come from, by name."""
 
 
 def by_leaf(function: Callable[..., Any], *observations: Any) -> Any:

@@ -32,6 +32,7 @@ from rejeu.sb3.common.evaluation import evaluate_policy
 from rejeu.sb3.common.vec_env.adapters import dummy_vec_env, identities
 from rejeu.sb3.common.vec_env.base_vec_env import VecEnv
 from rejeu.sb3.common.vec_env.vec_normalize import sync_envs_normalization
+from rejeu.sb3.modules import passes_on
 
 __all__ = [
     "BaseCallback",
@@ -387,3 +388,6 @@ def _evaluation(callback: BaseCallback) -> EvalCallback:
     if not isinstance(callback.parent, EvalCallback):
         raise TypeError(f"{type(callback).__name__} needs evaluations; give it to EvalCallback")
     return callback.parent
+
+
+passes_on(__name__)

@@ -15,6 +15,7 @@ from rejeu.sb3.common.atari_wrappers import AtariWrapper
 from rejeu.sb3.common.monitor import Monitor
 from rejeu.sb3.common.vec_env.base_vec_env import VecEnv, is_wrapped, unwrap_wrapper
 from rejeu.sb3.common.vec_env.dummy_vec_env import DummyVecEnv
+from rejeu.sb3.modules import passes_on
 
 __all__ = ["is_wrapped", "make_atari_env", "make_vec_env", "unwrap_wrapper"]
 
@@ -101,3 +102,6 @@ def made(env_id: str | Callable[..., gym.Env], kwargs: Mapping[str, Any]) -> gym
         if "render_mode" in kwargs or "render_mode" not in str(error):
             raise
         return make_env(env_id, **kwargs)
+
+
+passes_on(__name__)

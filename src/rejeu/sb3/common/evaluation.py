@@ -16,6 +16,7 @@ from rejeu.core.algorithm import Masked
 from rejeu.envs.make import make_vector
 from rejeu.envs.masks import make_masked
 from rejeu.logs.evaluation import MOST_STEPS, cut_off
+from rejeu.sb3.modules import passes_on
 
 __all__ = ["evaluate_policy"]
 
@@ -98,3 +99,6 @@ def evaluate_policy(
     if reward_threshold is not None and not mean > reward_threshold:
         raise AssertionError(f"the mean return {mean:.2f} is not above reward_threshold={reward_threshold:.2f}")
     return (episode_rewards, episode_lengths) if return_episode_rewards else (mean, std)
+
+
+passes_on(__name__)

@@ -1,4 +1,7 @@
 """Policies; see :mod:`rejeu.sb3.policy`."""
 
+from rejeu.sb3.modules import passes_on
 from rejeu.sb3.policy import *  # noqa: F403
 from rejeu.sb3.policy import __all__ as __all__
+
+passes_on(__name__)

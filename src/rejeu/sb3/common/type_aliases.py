@@ -22,6 +22,7 @@ TensorDict = dict[str, np.ndarray]
 TensorIndex = Any
 MaybeCallback = Callback | list[Callback] | None
 PolicyPredictor = Any
+PyTorchObs = Any
 Schedule = Callable[[float], float]
 
 

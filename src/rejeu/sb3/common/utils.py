@@ -21,6 +21,7 @@ from gymnasium import spaces
 
 from rejeu.core import schedules
 from rejeu.core.schedules import Exponential, Linear, TableSchedule
+from rejeu.sb3.modules import passes_on
 
 __all__ = [
     "ConstantSchedule",
@@ -166,6 +167,12 @@ class Device(str):
 def get_device(device: Any = "auto") -> Device:
     """Returns the device of a name; ``"auto"`` and ``"cuda"`` are the CPU where JAX has no GPU."""
     return Device("cuda" if jax.default_backend() == "gpu" and Device(device).type == "cuda" else "cpu")
+
+
+def available_device(device: Any) -> str:
+    """Returns the name of a device, ``"auto"`` for None and, where JAX has no GPU, for those that only PyTorch may have."""
+    name = "auto" if device is None else str(device)
+    return "auto" if name.startswith(("cuda", "mps")) and jax.default_backend() != "gpu" else name
 
 
 class Tensor(np.ndarray):
@@ -336,3 +343,6 @@ def get_system_info(print_info: bool = True) -> tuple[dict[str, str], str]:
     if print_info:
         print(text)
     return info, text
+
+
+passes_on(__name__)

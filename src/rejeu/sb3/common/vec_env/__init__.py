@@ -1,5 +1,7 @@
 """Vector environments and their wrappers."""
 
+import sys
+
 from rejeu.sb3.common.vec_env import adapters
 from rejeu.sb3.common.vec_env.base_vec_env import VecEnv, VecEnvWrapper, is_vecenv_wrapped, unwrap_vec_wrapper
 from rejeu.sb3.common.vec_env.dummy_vec_env import DummyVecEnv
@@ -12,6 +14,7 @@ from rejeu.sb3.common.vec_env.vec_monitor import VecMonitor
 from rejeu.sb3.common.vec_env.vec_normalize import VecNormalize, sync_envs_normalization, unwrap_vec_normalize
 from rejeu.sb3.common.vec_env.vec_transpose import VecTransposeImage
 from rejeu.sb3.common.vec_env.vec_video_recorder import VecVideoRecorder
+from rejeu.sb3.modules import passes_on
 
 __all__ = [
     "DummyVecEnv",
@@ -32,3 +35,6 @@ __all__ = [
     "unwrap_vec_normalize",
     "unwrap_vec_wrapper",
 ]
+
+for path in [path for path in sys.modules if path.startswith(f"{__name__}.")]:
+    passes_on(path)

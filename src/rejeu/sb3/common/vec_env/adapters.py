@@ -24,10 +24,10 @@ from rejeu.envs.make import register_adapter
 from rejeu.sb3.common.vec_env.base_vec_env import (
     TERMINAL_OBSERVATION,
     TIME_LIMIT_TRUNCATED,
-    Indices,
     SingleEnvs,
-    StepResult,
     VecEnv,
+    VecEnvIndices,
+    VecEnvStepReturn,
     VecEnvWrapper,
     is_wrapped,
 )
@@ -264,7 +264,7 @@ class AutoResetView(SingleEnvs):
     def step_async(self, actions: Any) -> None:
         self._actions = np.asarray(actions)
 
-    def step_wait(self) -> StepResult:
+    def step_wait(self) -> VecEnvStepReturn:
         step = self.vector.step(self._actions)
         dones = step.terminated | step.truncated
         infos: list[dict[str, Any]] = []
@@ -284,7 +284,7 @@ class AutoResetView(SingleEnvs):
     def close(self) -> None:
         self.vector.close()
 
-    def _call(self, indices: Indices, function: Callable[..., Any], *arguments: Any) -> list[Any]:
+    def _call(self, indices: VecEnvIndices, function: Callable[..., Any], *arguments: Any) -> list[Any]:
         if function is is_wrapped:
             return [False for _ in self._get_indices(indices)]
         raise AttributeError(

@@ -27,6 +27,9 @@ from rejeu.logs.formatting import counted
 
 __all__ = [
     "VecEnv",
+    "VecEnvIndices",
+    "VecEnvObs",
+    "VecEnvStepReturn",
     "VecEnvWrapper",
     "is_vecenv_wrapped",
     "is_wrapped",
@@ -39,10 +42,12 @@ TERMINAL_OBSERVATION = "terminal_observation"
 """Key of the info that holds the last observation of an episode."""
 TIME_LIMIT_TRUNCATED = "TimeLimit.truncated"
 """Key of the info that says whether only a time limit ended the episode."""
-Indices = int | Iterable[int] | None
+VecEnvIndices = int | Iterable[int] | None
 """Which environments: one, several, or None for all."""
-StepResult = tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]
-"""Observations ``(num_envs, ...)``, rewards ``float32 (num_envs,)``, dones ``bool (num_envs,)`` and infos."""
+VecEnvObs = Any
+"""Observations ``(num_envs, ...)``: an array, or a dict or tuple of arrays."""
+VecEnvStepReturn = tuple[VecEnvObs, np.ndarray, np.ndarray, list[dict[str, Any]]]
+"""Observations, rewards ``float32 (num_envs,)``, dones ``bool (num_envs,)`` and infos."""
 
 
 class VecEnv(ABC):
@@ -79,7 +84,7 @@ class VecEnv(ABC):
         """Starts a step with one action for each environment."""
 
     @abstractmethod
-    def step_wait(self) -> StepResult:
+    def step_wait(self) -> VecEnvStepReturn:
         """Waits for the step started by :meth:`step_async`; returns the same as :meth:`step`."""
 
     @abstractmethod
@@ -87,28 +92,28 @@ class VecEnv(ABC):
         """Closes the environments."""
 
     @abstractmethod
-    def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """Returns an attribute of each environment."""
 
     @abstractmethod
-    def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         """Sets an attribute of each environment."""
 
     @abstractmethod
     def env_method(
-        self, method_name: str, *method_args: Any, indices: Indices = None, **method_kwargs: Any
+        self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
     ) -> list[Any]:
         """Calls a method of each environment and returns the results."""
 
     @abstractmethod
-    def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: Indices = None) -> list[bool]:
+    def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
         """Returns for each environment whether it is wrapped in that class."""
 
     def __repr__(self) -> str:
         spaces = f"observations {self.observation_space}, actions {self.action_space}"
         return f"<{type(self).__name__}: {counted(self.num_envs, 'environment')}, {spaces}>"
 
-    def step(self, actions: Any) -> StepResult:
+    def step(self, actions: Any) -> VecEnvStepReturn:
         """Steps every environment and returns observations, rewards, dones and infos.
 
         Where an episode ended, the observation is the first of the next episode, and ``info["terminal_observation"]`` is
@@ -198,7 +203,7 @@ class VecEnv(ABC):
                 stacklevel=4,
             )
 
-    def _get_indices(self, indices: Indices) -> list[int]:
+    def _get_indices(self, indices: VecEnvIndices) -> list[int]:
         is_index = isinstance(indices, int | np.integer)
         chosen: Any = range(self.num_envs) if indices is None else [indices] if is_index else indices
         return [range(self.num_envs)[i] for i in chosen]
@@ -208,17 +213,17 @@ class SingleEnvs(VecEnv):
     """A vector of Gymnasium environments, in this process or in others. Abstract."""
 
     @abstractmethod
-    def _call(self, indices: Indices, function: Callable[..., Any], *arguments: Any) -> list[Any]:
+    def _call(self, indices: VecEnvIndices, function: Callable[..., Any], *arguments: Any) -> list[Any]:
         """Returns ``function(env, *arguments)`` of some environments."""
 
     def get_images(self) -> list[np.ndarray]:
         check_renders(self)
         return self._call(None, rgb_frame)
 
-    def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         return self._call(indices, methodcaller("get_wrapper_attr", attr_name))
 
-    def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         """Sets an attribute of each environment.
 
         It is set where it exists, also inside wrappers. (Stable-Baselines3 sets it on the outermost wrapper, where the
@@ -227,14 +232,14 @@ class SingleEnvs(VecEnv):
         self._call(indices, methodcaller("set_wrapper_attr", attr_name, value))
 
     def env_method(
-        self, method_name: str, *method_args: Any, indices: Indices = None, **method_kwargs: Any
+        self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
     ) -> list[Any]:
         return self._call(indices, call_method, method_name, method_args, method_kwargs)
 
-    def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: Indices = None) -> list[bool]:
+    def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
         return self._call(indices, is_wrapped, wrapper_class)
 
-    def _stepped(self, answers: Iterable[Any]) -> StepResult:
+    def _stepped(self, answers: Iterable[Any]) -> VecEnvStepReturn:
         """Returns what :func:`rejeu.envs.workers.process.step_and_reset` returned for each environment as one result."""
         obs, rewards, terminated, truncated, infos, finals, reset_infos = map(list, zip(*answers, strict=True))
         dones = np.logical_or(terminated, truncated)
@@ -299,18 +304,18 @@ class VecEnvWrapper(VecEnv):
     def has_attr(self, attr_name: str) -> bool:
         return self.venv.has_attr(attr_name)
 
-    def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         return self.venv.get_attr(attr_name, indices)
 
-    def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         self.venv.set_attr(attr_name, value, indices)
 
     def env_method(
-        self, method_name: str, *method_args: Any, indices: Indices = None, **method_kwargs: Any
+        self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
     ) -> list[Any]:
         return self.venv.env_method(method_name, *method_args, indices=indices, **method_kwargs)
 
-    def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: Indices = None) -> list[bool]:
+    def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
         return self.venv.env_is_wrapped(wrapper_class, indices)
 
     def __getattr__(self, name: str) -> Any:
@@ -336,7 +341,7 @@ class ObservationWrapper(VecEnvWrapper):
     def reset(self) -> Any:
         return self.map_observation(self.venv.reset())
 
-    def step_wait(self) -> StepResult:
+    def step_wait(self) -> VecEnvStepReturn:
         obs, rewards, dones, infos = self.venv.step_wait()
         for info in infos:
             if TERMINAL_OBSERVATION in info:

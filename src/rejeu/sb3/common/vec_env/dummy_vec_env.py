@@ -10,7 +10,7 @@ import gymnasium as gym
 from rejeu.core.errors import BadEnvironmentError
 from rejeu.envs.validation import environment_fault, id_of, reset_env, with_location
 from rejeu.envs.workers.process import as_declared, step_and_reset
-from rejeu.sb3.common.vec_env.base_vec_env import Indices, SingleEnvs, StepResult, stacked
+from rejeu.sb3.common.vec_env.base_vec_env import SingleEnvs, VecEnvIndices, VecEnvStepReturn, stacked
 
 __all__ = ["DummyVecEnv"]
 
@@ -69,7 +69,7 @@ class DummyVecEnv(SingleEnvs):
         self._check_count(actions)
         self._actions = actions
 
-    def step_wait(self) -> StepResult:
+    def step_wait(self) -> VecEnvStepReturn:
         self.n_steps += 1
         return self._stepped(
             # Copies: an environment may write its next observation into the same array.
@@ -89,5 +89,5 @@ class DummyVecEnv(SingleEnvs):
         for env in self.envs:
             env.close()
 
-    def _call(self, indices: Indices, function: Callable[..., Any], *arguments: Any) -> list[Any]:
+    def _call(self, indices: VecEnvIndices, function: Callable[..., Any], *arguments: Any) -> list[Any]:
         return [function(self.envs[i], *arguments) for i in self._get_indices(indices)]

@@ -11,7 +11,7 @@ from rejeu.core.errors import BadEnvironmentError, WorkerError
 from rejeu.envs.validation import with_location
 from rejeu.envs.workers.pool import RESTARTED, TIMEOUT, Processes, ProcessWorker, Restarted, Workers
 from rejeu.envs.workers.process import WorkerFailure
-from rejeu.sb3.common.vec_env.base_vec_env import Indices, SingleEnvs, StepResult, stacked
+from rejeu.sb3.common.vec_env.base_vec_env import SingleEnvs, VecEnvIndices, VecEnvStepReturn, stacked
 
 __all__ = ["SubprocVecEnv"]
 
@@ -90,7 +90,7 @@ class SubprocVecEnv(SingleEnvs):
         )
         self.waiting = True
 
-    def step_wait(self) -> StepResult:
+    def step_wait(self) -> VecEnvStepReturn:
         self.waiting = False
         replies = self._receive(range(self.num_envs))
         lost = {i: reply.why for i, reply in replies.items() if isinstance(reply, Restarted)}
@@ -103,7 +103,7 @@ class SubprocVecEnv(SingleEnvs):
         """Ends the processes; a second call does nothing."""
         self.workers.close()
 
-    def _call(self, indices: Indices, function: Callable[..., Any], *arguments: Any) -> list[Any]:
+    def _call(self, indices: VecEnvIndices, function: Callable[..., Any], *arguments: Any) -> list[Any]:
         """Calls ``function(env, *arguments)`` in some processes and returns the results.
 
         Raises:

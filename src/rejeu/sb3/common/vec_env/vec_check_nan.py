@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from rejeu.core.errors import BadEnvironmentError
-from rejeu.sb3.common.vec_env.base_vec_env import StepResult, VecEnv, VecEnvWrapper, by_key
+from rejeu.sb3.common.vec_env.base_vec_env import VecEnv, VecEnvStepReturn, VecEnvWrapper, by_key
 
 __all__ = ["VecCheckNan"]
 
@@ -47,7 +47,7 @@ class VecCheckNan(VecEnvWrapper):
         self._check(obs, "the observations of reset")
         return obs
 
-    def step_wait(self) -> StepResult:
+    def step_wait(self) -> VecEnvStepReturn:
         obs, rewards, dones, infos = self.venv.step_wait()
         self._check(obs, "the observations")
         self._check(rewards, "the rewards")

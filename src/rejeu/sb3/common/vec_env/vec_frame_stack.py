@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from rejeu.sb3.common.vec_env.base_vec_env import StepResult, VecEnv, VecEnvWrapper
+from rejeu.sb3.common.vec_env.base_vec_env import VecEnv, VecEnvStepReturn, VecEnvWrapper
 from rejeu.sb3.common.vec_env.stacked_observations import StackedObservations
 
 __all__ = ["VecFrameStack"]
@@ -32,7 +32,7 @@ class VecFrameStack(VecEnvWrapper):
     def reset(self) -> Any:
         return self.stacked_obs.reset(self.venv.reset())
 
-    def step_wait(self) -> StepResult:
+    def step_wait(self) -> VecEnvStepReturn:
         obs, rewards, dones, infos = self.venv.step_wait()
         stacked, infos = self.stacked_obs.update(obs, dones, infos)
         return stacked, rewards, dones, infos

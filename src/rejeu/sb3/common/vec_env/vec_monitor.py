@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from rejeu.sb3.common.monitor import Monitor, ResultsWriter, keywords_of
-from rejeu.sb3.common.vec_env.base_vec_env import StepResult, VecEnv, VecEnvWrapper
+from rejeu.sb3.common.vec_env.base_vec_env import VecEnv, VecEnvStepReturn, VecEnvWrapper
 
 __all__ = ["VecMonitor"]
 
@@ -47,7 +47,7 @@ class VecMonitor(VecEnvWrapper):
         self.episode_lengths = np.zeros(self.num_envs, np.int64)
         return self.venv.reset()
 
-    def step_wait(self) -> StepResult:
+    def step_wait(self) -> VecEnvStepReturn:
         obs, rewards, dones, infos = self.venv.step_wait()
         self.episode_returns += rewards
         self.episode_lengths += 1

@@ -25,8 +25,8 @@ from rejeu.core.records import convert
 from rejeu.sb3.common.running_mean_std import RunningMeanStd
 from rejeu.sb3.common.vec_env.base_vec_env import (
     TERMINAL_OBSERVATION,
-    StepResult,
     VecEnv,
+    VecEnvStepReturn,
     VecEnvWrapper,
     by_key,
     unwrap_vec_wrapper,
@@ -165,7 +165,7 @@ class VecNormalize(VecEnvWrapper):
         self._update(obs)
         return self.normalize_obs(obs)
 
-    def step_wait(self) -> StepResult:
+    def step_wait(self) -> VecEnvStepReturn:
         """Steps the environments and returns normalized observations and rewards, dones and infos.
 
         ``terminal_observation`` is normalized too.

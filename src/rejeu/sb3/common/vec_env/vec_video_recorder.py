@@ -8,7 +8,7 @@ from typing import Any
 
 from rejeu.envs.rendering import check_renders
 from rejeu.logs.video import VideoFile
-from rejeu.sb3.common.vec_env.base_vec_env import StepResult, VecEnv, VecEnvWrapper, tile_images
+from rejeu.sb3.common.vec_env.base_vec_env import VecEnv, VecEnvStepReturn, VecEnvWrapper, tile_images
 
 __all__ = ["VecVideoRecorder"]
 
@@ -66,7 +66,7 @@ class VecVideoRecorder(VecEnvWrapper):
             self._start()
         return obs
 
-    def step_wait(self) -> StepResult:
+    def step_wait(self) -> VecEnvStepReturn:
         result = self.venv.step_wait()
         self.step_id += 1
         if self._video is not None:
