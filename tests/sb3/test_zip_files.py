@@ -231,6 +231,32 @@ def test_a_missing_file_and_one_that_is_no_zip_file(tmp_path):
         rejeu.load(write(tmp_path, PPO))
 
 
+CLOUDPICKLED = b"\x80\x02ccloudpickle.cloudpickle\n_make_skeleton_class\n."
+"""How the pickle of a class that is defined in a script begins."""
+
+
+@pytest.mark.parametrize(("content", "message"), [
+    (zipped({"data": b"{}", "parameter_list": b"[]", "parameters": b""}), "it has data and parameters, as models of Stable B"),
+    (pickle.dumps(({}, [np.zeros(2)])), "it is a pickle, .*VecNormalize.* models of Stable Baselines 2 .* train again with"),
+    (changed(PPO, {"policy_kwargs": serialized(CLOUDPICKLED)}), "policy_kwargs: it holds a class .*your own, .*with equinox"),
+    (changed(PPO, {"policy_class": serialized(b"\x80\x02cmine\nPolicy\n.")}), "it names mine.Policy, .*with equinox"),
+])  # fmt: skip
+def test_what_is_not_read_is_named_with_what_to_do(content, message, tmp_path):
+    with pytest.raises(CheckpointError, match=message):
+        load_zip(write(tmp_path, content))
+
+
+def test_a_pickle_in_the_place_of_a_model_file_is_named(tmp_path):
+    with pytest.raises(CheckpointError, match="it is a pickle, such as an old model of Stable Baselines 2"):
+        algorithms.PPO.load(write(tmp_path, pickle.dumps({}), "model.pkl"))
+
+
+def test_a_policy_class_of_another_program_is_noted(tmp_path):
+    content = changed((FOLDER / "sac-sde.zip").read_bytes(), {"policy_class": serialized(CLOUDPICKLED)})
+    (note,) = load_zip(write(tmp_path, content)).notes
+    assert note.startswith("its policy class is not of Stable-Baselines3: it is read as SAC, and what that class adds")
+
+
 def test_environments_of_other_spaces_are_refused():
     with pytest.raises(CheckpointError, match=r"its observation space is .* and the environment's is"):
         load_zip(FOLDER / "ppo-normalized.zip", env="Pendulum-v1")

@@ -43,6 +43,14 @@ MOST_DATA = 16 * 2**20
 """Upper limit on the bytes of ``data``."""
 EXPANSION = 16
 """Upper limit on the size of the unpacked content relative to that of the file: weights can hardly be compressed."""
+OWN_NETWORK = (
+    "; write a network of your own with equinox and train again, as docs/coming-from-sb3.md shows, or use the model with "
+    "Stable-Baselines3"
+)
+TENSORFLOW = (
+    "models of Stable Baselines 2 (TensorFlow), which are not read; train again with rejeu.sb3, whose hyperparameters have "
+    "nearly the same names"
+)
 OLD_HER = "goal_selection_strategy"
 """A setting that is among those of the agent where HER was an algorithm, in versions before 1.1."""
 ON_POLICY = ("PPO", "A2C", "TRPO", "MaskablePPO", "RecurrentPPO")
@@ -90,7 +98,7 @@ class Model(NamedTuple):
         if len(raw) > MOST_FIELD:
             raise Malformed(f"{key} has more than {MOST_FIELD:,} bytes")
         if raw.startswith(b"{") and (text := msgspec.json.decode(raw, type=Pickled).content) is not None:
-            with part_of(f"data: {key}"):
+            with part_of(f"data: {key}", OWN_NETWORK if key in ("policy_class", "policy_kwargs") else ""):
                 return parse(base64.b64decode(text))
         return msgspec.json.decode(raw)
 
@@ -111,12 +119,12 @@ class Model(NamedTuple):
 
 
 @contextlib.contextmanager
-def part_of(name: str) -> Iterator[None]:
+def part_of(name: str, advice: str = "") -> Iterator[None]:
     """Turns errors of a damaged part into ``Malformed`` with its name."""
     try:
         yield
     except UNREADABLE as error:
-        raise Malformed(f"{name}: {brief(error)}") from None
+        raise Malformed(f"{name}: {brief(error)}{advice}") from None
 
 
 def read(path: Path) -> Model:
@@ -127,8 +135,13 @@ def read(path: Path) -> Model:
     """
     found = path.stat()
     room = min(found.st_size, 512 * getattr(found, "st_blocks", found.st_size))
+    with path.open("rb") as file:
+        if file.read(1) == b"\x80":
+            raise Malformed(f"it is a pickle, as statistics of VecNormalize are and {TENSORFLOW}")
     with path.open("rb") as file, opened(file, EXPANSION * room + 2**20) as archive:
         sizes = {info.filename: info.file_size for info in archive.infolist()}
+        if {"data", "parameters"} <= sizes.keys():
+            raise Malformed(f"it has data and parameters, as {TENSORFLOW}")
         if not {"data", "policy.pth"} <= sizes.keys() or sizes["data"] > MOST_DATA:
             raise Malformed("it has no data and policy.pth, or too much data")
         fields = msgspec.json.decode(content_of(archive, "data"), type=dict[str, msgspec.Raw])
@@ -471,6 +484,15 @@ def load_zip(
         if kind is not None and (name := kind.algorithm.Config.name) != algorithm:
             raise Malformed(f"it is a model of {algorithm}, not of {name}; load it with {algorithm}.load")
     vecnormalize, notes = normalization_for(path, vecnormalize, changes)
+    policy_class = model.readable("policy_class")
+    is_original = isinstance(policy_class, Name) and policy_class.module.startswith(
+        ("stable_baselines3.", "sb3_contrib.")
+    )
+    if policy_class is not None and not is_original:
+        notes.append(
+            f"its policy class is not of Stable-Baselines3: it is read as {algorithm}, and what that class adds, such as "
+            "action masks, is lost"
+        )
     cls = kind or BUILT_IN[algorithm]
     own = {key: changes.pop(key) for key in [*changes] if key in (*OWN, *OUTPUTS)}
     outputs = {key: own.pop(key) for key in [*own] if key in OUTPUTS}

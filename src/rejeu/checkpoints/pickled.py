@@ -127,6 +127,8 @@ def parse(
             add(stack[-1], items, code == "SETITEM")
         elif code in ("GLOBAL", "STACK_GLOBAL"):
             module, name = value.split(" ") if code == "GLOBAL" else popped(stack, 2)
+            if module in ("cloudpickle.cloudpickle", "dill._dill"):
+                raise Malformed("it holds a class or function of your own, whose code rejeu does not run")
             is_name = all(isinstance(text, str) and len(text) <= MOST_NAME for text in (module, name))
             if not is_name or (module.split(".")[0] not in PACKAGES and (module, name) not in SETS):
                 raise Malformed(f"it names {named(module)}.{named(name)}, which has no place in such a file")

@@ -306,6 +306,10 @@ def explained(path: str | Path) -> Iterator[None]:
         advice = "it was cut short or is from another program"
         if zipfile.is_zipfile(path):
             advice = "it is a zip file; rejeu import converts those of Stable-Baselines3"
+        with Path(path).open("rb") as file:
+            is_pickle = file.read(1) == b"\x80"
+        if is_pickle:
+            advice = "it is a pickle, such as an old model of Stable Baselines 2, and no code of a file is run"
         raise CheckpointError(f"{shown_path} is not a complete safetensors file ({shown(error)}); {advice}") from None
     except OSError as error:
         raise CheckpointError(f"{shown_path} cannot be read: {error.strerror or error}") from None
