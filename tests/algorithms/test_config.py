@@ -93,7 +93,7 @@ def test_an_impossible_value_is_named_with_what_is_possible(settings, words):
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        ({"policy_kwargs": {"net_arc": [8]}}, "policy_kwargs of MemoryConfig has no setting 'net_arc'; .*net_arch"),
+        ({"policy_kwargs": {"net_arc": [8]}}, "^policy_kwargs has no setting 'net_arc'; .*net_arch"),
         ({"policy_kwargs": [8]}, "policy_kwargs=.* must be a dict with the keys net_arch"),
         (
             {"replay_buffer_class": "HerReplayBuffer", "replay_buffer_kwargs": {"n_sampled_goals": 4}},

@@ -157,6 +157,12 @@ HOSTILE = {
 }  # fmt: skip
 
 
+def test_a_file_of_pickles_is_refused_in_our_words(tmp_path):
+    np.savez(tmp_path / "policy.npz", **{POLICY: np.array([{}], object)})
+    with pytest.raises(CheckpointError, match=r"\(it holds pickles, which are not read\); export the model again"):
+        load_policy(tmp_path / "policy.npz")
+
+
 @pytest.mark.parametrize("kind", HOSTILE)
 def test_a_file_that_is_not_valid_is_refused(kind, tmp_path):
     path = agent_of("PPO", "Box").export(tmp_path / "policy.npz").path

@@ -16,6 +16,7 @@ from rejeu.sb3 import A2C, PPO, SAC
 from rejeu.sb3.common.callbacks import BaseCallback
 from rejeu.sb3.common.evaluation import evaluate_policy
 from rejeu.sb3.common.monitor import Monitor
+from rejeu.sb3.common.torch_layers import BaseFeaturesExtractor
 from rejeu.sb3.common.vec_env import DummyVecEnv, VecNormalize
 
 pytestmark = pytest.mark.usefixtures("learners_are_shared")
@@ -160,3 +161,40 @@ def test_the_old_class_of_hindsight_says_what_replaced_it():
     for call in (HER, HER.load):
         with pytest.raises(ImportError, match="replay_buffer_class=HerReplayBuffer"):
             call("path")
+
+
+def test_an_empty_buffer_does_not_replace_the_file_of_an_earlier_one(tmp_path):
+    model = SAC("MlpPolicy", "Pendulum-v1", **TINY)
+    (tmp_path / "buffer.pkl").write_bytes(b"an earlier one")
+    with pytest.warns(UserWarning, match=r"buffer\.pkl exists and is kept, .* call load_replay_buffer first"):
+        assert model.save_replay_buffer(tmp_path / "buffer") == tmp_path / "buffer.pkl"
+    assert (tmp_path / "buffer.pkl").read_bytes() == b"an earlier one"
+
+
+class TorchModule:
+    """Stands for ``torch.nn.Module``: PyTorch is not installed where the tests run."""
+
+    __module__ = "torch.nn.modules.module"
+
+
+class WithLayersOfTorch(BaseFeaturesExtractor):
+    def __init__(self, observation_space, features_dim=8):
+        super().__init__(observation_space, features_dim)
+        self.net = TorchModule()
+
+
+def of_torch(name):
+    return type(name, (TorchModule,), {"__module__": f"torch.{name.lower()}"})
+
+
+@pytest.mark.parametrize(("setting", "value", "message"), [
+    ("features_extractor_class", WithLayersOfTorch, "WithLayersOfTorch: .*'net'; .*equinox.*docs/coming-from-sb3.md shows"),
+    ("features_extractor_class", of_torch("MyCNN"), "MyCNN.* not a PyTorch module; .*equinox.nn, as docs/coming-from-sb3.md"),
+    ("optimizer_class", of_torch("Adagrad"), "optimizer_class=Adagrad is of PyTorch; use one of Adam, .*optimizer=optax"),
+    ("activation_fn", of_torch("Mish"), "activation_fn='mish' must be one of relu, tanh"),
+    ("activation_fn", of_torch("Mish")(), "activation_fn='mish' must be one of relu, tanh"),
+])  # fmt: skip
+def test_a_class_of_pytorch_is_named_with_what_to_do(setting, value, message):
+    with pytest.raises((TypeError, ValueError), match=message) as caught:
+        PPO("MlpPolicy", "CartPole-v1", policy_kwargs={setting: value})
+    assert "\n" not in str(caught.value)

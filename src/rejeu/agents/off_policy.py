@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -52,15 +53,20 @@ class OffPolicyAgent(Agent):
     def save_replay_buffer(self, path: str | Path) -> Path:
         """Writes the replay buffer to one safetensors file and returns its path.
 
+        A file that exists, perhaps that of an earlier buffer, is kept with a warning if the buffer is empty.
+
         Raises:
-            ValueError: if the agent has no buffer, or an empty one for a file that exists: that of an earlier buffer, perhaps.
+            ValueError: if the agent has no buffer.
         """
         self._require_replay()
-        if not self.run.replay.size() and checkpoint.resolve(path).exists():
-            raise ValueError(
-                f"{path} exists, and the replay buffer of this {self.name} is empty; load_replay_buffer comes first, or give "
-                "another path"
+        file = checkpoint.resolve(path)
+        if not self.run.replay.size() and file.exists():
+            warnings.warn(
+                f"{path} exists and is kept, as the replay buffer of this {self.name} is empty; call load_replay_buffer "
+                "first, or give another path",
+                stacklevel=2,
             )
+            return file
         header = {
             "observation_space": spaces.describe(self.observation_space),
             "action_space": spaces.describe(self.action_space),

@@ -146,16 +146,16 @@ def nested(key: str, value: Any, kind: type[C]) -> C:
         return kind()
     if not isinstance(value, Mapping):
         raise TypeError(f"{key}={value!r} must be a dict with the keys {', '.join(field_names(kind))}")
-    return build(kind, value, f"{key} of ")
+    return build(kind, value, key)
 
 
-def build(kind: type[C], given: Mapping[str, Any], context: str = "") -> C:
-    """Returns ``kind(**given)``.
+def build(kind: type[C], given: Mapping[str, Any], setting: str = "") -> C:
+    """Returns ``kind(**given)``; ``setting`` is what the user calls it, if not by the name of the class.
 
     Raises:
         TypeError: for a name that is no field, suggesting the nearest that is.
     """
-    check_names(given, field_names(kind), f"{context}{getattr(kind, 'name', '') or kind.__name__}")
+    check_names(given, field_names(kind), setting or getattr(kind, "name", "") or kind.__name__)
     return kind(**given)
 
 

@@ -235,6 +235,7 @@ def read(path: Path) -> NumpyPolicy:
     try:
         return parse(content)
     except (*WRONG, EOFError, zipfile.BadZipFile) as error:
+        reason = "it holds pickles, which are not read" if "pickle" in str(error) else brief(error)
         raise CheckpointError(
-            f"{path} is damaged, or not written by rejeu export --to npz ({brief(error)}); export the model again"
+            f"{path} is damaged, or not written by rejeu export --to npz ({reason}); export the model again"
         ) from None

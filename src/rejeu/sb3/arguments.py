@@ -12,7 +12,7 @@ from rejeu.algorithms.config import REPLAY_BUFFERS
 from rejeu.core import validation
 from rejeu.sb3.common import buffers, utils
 from rejeu.sb3.common.noise import VectorizedActionNoise
-from rejeu.sb3.common.torch_layers import encoder_of
+from rejeu.sb3.common.torch_layers import encoder_of, is_torch
 
 SCHEDULED = ("learning_rate", "clip_range", "clip_range_vf", "ent_coef", "critic_learning_rate", "beta")
 """The hyperparameters that can be schedules."""
@@ -126,6 +126,7 @@ def shape_of(kind: type[Agent], given: Mapping[str, Any]) -> tuple[dict[str, Any
         if key == "net_arch" and value is not None:
             shape[key] = layers_of(value)
         elif key == "activation_fn" and value is not None:
+            value = type(value) if is_torch(value) and not isinstance(value, type) else value
             shape[key] = {"LeakyReLU": "leaky_relu"}.get(getattr(value, "__name__", ""), value)
         elif key == "log_std_init" and "sde_log_std_init" in known:
             others["sde_log_std_init"] = value
@@ -154,6 +155,11 @@ def unsupported(name: str, value: Any, what: str = "has no effect") -> None:
 def optimizer_of(kind: Any, settings: Mapping[str, Any]) -> Any:
     """Returns the setting ``optimizer`` for a class of PyTorch's, its name, or one of Optax, and its arguments."""
     known = OPTIMIZERS.get(kind if isinstance(kind, str) else getattr(kind, "__name__", ""))
+    if known is None and is_torch(kind):
+        raise TypeError(
+            f"optimizer_class={getattr(kind, '__name__', kind)} is of PyTorch; use one of {', '.join(OPTIMIZERS)}, or give "
+            "the agent one of Optax: optimizer=optax.lamb"
+        )
     if known is None:
         return kind if kind is not None else {"name": "adam", **settings} if settings else None
     renamed = {"alpha": "decay"}

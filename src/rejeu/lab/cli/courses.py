@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -77,7 +78,7 @@ def run_class(arguments: Class) -> tuple[int, dict[str, Any]]:
     )
     if not arguments.json:
         show_table(leaderboard.columns(language), [leaderboard.cells_of(row, language) for row in board.rows], 3)
-        for note in leaderboard.notes(board):
+        for note in leaderboard.notes(replace(board, problems=())):  # which were printed when they were met
             echo(note)
     echo(said("the page of the class: {}", f"rejeu studio {quoted(arguments.folder)}", language=language))
     if out is not None:

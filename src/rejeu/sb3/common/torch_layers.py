@@ -24,6 +24,7 @@ import inspect
 import itertools
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import FrozenInstanceError
 from typing import Any
 
 import equinox as eqx
@@ -124,6 +125,12 @@ def get_actor_critic_arch(net_arch: Any) -> tuple[list[int], list[int]]:
     return [*each[0]], [*each[1]]
 
 
+def is_torch(value: Any) -> bool:
+    """Returns whether something is a class or an object of PyTorch, which need not be installed."""
+    kind = value if isinstance(value, type) else type(value)
+    return any(base.__module__.partition(".")[0] == "torch" for base in kind.__mro__)
+
+
 class Prepared(eqx.Module):
     """An extractor that is given observations as they come."""
 
@@ -183,7 +190,7 @@ def encoder_of(extractor: Any, settings: Mapping[str, Any], normalize_images: bo
     if not (isinstance(extractor, type) and issubclass(extractor, eqx.Module)):
         raise TypeError(
             f"features_extractor_class={extractor!r} must be a subclass of BaseFeaturesExtractor, which is an equinox.Module "
-            "here, not a PyTorch module; rewrite its layers with equinox.nn"
+            "here, not a PyTorch module; write its layers with equinox.nn, as docs/coming-from-sb3.md shows"
         )
     name = f"{PREFIX}{extractor.__name__} {json.dumps([dict(settings), normalize_images], default=repr)}"
     _register(name, extractor, settings, normalize_images)
@@ -194,7 +201,13 @@ def _register(name: str, extractor: type[eqx.Module], settings: Mapping[str, Any
     @register_encoder(name)
     def make(key: Array, leaves: tuple[Leaf, ...]) -> Any:
         takes_key = "key" in inspect.signature(extractor).parameters
-        module = extractor(space_of(leaves), **settings, **({"key": key} if takes_key else {}))
+        try:
+            module = extractor(space_of(leaves), **settings, **({"key": key} if takes_key else {}))
+        except FrozenInstanceError as error:
+            raise TypeError(
+                f"features_extractor_class={extractor.__name__}: {error}; an extractor is an equinox.Module here, with its "
+                "layers of equinox.nn declared as fields and not those of PyTorch, as docs/coming-from-sb3.md shows"
+            ) from None
         zeros = {leaf.path: np.zeros((1, *leaf.shape), leaf.dtype) for leaf in leaves}
         batch = prepared(zeros.get("", zeros), leaves, normalize_images)
         example = jax.tree.map(lambda x: x[0], batch)

@@ -69,7 +69,8 @@ class Window:
         ):
             pygame.display.quit()
             raise OSError(
-                f"cannot open a window: SDL finds no display ({driver}); rejeu record RUN films a trained agent without one"
+                f"cannot open a window: SDL finds no display ({driver}); play in a browser with "
+                "rejeu studio, or film a trained agent with rejeu record RUN"
             )
         pygame.font.init()
         self.clock = pygame.time.Clock()
