@@ -379,10 +379,10 @@ class Wrong(Counter):
         return self.allowed_moves
 
 
-@pytest.mark.parametrize("vector", [Wrong, lambda: make_vector(Wrong, 1)])
-def test_a_mistake_within_the_function_of_the_masks_is_shown_as_it_is(vector):
+@pytest.mark.parametrize("env", [Wrong, lambda: make_vector(Wrong, 1), lambda: DummyVecEnv([Wrong])])
+def test_a_mistake_within_the_function_of_the_masks_is_shown(env):
     with pytest.raises(AttributeError, match="'Wrong' object has no attribute 'allowed_moves'"):
-        small(vector(), n_steps=4).learn(4)
+        small(env(), n_steps=4).learn(4)
 
 
 # Who looks on.

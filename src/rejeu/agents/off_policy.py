@@ -58,15 +58,15 @@ class OffPolicyAgent(Agent):
         Raises:
             ValueError: if the agent has no buffer.
         """
-        self._require_replay()
-        file = checkpoint.resolve(path)
-        if not self.run.replay.size() and file.exists():
+        file, replay = checkpoint.resolve(path), self.run.replay
+        if (replay is None or not replay.size()) and file.exists():
             warnings.warn(
                 f"{path} exists and is kept, as the replay buffer of this {self.name} is empty; call load_replay_buffer "
                 "first, or give another path",
                 stacklevel=2,
             )
             return file
+        self._require_replay()
         header = {
             "observation_space": spaces.describe(self.observation_space),
             "action_space": spaces.describe(self.action_space),
