@@ -60,7 +60,7 @@ class IdentityEnv(gym.Env):
 
 
 class IdentityEnvBox(IdentityEnv):
-    """The same with numbers in ``[low, high]``, which the action must meet within ``eps``."""
+    """Numbers in ``[low, high]``, which the action must meet within ``eps``."""
 
     def __init__(self, low: float = -1.0, high: float = 1.0, eps: float = 0.05, ep_length: int = 100) -> None:
         super().__init__(space=spaces.Box(low=low, high=high, shape=(1,), dtype=np.float32), ep_length=ep_length)
@@ -71,14 +71,14 @@ class IdentityEnvBox(IdentityEnv):
 
 
 class IdentityEnvMultiDiscrete(IdentityEnv):
-    """The same with two numbers below ``dim``."""
+    """Two numbers below ``dim``, which the action must equal."""
 
     def __init__(self, dim: int = 1, ep_length: int = 100) -> None:
         super().__init__(space=spaces.MultiDiscrete([dim, dim]), ep_length=ep_length)
 
 
 class IdentityEnvMultiBinary(IdentityEnv):
-    """The same with ``dim`` bits."""
+    """Bits, ``dim`` of them, which the action must equal."""
 
     def __init__(self, dim: int = 1, ep_length: int = 100) -> None:
         super().__init__(space=spaces.MultiBinary(dim), ep_length=ep_length)
