@@ -368,23 +368,6 @@ def test_environments_whose_masks_cannot_be_had_or_kept_to_are_refused(env, erro
         small(env(), n_steps=4).learn(4)
 
 
-class Wrong(Counter):
-    """Has a mistake in its function of the masks."""
-
-    def __init__(self):
-        super().__init__((4,))
-        self.action_space = spaces.Discrete(3)
-
-    def action_masks(self):
-        return self.allowed_moves
-
-
-@pytest.mark.parametrize("env", [Wrong, lambda: make_vector(Wrong, 1), lambda: DummyVecEnv([Wrong])])
-def test_a_mistake_within_the_function_of_the_masks_is_shown(env):
-    with pytest.raises(AttributeError, match="'Wrong' object has no attribute 'allowed_moves'"):
-        small(env(), n_steps=4).learn(4)
-
-
 # Who looks on.
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gymnasium as gym
-import jax
 import numpy as np
 import pytest
 
@@ -117,9 +116,3 @@ def test_attributes_of_ones_own_can_be_set_and_nearly_right_names_warn(dqn):
     assert dqn.best_so_far == 3
     with pytest.warns(UserWarning, match="is the hyperparameter batch_size meant"):
         dqn.batchsize = 3
-
-
-@pytest.mark.skipif(jax.default_backend() == "gpu", reason="JAX has a GPU")
-@pytest.mark.parametrize("device", ["cuda", "cuda:1", "mps", None])
-def test_without_a_gpu_the_device_is_the_cpu_as_in_the_original(device):
-    assert A2C("MlpPolicy", "CartPole-v1", device=device).device.type == "cpu"

@@ -131,7 +131,6 @@ class Original(Agent):
             settings: hyperparameters.
         """
         settings |= zip(arguments.POSITIONAL.get(self.name, arguments.OFF_POLICY), args, strict=False)
-        settings["device"] = utils.available_device(settings.get("device"))
         made = None
         if isinstance(policy, type):
             env, policy, made = self._prepared(policy, env, settings)
@@ -629,7 +628,9 @@ class Original(Agent):
             utils.get_system_info()
         known = {*validation.field_names(cls.algorithm.Config), *AGENT_ARGUMENTS}
         objects = {key: value for key, value in (custom_objects or {}).items() if key in known}
-        changes = {**objects, "device": utils.available_device(device), **kwargs}
+        has_gpu = utils.Device(str(device)).type == "cuda" and utils.get_device(device).type == "cuda"
+        place = str(device) if has_gpu or str(device) in ("auto", "cpu") else "auto"
+        changes = {**objects, "device": place, **kwargs}
         with readable(path, ".zip") as found:
             agent: Any
             if zipfile.is_zipfile(found):

@@ -82,7 +82,7 @@ def converted(kind: type[Agent], settings: Mapping[str, Any]) -> dict[str, Any]:
     if isinstance(frequency := result.get("train_freq"), tuple):
         result["train_freq"] = tuple(getattr(part, "value", part) for part in frequency)
     if "device" in result:
-        result["device"] = utils.available_device(result["device"])
+        result["device"] = "auto" if result["device"] is None else str(result["device"])
     convert_buffer(result)
     if isinstance(result.get("policy_kwargs"), Mapping):
         shape, others = shape_of(kind, result["policy_kwargs"])

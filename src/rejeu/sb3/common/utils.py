@@ -169,12 +169,6 @@ def get_device(device: Any = "auto") -> Device:
     return Device("cuda" if jax.default_backend() == "gpu" and Device(device).type == "cuda" else "cpu")
 
 
-def available_device(device: Any) -> str:
-    """Returns the name of a device, ``"auto"`` for None and, where JAX has no GPU, for those that only PyTorch may have."""
-    name = "auto" if device is None else str(device)
-    return "auto" if name.startswith(("cuda", "mps")) and jax.default_backend() != "gpu" else name
-
-
 class Tensor(np.ndarray):
     """A NumPy array with the methods of PyTorch's tensors that scripts end their expressions with.
 
