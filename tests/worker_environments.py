@@ -213,33 +213,6 @@ class Paced(gym.Env):
         self.np_random.bit_generator.state = state["rng"]
 
 
-class Gated(Losable):
-    """Episodes of 3 steps. The one that was seeded with 0 waits at steps while the file ``gate`` is there, and at further
-    resets while ``gate.reset`` is there.
-    """
-
-    is_first = False
-
-    def __init__(self, gate, at_reset=None):
-        super().__init__(at_reset)
-        self.lengths, self.gate = (3,), gate
-
-    def reset(self, **kwargs):
-        if kwargs.get("seed") is None:
-            self.wait(self.gate.with_suffix(".reset"))
-        else:
-            self.is_first = kwargs["seed"] == 0
-        return super().reset(**kwargs)
-
-    def step(self, action):
-        self.wait(self.gate)
-        return super().step(action)
-
-    def wait(self, gate):
-        while self.is_first and gate.exists():
-            time.sleep(0.01)
-
-
 class DrawsGlobally(gym.Env):
     """Draws from the global generators of NumPy and Python, when it is made, reset and stepped."""
 
@@ -265,18 +238,3 @@ def process_id(env):
 
 def imports_jax(env):
     return "jax" in sys.modules
-
-
-def in_order(vector):
-    """Lets environments that do not wait for each other answer in an order that depends on their rewards, not on chance."""
-    receive = vector.receive
-
-    def ordered():
-        while vector._pending:
-            vector._listen()
-        ranked = sorted(vector._results, key=lambda i: (vector._results[i].reward, i))
-        vector._results = {i: vector._results[i] for i in ranked}
-        return receive()
-
-    vector.receive = ordered
-    return vector

@@ -120,7 +120,6 @@ def test_all_episodes_are_judged_when_learn_reaches_its_limit(limit: Any, monkey
         (["--seeds", "2", "--pause", "10"], "--pause is for a single run; leave it out, or --seeds"),
         (["--seeds", "2", "--set", "learning_rate=[1e-3,1e-4]"], "learning_rate=[0.001, 0.0001]"),
         (["--seeds", "2", "--algo", "MaskablePPO"], "CartPole.action_mask returned None, expected a mask"),
-        (["--seeds", "2", "--wait-for", "1"], "wait_for"),
     ],
 )
 def test_what_seeds_cannot_be_combined_with_is_said_in_one_line(

@@ -28,7 +28,6 @@ from tests.helpers import small_sac
 from tests.jax_environments import Forbidden
 from tests.sharing import shared_learners
 from tests.tiers import only, only_tuples
-from tests.worker_environments import in_order
 
 pytestmark = pytest.mark.usefixtures("learners_are_shared")
 
@@ -45,11 +44,6 @@ NOISES = {
 
 def vector(env_id, n_envs=3, backend="gymnasium"):
     return lambda: rejeu.make_vector(env_id, n_envs, backend, seed=1)
-
-
-def first_of_n():
-    """Returns environments that do not wait for each other, with an order of arrival that no chance decides."""
-    return in_order(rejeu.make_vector("Pendulum-v1", 3, "gymnasium-async", seed=1, wait_for=2))
 
 
 CASES = {
@@ -69,8 +63,6 @@ CASES = {
     "EnvPool, PPO": ("PPO", vector("CartPole-v1", 3, "envpool"), {**SMALL, "n_steps": 16, "batch_size": 16}),
     "EnvPool, whole episodes": ("PPO", vector("CartPole-v1", 3, "envpool"), {**SMALL, "n_steps": 16, "n_episodes": 1}),
     "worker processes": ("SAC", vector("Pendulum-v1", 2, "gymnasium-async"), OFF),
-    "first of n": ("SAC", first_of_n, OFF),
-    "first of n, noise": ("DDPG", first_of_n, {**OFF, "action_noise": "ou(0.2)", "normalize": True}),
     "DQN, masks": (
         "DQN",
         lambda: InProcess([GymnasiumEnv(Forbidden()), GymnasiumEnv(Forbidden())], 1),
@@ -94,7 +86,7 @@ CASES = {
 
 DEFAULT_CASES = {
     *("priorities, n steps", "TD3, memory, noise", "PPO, normalised", "RecurrentPPO", "ARS", "DQN, masks"),
-    *("EnvPool, whole episodes", "first of n"),
+    "EnvPool, whole episodes",
 }
 """Each kind of loop, replay and memory once; the others are exhaustive."""
 

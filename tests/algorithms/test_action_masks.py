@@ -291,5 +291,3 @@ def test_algorithms_that_take_no_masks_say_which_do(name):
 def test_where_masks_have_no_meaning_they_are_refused():
     with pytest.raises(ValueError, match="masks need Discrete"):
         rejeu.SAC("MlpPolicy", gym.make("Pendulum-v1"), action_masks=True)
-    with pytest.raises(ValueError, match="wait_for=2 is not available with action_masks=True"):
-        rejeu.DQN("MlpPolicy", Rules(), action_masks=True).make_envs(Rules, 4, wait_for=2)

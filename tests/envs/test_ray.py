@@ -21,7 +21,7 @@ from rejeu.envs.make import make_vector
 from rejeu.envs.workers import pool, remote
 from tests.envs import ray_cluster
 from tests.helpers import assert_same_parameters, small_sac
-from tests.worker_environments import Losable, Paced, imports_jax, in_order, process_id
+from tests.worker_environments import Losable, Paced, imports_jax, process_id
 
 pytestmark = [
     pytest.mark.exhaustive,
@@ -107,7 +107,7 @@ def test_nothing_is_left_when_a_program_ends(tmp_path, ends):
             f"""
             import os, signal
             import rejeu
-            from tests.worker_environments import Paced, process_id, in_order
+            from tests.worker_environments import Paced, process_id
 
             def main():
                 env = rejeu.make_vector(Paced, 2, "ray")
@@ -143,31 +143,20 @@ def test_an_actor_that_crashes_or_hangs_is_named_and_all_are_ended(act):
     assert_gone(pids)
 
 
-@pytest.mark.parametrize("wait_for", [None, 1])
 @pytest.mark.parametrize("act", [1, 2])
-def test_a_lost_actor_is_replaced_and_its_episode_truncated(act, wait_for):
-    with opened(Losable, 2, worker_timeout=3.0, restart_workers=1, wait_for=wait_for) as vector:
+def test_a_lost_actor_is_replaced_and_its_episode_truncated(act):
+    with opened(Losable, 2, worker_timeout=3.0, restart_workers=1) as vector:
         before = vector.reset().copy()
         with pytest.warns(
             RuntimeWarning, match=r"environment 1 .*'step'.*restarted \(1 of at most 1 times\).*truncated"
         ):
-            step = play(vector, actions(0, act))
+            step = vector.step(actions(0, act))
         assert step.truncated.tolist() == [False, True]
         assert step.reward[1] == 0.0
         assert "environment 1" in step.info[1]["worker_restarted"]
         np.testing.assert_array_equal(step.obs[1], before[1])
         assert vector.reset_done(step.truncated)[1, 2] != before[1, 2]  # drawn from another seed
-        assert play(vector, actions(0, 0)).obs[1, 1] == 1
-
-
-def play(vector, action):
-    """Steps all, or takes results until that of environment 1 is there."""
-    if vector.wait_for is None:
-        return vector.step(action)
-    vector.send(action)
-    while 1 not in (step := vector.receive()).which:
-        pass
-    return step
+        assert vector.step(actions(0, 0)).obs[1, 1] == 1
 
 
 def test_a_run_resumes_exactly(tmp_path):
@@ -183,14 +172,6 @@ def test_a_run_resumes_exactly(tmp_path):
         assert again.resumed.exact
         again.learn()
     assert_same_parameters(whole, again)
-
-
-def test_results_in_the_same_order_train_the_same_agent_in_actors_and_in_processes():
-    with opened(functools.partial(Paced, 0.002), 3, wait_for=2) as env:
-        live = small_sac(in_order(env)).learn(60)
-    with contextlib.closing(make_vector(Paced, 3, "gymnasium-async", seed=0, wait_for=2)) as env:
-        again = small_sac(in_order(env)).learn(60)
-    assert_same_parameters(live, again)
 
 
 def test_environments_without_a_place_are_named(monkeypatch):

@@ -107,16 +107,6 @@ def test_environments_elsewhere_walk_as_those_here_do(ray):
     assert ray.closed == ["auto"]
 
 
-def test_results_are_taken_as_they_arrive():
-    with opened(3, wait_for=2) as vector:
-        vector.reset()
-        for _ in range(10):
-            vector.send(np.zeros((3, 1), np.float32))
-            step = vector.receive()
-            assert len(step.which) == 2
-            vector.reset_done(step.terminated | step.truncated)
-
-
 def test_an_actor_that_never_ran_is_started_again(monkeypatch):
     monkeypatch.setattr(Task, "n_failures", 3)
     with opened() as vector:

@@ -240,6 +240,7 @@ def test_answers_that_nobody_fetched_are_dropped():
         ({"worker_timeout": 0}, "worker_timeout=0 must be a number of seconds above 0, or None"),
         ({"restart_workers": -1}, "restart_workers=-1 must be a whole number"),
         ({"restart_workers": 1, "backend": "gymnasium"}, "got backend='gymnasium'.*use backend='gymnasium-async'"),
+        ({"ray": {"num_cpus": 1}}, "is for backend='ray', got backend='gymnasium-async'"),
     ],
 )
 def test_options_of_workers_are_checked(options, words):

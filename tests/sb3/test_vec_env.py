@@ -30,6 +30,7 @@ from rejeu.sb3.common.vec_env import (
     unwrap_vec_wrapper,
 )
 from rejeu.training.learner import Readings
+from tests.bad_environments import Good, SameArray
 from tests.environments import Reach
 from tests.golden.vec_env_script import Walk
 from tests.logs.test_video import Lamp
@@ -190,6 +191,18 @@ def test_a_vector_that_hides_what_episodes_end_in_is_an_error(forget, said):
     agent = rejeu.DQN("MlpPolicy", Forgetful(walks(), forget), **SMALL)
     with pytest.raises(BadEnvironmentError, match=said):
         agent.learn(20)
+
+
+def test_the_last_observation_of_an_episode_outlasts_an_environment_that_writes_into_one_array():
+    vectors = [DummyVecEnv([kind]) for kind in (Good, SameArray)]
+    for vector in vectors:
+        vector.seed(3)
+        vector.reset()
+    ends = []
+    while not ends:
+        infos = [vector.step(np.zeros((1, *vector.action_space.shape), np.float32))[3][0] for vector in vectors]
+        ends = [info["terminal_observation"] for info in infos if "terminal_observation" in info]
+    np.testing.assert_array_equal(*ends)
 
 
 def test_returns_are_counted_beneath_wrappers_that_change_rewards():

@@ -28,8 +28,8 @@ from rejeu.core.algorithm import Algorithm, Masked, names
 from rejeu.core.failed_writes import FailedWrites
 from rejeu.core.normalization import normalized
 from rejeu.core.validation import number, whole, whole_seed
-from rejeu.envs.make import Backend, VectorEnv
-from rejeu.envs.masks import mask_leaf, n_choices
+from rejeu.envs.make import Backend, VectorEnv, make_vector
+from rejeu.envs.masks import make_masked, mask_leaf, n_choices
 from rejeu.exploration import explorer as exploration
 from rejeu.exploration.noise import Noise, check_fits
 from rejeu.logs.formatting import counted, html_table
@@ -357,11 +357,9 @@ class BaseAgent(ABC):
         with devices.chosen(self.device):
             self.run = initial_run(env, buffer, self.learner, learn_from, self.seed, state)
 
-    @abstractmethod
-    def make_envs(
-        self, env: Any, n_envs: int = 1, backend: Backend = "auto", seed: int | None = None, wait_for: int | None = None
-    ) -> VectorEnv:
+    def make_envs(self, env: Any, n_envs: int = 1, backend: Backend = "auto", seed: int | None = None) -> VectorEnv:
         """Returns vector environments for this agent; the arguments are those of :func:`rejeu.make_vector`."""
+        return (make_masked if self.takes_masks else make_vector)(env, n_envs, backend, seed)
 
     @abstractmethod
     def make_noise(self) -> Noise | None:

@@ -17,8 +17,7 @@ from rejeu.core import checkpoint, spaces
 from rejeu.core.errors import CheckpointError
 from rejeu.core.records import brief
 from rejeu.envs.goals import GoalFunctions
-from rejeu.envs.make import Backend, VectorEnv, make_vector
-from rejeu.envs.masks import make_masked
+from rejeu.envs.make import VectorEnv
 from rejeu.exploration.noise import Noise, for_actions
 from rejeu.replay import ring_io
 from rejeu.replay.hindsight import HerReplayBuffer, counters
@@ -102,15 +101,6 @@ class OffPolicyAgent(Agent):
     def _require_replay(self) -> None:
         if self.run.replay is None:
             raise ValueError("this agent has no environment and so no replay buffer; give one to load(path, env=...)")
-
-    def make_envs(
-        self, env: Any, n_envs: int = 1, backend: Backend = "auto", seed: int | None = None, wait_for: int | None = None
-    ) -> VectorEnv:
-        if not self.takes_masks:
-            return make_vector(env, n_envs, backend, seed, wait_for=wait_for)
-        if wait_for is not None:
-            raise ValueError(f"wait_for={wait_for} is not available with action_masks=True; leave out one of them")
-        return make_masked(env, n_envs, backend, seed)
 
     def make_noise(self) -> Noise | None:
         return for_actions(self.config.action_noise, self.action_space)

@@ -12,8 +12,8 @@ from rejeu.agents import policy
 from rejeu.agents.agent import Agent
 from rejeu.algorithms.rollout_config import RolloutConfig
 from rejeu.core import devices, spaces
-from rejeu.envs.make import Backend, VectorEnv, make_vector
-from rejeu.envs.masks import make_masked, split
+from rejeu.envs.make import VectorEnv
+from rejeu.envs.masks import split
 from rejeu.exploration.noise import Noise
 from rejeu.replay.rollout import RolloutBuffer
 from rejeu.training import finite
@@ -64,17 +64,6 @@ class OnPolicyAgent(Agent):
             memory = policy.memory_of(self, state, n)
             values = np.asarray(self.learner.state_value(self.run.state, memory, obs, ended))
         return values[0] if single else values
-
-    def make_envs(
-        self, env: Any, n_envs: int = 1, backend: Backend = "auto", seed: int | None = None, wait_for: int | None = None
-    ) -> VectorEnv:
-        vector = (make_masked if self.takes_masks else make_vector)(env, n_envs, backend, seed)
-        if (wait_for := wait_for or vector.wait_for) is not None:
-            raise ValueError(
-                f"wait_for={wait_for} is for off-policy algorithms such as SAC, and {self.name} learns from rollouts in which "
-                "all environments step together; make the environments without wait_for"
-            )
-        return vector
 
     def make_noise(self) -> Noise | None:
         return None

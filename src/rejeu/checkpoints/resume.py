@@ -97,8 +97,7 @@ def _resume_within(made: ExitStack, file: checkpoint.Contents, cls: type[A], env
             return vector
         env_id, backend = environment(path, header)
         try:
-            several = {} if header.wait_for is None else {"wait_for": header.wait_for}
-            vector = agent.make_envs(env_id, header.n_envs, backend, seed_of_run(agent.seed), **several)
+            vector = agent.make_envs(env_id, header.n_envs, backend, seed_of_run(agent.seed))
             made.callback(vector.close)
             agent.check_spaces(vector, f"{env_id} as it is here")
         except (ValueError, TypeError, gym.error.Error) as error:

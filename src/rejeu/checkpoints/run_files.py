@@ -231,7 +231,6 @@ class RunHeader(msgspec.Struct):
     """Of JAX's device."""
     env_id: Any = None
     backend: Any = None
-    wait_for: Positive | None = None
     own_env: Any = False
     n_together: Positive = 1
     """Runs in the program that trained it."""
@@ -322,7 +321,6 @@ def content(agent: BaseAgent, reason: str) -> tuple[dict[str, Any], dict[str, np
         "run_id": agent.run_id,
         "n_envs": run.env.n_envs,
         "backend": run.env.backend,
-        "wait_for": run.env.wait_for,
         "own_env": agent.made_from_id,
         "threads": xla.threads(),
         "n_together": agent.n_together,

@@ -84,8 +84,6 @@ class Step(NamedTuple):
     returns: np.ndarray | None = None
     """The return of each episode that ended, ``(n_envs,)``, as recorded by a ``Monitor`` inside wrappers that change rewards;
     NaN elsewhere. None if the sum of the rewards is the return."""
-    which: np.ndarray | None = None
-    """Indices of the environments whose results these are, increasing; None for all."""
 
     def return_of(self, env: int, total: float) -> float:
         """Returns the return of the episode that ended in environment ``env`` with the sum of rewards ``total``."""
@@ -111,8 +109,6 @@ class VectorEnv(ABC):
     """The time limit, None if unknown."""
     reward_threshold: float | None = None
     """The return at which the environment counts as solved, None if it declares none."""
-    wait_for: int | None = None
-    """How many results off-policy learning takes at a time, those that arrive first; None: those of all environments."""
     venv: Any = None
     """The vector environment with automatic resets that this was made from, or that was made of it; None if there is none."""
     wrapped_by: str | None = None

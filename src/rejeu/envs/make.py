@@ -56,7 +56,6 @@ class WorkerOptions(NamedTuple):
 
     worker_timeout: float | None = TIMEOUT
     restart_workers: int = 0
-    wait_for: int | None = None
     ray: Mapping[str, Any] | None = None
 
 
@@ -68,7 +67,6 @@ def make_vector(
     *,
     worker_timeout: float | None = TIMEOUT,
     restart_workers: int = 0,
-    wait_for: int | None = None,
     ray: Mapping[str, Any] | None = None,
     **env_kwargs: Any,
 ) -> VectorEnv:
@@ -89,10 +87,7 @@ def make_vector(
             meaning on other backends.
         restart_workers: how many workers that crashed, hung or were lost with their machine are restarted, with a warning,
             and their episode counted as truncated there; after that, and by default, :class:`rejeu.core.errors.WorkerError` is
-            raised. Only for ``"gymnasium-async"`` and ``"ray"``, like the options that follow.
-        wait_for: how many results off-policy algorithms take at a time, from 1 to ``n_envs``: those that arrive first.
-            They are stored, and these environments continue while the others still step. None: all environments step
-            together.
+            raised. Only for ``"gymnasium-async"`` and ``"ray"``.
         ray: for ``"ray"``: ``address`` of the cluster (``"HOST:PORT"`` or ``"auto"``; by default that in the environment
             variable ``RAY_ADDRESS``, else Ray is started on this machine), and what each environment reserves:
             ``num_cpus`` (1, or 0 if Ray is started here), ``num_gpus`` (0), ``memory`` in bytes, ``resources`` by name.
@@ -111,7 +106,7 @@ def make_vector(
     """
     validation.choice("backend", backend, BACKENDS)
     n_envs = validation.whole("n_envs", n_envs, least=1)
-    workers = WorkerOptions(worker_timeout, restart_workers, wait_for, ray)
+    workers = WorkerOptions(worker_timeout, restart_workers, ray)
     check_workers(env, n_envs, backend, workers)
     if isinstance(env, VectorEnv | gym.vector.VectorEnv) or adapter_of(env) is not None:
         n_envs = env.n_envs if isinstance(env, VectorEnv) else env.num_envs
@@ -151,7 +146,7 @@ def _made(
     if callable(env):
         if backend in WORKERS:
             starter = Actors(workers.ray or {}) if backend == "ray" else None
-            return InWorkers(env, n_envs, seed, *workers[:3], starter)
+            return InWorkers(env, n_envs, seed, workers.worker_timeout, workers.restart_workers, starter)
         return InProcess([env() for _ in range(n_envs)], seed)
     if not isinstance(env, str):
         raise TypeError(environment_fault(env, KINDS))
@@ -204,8 +199,6 @@ def check_workers(env: Any, n_envs: int, backend: Backend, options: WorkerOption
                 f"{name}={value!s:.40} is for worker processes, got backend={backend!r} and an env of type "
                 f"{type(env).__name__}; use backend='gymnasium-async' or 'ray', and an id or a function"
             )
-    if options.wait_for is not None:
-        validation.whole("wait_for", options.wait_for, least=1, most=n_envs)
     if options.ray is not None and backend != "ray":
         raise ValueError(f"ray={dict(options.ray)} is for backend='ray', got backend={backend!r}")
 

@@ -248,7 +248,7 @@ def make_masked(
 
     Raises:
         TypeError: for EnvPool, whose single environments cannot be accessed.
-        ValueError: for worker options out of range, ``restart_workers`` where there are no worker processes, or ``wait_for``.
+        ValueError: for worker options out of range, or ``restart_workers`` where there are no worker processes.
     """
     check_workers(env, n_envs, backend, WorkerOptions(worker_timeout, restart_workers))
     if adapter_of(env) is not None or isinstance(env, gym.Env | gym.vector.VectorEnv):
@@ -270,8 +270,6 @@ def make_masked(
             "rejeu.make_vector(function, n_envs, 'gymnasium')"
         )
     if isinstance(env, VectorEnv):
-        if env.wait_for is not None:
-            raise ValueError(f"wait_for={env.wait_for} is not available with action masks; leave it out")
         return MaskedVector(env, asks=True)
     made_from: tuple[str, dict[str, Any]] | None = (env, {}) if isinstance(env, str) else None
     if isinstance(env, str):

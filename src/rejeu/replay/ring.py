@@ -153,10 +153,9 @@ class Ring:
         self._write_obs(following, next_obs, env_numbers)
         return index, following
 
-    def remember(self, memory: np.ndarray, ended: np.ndarray, envs: np.ndarray | None = None) -> None:
+    def remember(self, memory: np.ndarray, ended: np.ndarray) -> None:
         """Writes what is remembered before the newest observations, ``(n_envs, memory_size)``; nothing where ``ended``."""
-        envs = self.all_envs if envs is None else envs
-        self.memory[self.index(envs, self.head[envs])] = np.where(ended[:, None], np.float32(0), memory)[envs]
+        self.memory[self.index(self.all_envs, self.head)] = np.where(ended[:, None], np.float32(0), memory)
 
     def index(self, env: np.ndarray, time: np.ndarray) -> np.ndarray:
         """Returns the positions of rows given by environment and absolute time."""

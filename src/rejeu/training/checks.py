@@ -21,16 +21,10 @@ from rejeu.training.run import Run, restart, timed
 def checked_step(run: Run, action: np.ndarray, active: np.ndarray | None = None) -> Step:
     """Steps the environments, or those that are ``active``, and checks what they return, bounds from time to time.
 
-    Where environments do not wait for each other, the result is that of the first ``wait_for``.
-
     Raises:
         BadEnvironmentError, NonFiniteError, NonFiniteUpdate: as :func:`check_finite`.
     """
-    if run.env.wait_for is None:
-        step = run.env.step(action, active)
-    else:
-        run.env.send(action)
-        step = run.env.receive()
+    step = run.env.step(action, active)
     check_finite(run, step, run.step)
     if run.step >= run.next_look:
         check_bounds(run, step.obs)

@@ -12,10 +12,6 @@
 So environments and updates do not wait for each other. The results still depend on the seed only, because the action at
 a step always follows the update of the step before the last. With ``overlap=False`` actions are requested after the
 updates are started, and wait for them.
-
-With ``env.wait_for`` one turn takes the results of so many environments that have them first, ``step.which``, and gives these
-new actions, while the others still step. Arrays of a turn have a row for each environment; only the rows of ``which`` are
-new. The results depend on the seed and on the order of arrival, which no seed determines.
 """
 
 from __future__ import annotations
@@ -68,23 +64,23 @@ def off_policy(
         if run.obs is None or env.must_reset:
             run.replay.begin(checked_restart(run))
         if run.action is None:
-            run.action = np.array(choose(run, learner, config, clock_of(run, progress(run.step - first)), None)[0])
+            run.action = np.array(choose(run, learner, config, clock_of(run, progress(run.step - first)))[0])
         action = scale(run.action)
         step = checked_step(run, action)
         n_kept, episodes = store(run, learner, config, step, last)
         last_obs = begin_where_ended(run, step)
         if learner.observe is not None:
-            observe(run, learner, step.which)
+            observe(run, learner)
         done = progress(run.step - first)
         clock = clock_of(run, done)
         n_updates = due(run, config, n_kept, len(episodes))
         if config.overlap:
-            chosen = choose(run, learner, config, clock, step.which)
+            chosen = choose(run, learner, config, clock)
         samples = sample(run, config, n_updates, done)
         update(run, learner, samples, clock)
         if not config.overlap:
-            chosen = choose(run, learner, config, clock, step.which)
-        read(run, chosen, step.which)
+            chosen = choose(run, learner, config, clock)
+        read(run, chosen)
         ended = n_updates > 0 or (run.step <= run.learn_from and reaches(run, config, n_kept, len(episodes)))
         yield Progress(run.step, episodes, run.metrics, action, step, last_obs, ended)
 
@@ -133,15 +129,14 @@ def store(
     Returns how many environments' steps were kept, so that there are ``last`` in all, and the episodes that ended.
     """
     n_envs = run.env.n_envs
-    which = np.arange(n_envs) if step.which is None else step.which
-    n_kept = len(which) if last is None else min(len(which), last - run.step)
-    kept = None if n_kept == n_envs else which[:n_kept]
+    n_kept = n_envs if last is None else min(n_envs, last - run.step)
+    kept = None if n_kept == n_envs else np.arange(n_kept)
     if learner.observe is not None:
         before = np.where(run.ended, np.float32(0), run.running_return)
-        run.running_return = merged(before, config.gamma * before + step.reward, step.which)
+        run.running_return = config.gamma * before + step.reward
     run.replay.add(run.action, step.reward, step.terminated, step.obs, kept)
     run.step += n_kept
-    return n_kept, record_step(run, step, mask(kept, n_envs), mask(step.which, n_envs))
+    return n_kept, record_step(run, step, None if kept is None else np.arange(n_envs) < n_kept)
 
 
 def begin_where_ended(run: Run, step: Step) -> PyTree:
@@ -158,45 +153,21 @@ def begin_where_ended(run: Run, step: Step) -> PyTree:
     return last_obs
 
 
-def merged(old: Any, new: np.ndarray, which: np.ndarray | None) -> np.ndarray:
-    """Returns ``old`` with the rows ``which`` of ``new``, which has all rows or only these; ``new`` where that is None."""
-    if which is None:
-        return new
-    old = old.copy()
-    old[which] = new if len(new) == len(which) else new[which]
-    return old
-
-
-def mask(which: np.ndarray | None, n_envs: int) -> np.ndarray | None:
-    """Returns indices as a mask, ``bool (n_envs,)``; None, which stands for all, as it is."""
-    return None if which is None else np.bincount(which, minlength=n_envs) > 0
-
-
 @timed("update")
-def choose(run: Run, learner: Learner, config: OffPolicyConfig, clock: Clock, which: np.ndarray | None) -> Choice:
+def choose(run: Run, learner: Learner, config: OffPolicyConfig, clock: Clock) -> Choice:
     """Returns random actions at first, then those of the exploring policy, and how many updates are done when they are.
 
     A policy with memory remembers the observations of random actions too, and the replay buffer what it remembered.
-    ``run.obs`` must not change before they are read. ``which`` are the environments; None stands for all. Noise and other
-    state of exploration advance in these only. What they share, arrays without an axis of environments, advances with every
-    call.
+    ``run.obs`` must not change before they are read.
     """
     random = None
     if run.step < config.learning_starts:
-        allowed = unmasked(run.obs)[1]
-        allowed = allowed if allowed is None or which is None else allowed[which]
-        n = run.env.n_envs if which is None else len(which)
-        random = random_action(run.env.action_space, n, run.rng, allowed)
+        random = random_action(run.env.action_space, run.env.n_envs, run.rng, unmasked(run.obs)[1])
         if learner.algorithm.recall is None:
             return random, len(run.monitor)
     if learner.algorithm.recall is not None:
-        run.replay.ring.remember(np.asarray(memory_in(run.carry)), run.ended, which)
-    if which is None:
-        action, run.carry = learner.act(run.state, run.carry, run.obs, run.ended, run.key, clock)
-    else:
-        carry = jax.tree.map(lambda leaf: leaf[which] if leaf.ndim else leaf, run.carry)
-        action, carry = learner.act(run.state, carry, rows(run.obs, which), run.ended[which], run.key, clock)
-        run.carry = jax.tree.map(lambda old, new: old.at[which].set(new) if old.ndim else new, run.carry, carry)
+        run.replay.ring.remember(np.asarray(memory_in(run.carry)), run.ended)
+    action, run.carry = learner.act(run.state, run.carry, run.obs, run.ended, run.key, clock)
     if random is None:
         return action, len(run.monitor)
     jax.block_until_ready(action)  # until then the device may read the observations
@@ -204,32 +175,26 @@ def choose(run: Run, learner: Learner, config: OffPolicyConfig, clock: Clock, wh
 
 
 @timed("update")
-def read(run: Run, chosen: Choice, which: np.ndarray | None) -> None:
-    """Waits for the actions of the environments ``which``, and checks the updates that were started before them."""
-    run.action = merged(run.action, np.asarray(chosen[0]), which)
+def read(run: Run, chosen: Choice) -> None:
+    """Waits for the actions, and checks the updates that were started before them."""
+    run.action = np.asarray(chosen[0])
     run.monitor.read(chosen[1])
 
 
-def rows(obs: PyTree, which: np.ndarray | None) -> PyTree:
-    """Returns a copy of the observations of the environments ``which``; None stands for all."""
-    return jax.tree.map(np.copy if which is None else (lambda leaf: leaf[which]), obs)
-
-
 @timed("update")
-def observe(run: Run, learner: Learner, which: np.ndarray | None) -> None:
+def observe(run: Run, learner: Learner) -> None:
     """Adds the new observations to the statistics of the state.
 
     They are copied: the device may read an array after the environments have written the next step to it.
     """
     assert learner.observe is not None
-    returns = run.running_return if which is None else run.running_return[which]
-    run.state = run.monitor.follow(learner.observe, run.state, rows(run.obs, which), returns)
+    run.state = run.monitor.follow(learner.observe, run.state, jax.tree.map(np.copy, run.obs), run.running_return)
 
 
 @timed("replay")
 def sample(run: Run, config: OffPolicyConfig, n_updates: int, progress: float) -> list[tuple[Any, Any]]:
     """Returns the batches of a number of gradient steps, each with its draw."""
-    shapes = batch_shapes(n_updates, config, run.env.wait_for or run.env.n_envs)
+    shapes = batch_shapes(n_updates, config, run.env.n_envs)
     return [run.replay.draw(run.rng, shape, progress) for shape in shapes]
 
 

@@ -157,7 +157,7 @@ def restart(run: Run) -> PyTree:
 
 def clock_of(run: Run, progress: float) -> Clock:
     """Returns the position in the run as arrays, so that no compiled function depends on the values."""
-    n_envs = 1 if run.env is None else run.env.wait_for or run.env.n_envs
+    n_envs = 1 if run.env is None else run.env.n_envs
     return Clock(np.uint32(run.step), np.uint32(run.episode), np.float32(progress), np.uint32(n_envs))
 
 

@@ -262,11 +262,11 @@ def test_train(sessions, tmp_path):
 
 def test_workers_and_datasets_of_train(spy):
     made, shown = spy(Environment, "vector"), Train(env=TYPED, offline=Path("shown"))
-    given = Train(env=TYPED, n_envs=3, backend="gymnasium-async", restart_workers=2, wait_for=1)
+    given = Train(env=TYPED, n_envs=3, backend="gymnasium-async", restart_workers=2)
     environment = models.environment.from_arguments(TYPED, given)
     begin.make_env(given, environment, None, 5)
     assert includes(made, n_envs=3, backend="gymnasium-async", seed=5)
-    assert (made[-1]["workers"].restart_workers, made[-1]["workers"].wait_for) == (2, 1)
+    assert made[-1]["workers"].restart_workers == 2
     begin.make_env(dataclasses.replace(given, backend="ray", ray="auto", env_cpus=0.5), environment, None, 5)
     assert made[-1]["workers"].ray == {"address": "auto", "num_cpus": 0.5}
     given = begin.with_dataset(shown)
@@ -297,14 +297,14 @@ def decided(**changes):
     """What a run folder says."""
     common = {"env": TYPED, "algorithm": "DQN", "policy": "MlpPolicy", "preset": True, "seed": 4}
     common |= {"n_envs": 2, "backend": "gymnasium", "steps": 100, "evaluate_every": 40, "evaluate_episodes": 6}
-    return DecidedRun(**{**common, "device": "cpu", "wait_for": None, **changes})
+    return DecidedRun(**{**common, "device": "cpu", **changes})
 
 
 def test_resume(spy, sessions, monkeypatch, tmp_path):
     agent = mock.Mock(training_call=mock.Mock(last_step=100, **{"is_over.return_value": False}))
     agent.run.step = 30
     kind = mock.Mock(**{"resume.return_value": agent})
-    spy(resume, "read_folder", decided(wait_for=1, hyperparameters={"policy_kwargs": {"net_arch": [4]}}))
+    spy(resume, "read_folder", decided(hyperparameters={"policy_kwargs": {"net_arch": [4]}}))
     spy(resume, "agent_of_file", kind)
     written, made = spy(resume.configs_of_runs, "write"), spy(Environment, "vector", mock.Mock())
     monkeypatch.setattr(resume.configs, "to_json", lambda config: {"gamma": 0.5})
@@ -321,7 +321,7 @@ def test_resume(spy, sessions, monkeypatch, tmp_path):
     assert kind.resume.call_args.args[0] == tmp_path / "checkpoints"
     training, evaluating = made
     assert (training["n_envs"], training["backend"], training["seed"]) == (2, "gymnasium", 4)
-    assert (training["workers"].restart_workers, training["workers"].wait_for) == (3, 1)
+    assert training["workers"].restart_workers == 3
     assert evaluating["seed"] != 4
     assert written[-1]["config"].hyperparameters == {"gamma": 0.5}
     assert main([*argv, "--minutes", "2", "--no-video"]) == 0

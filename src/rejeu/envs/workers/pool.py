@@ -285,16 +285,6 @@ class Workers:
             waiting -= found.keys()
         return self._without_lost(dict(sorted(found.items())))
 
-    def first(self, numbers: Collection[int]) -> dict[int, Any]:
-        """Waits until one of these workers has answered, and returns what has arrived, in any order.
-
-        The answers and errors are those of :meth:`answers`.
-        """
-        found: dict[int, Any] = {}
-        while not found:
-            found = self._arrived(numbers)
-        return self._without_lost(found)
-
     def _arrived(self, numbers: Collection[int]) -> dict[int, Any]:
         """Returns the answers that arrive within :data:`LOOK_SECONDS`, and :class:`Lost` for workers without one."""
         ready = self._listener.ready(self.workers, seconds_until(self._look_at, LOOK_SECONDS))

@@ -79,25 +79,18 @@ def rows(space: gym.Space, buffers: Sequence[Any], n_envs: int) -> list[np.ndarr
     ]
 
 
-class Encoders(NamedTuple):
-    """What takes an observation, and returns what is sent in its place."""
-
-    encode: Callable[[Any], Any]
-    keep: Callable[[Any], Any]
-    """The same of final observations, which must outlast the next one."""
-
-
-Handover = Callable[[gym.Space], Encoders]
+Encode = Callable[[Any], Any]
+"""Takes an observation, and returns its message; an observation may change afterwards."""
+Handover = Callable[[gym.Space], Encode]
 """How a worker hands over observations of a space; sent to the worker."""
 
 
-def in_shared_memory(buffers: Sequence[Any], n_envs: int, number: int, space: gym.Space) -> Encoders:
-    """Writes observations of environment ``number`` into the memory of :func:`rows`; of final ones the leaves are sent."""
-    put = validation.make_writer(space, rows(space, buffers, n_envs))
-    return Encoders(partial(put, number), as_leaves(space).keep)
+def in_shared_memory(buffers: Sequence[Any], n_envs: int, number: int, space: gym.Space) -> Encode:
+    """Writes observations of environment ``number`` into the memory of :func:`rows`."""
+    return partial(validation.make_writer(space, rows(space, buffers, n_envs)), number)
 
 
-def as_leaves(space: gym.Space) -> Encoders:
+def as_leaves(space: gym.Space) -> Encode:
     """Sends observations as the list of their leaves, arrays of the kept dtypes."""
     stores = [np.zeros((1, *leaf.shape), leaf.dtype) for leaf in leaves(space)]
     put = validation.make_writer(space, stores)
@@ -106,12 +99,12 @@ def as_leaves(space: gym.Space) -> Encoders:
         put(0, obs)
         return [np.array(store[0]) for store in stores]
 
-    return Encoders(encode, encode)
+    return encode
 
 
-def as_declared(space: gym.Space) -> Encoders:
+def as_declared(space: gym.Space) -> Encode:
     """Sends observations with their structure and the dtypes of the space."""
-    return Encoders(*[partial(validation.copy_observation, space)] * 2)
+    return partial(validation.copy_observation, space)
 
 
 @contextmanager
@@ -153,10 +146,10 @@ def serve(pipe: Connection, make: CloudpickleWrapper, handover: Handover) -> Non
         env = make.fn()
         if (fault := validation.environment_fault(env)) is not None:
             raise TypeError(fault)
-        encoders = handover(env.observation_space)
+        encode = handover(env.observation_space)
         send(pipe, WorkerDescription(env.observation_space, env.action_space, env.metadata, env.render_mode))
         while (request := receive(pipe))[0] != "close":
-            send(pipe, _answered(env, request, encoders))
+            send(pipe, _answered(env, request, encode))
     except (EOFError, ConnectionError):
         pass
     except Exception as error:  # any exception of the constructor: the main process raises it
@@ -216,10 +209,10 @@ def receive_exactly(connected: socket.socket, n: int) -> bytes:
     return data
 
 
-def _answered(env: gym.Env, request: Any, encoders: Encoders) -> Any:
+def _answered(env: gym.Env, request: Any, encode: Encode) -> Any:
     """Returns the answer of the environment, or a :class:`WorkerFailure`."""
     try:
-        return _answer(env, encoders, *request)
+        return _answer(env, encode, *request)
     except BadEnvironmentError as error:
         return WorkerFailure("bad answer", str(error), traceback.format_exc())
     except Exception as error:  # the environment can raise anything
@@ -227,18 +220,18 @@ def _answered(env: gym.Env, request: Any, encoders: Encoders) -> Any:
         return WorkerFailure(kind, str(error), traceback.format_exc())
 
 
-def _answer(env: gym.Env, encoders: Encoders, name: str, *arguments: Any) -> Any:
+def _answer(env: gym.Env, encode: Encode, name: str, *arguments: Any) -> Any:
     """Returns the answer of an environment to one request."""
     if name == "step":
         obs, *rest = validation.step_env(env, *arguments)
-        return encoders.encode(obs), *rest
+        return encode(obs), *rest
     if name == "step_and_reset":
-        return step_and_reset(env, encoders, *arguments)
+        return step_and_reset(env, encode, *arguments)
     if name == "reset":
         if arguments and arguments[0] is not None:
             seed_globals(arguments[0])
         obs, info = validation.reset_env(env, *arguments)
-        return encoders.encode(obs), info
+        return encode(obs), info
     if name == "snapshot":
         return snapshot.state_of(env)
     if name == "restore":
@@ -256,13 +249,13 @@ def seed_globals(seed: int | None) -> None:
 
 
 def step_and_reset(
-    env: gym.Env, encoders: Encoders, action: Any
+    env: gym.Env, encode: Encode, action: Any
 ) -> tuple[Any, float, bool, bool, dict[str, Any], Any, dict[str, Any]]:
     """Steps an environment, and resets it if the episode has ended.
 
     Args:
         env: the environment.
-        encoders: of the observations.
+        encode: of the observations.
         action: the action.
 
     Returns:
@@ -271,10 +264,10 @@ def step_and_reset(
     """
     obs, reward, terminated, truncated, info = validation.step_env(env, action)
     if not (terminated or truncated):
-        return encoders.encode(obs), reward, terminated, truncated, info, None, {}
-    final = encoders.keep(obs)
+        return encode(obs), reward, terminated, truncated, info, None, {}
+    final = encode(obs)
     obs, reset_info = validation.reset_env(env)
-    return encoders.encode(obs), reward, terminated, truncated, info, final, reset_info
+    return encode(obs), reward, terminated, truncated, info, final, reset_info
 
 
 def call_method(env: gym.Env, name: str, arguments: tuple[Any, ...], keywords: dict[str, Any]) -> Any:

@@ -85,7 +85,7 @@ def make_env(arguments: Train, made: Environment, preset: Preset | None, seed: i
     if is_elsewhere and arguments.backend is None and usable_envpool() is None:
         backend = "gymnasium"
     backend = arguments.backend or backend
-    workers = WorkerOptions(restart_workers=arguments.restart_workers, wait_for=arguments.wait_for)
+    workers = WorkerOptions(restart_workers=arguments.restart_workers)
     if backend == "ray" or arguments.ray is not None:
         workers = workers._replace(ray={"address": arguments.ray, "num_cpus": arguments.env_cpus})
     return made.vector(n_envs, backend, seed, workers)
@@ -139,7 +139,6 @@ def make_config(
         seed=seed,
         n_envs=env.n_envs,
         backend=env.backend,
-        wait_for=env.wait_for,
         device=devices.named(arguments.device, "--device"),
         steps=None if arguments.minutes is not None else arguments.steps or base.total_steps,
         minutes=arguments.minutes,

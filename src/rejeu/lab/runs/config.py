@@ -237,8 +237,6 @@ class RunConfig(EnvironmentOptions):
     """auto, envpool, gymnasium, gymnasium-async, jax or ray; by default the preset's, else auto."""
     restart_workers: Annotated[int, Meta(ge=0), Shown("N"), Topic.ENVIRONMENT] = 0
     """With --backend gymnasium-async or ray: how many workers that crashed, hung or were lost are restarted."""
-    wait_for: Annotated[Positive | None, Shown("K"), Topic.ENVIRONMENT] = None
-    """With these: take the first K results that arrive, and do not wait for the other environments."""
     ray: Annotated[str | None, Shown("ADDRESS"), Topic.ENVIRONMENT] = None
     """With --backend ray: HOST:PORT of the cluster, or auto; by default RAY_ADDRESS, else Ray on this machine."""
     env_cpus: Annotated[Annotated[float, Meta(ge=0, le=10_000)] | None, Shown("N"), Topic.ENVIRONMENT] = None

@@ -67,7 +67,7 @@ def train_on(
     kind = agent_of_file(config.algorithm, folder.config)
     environment = environments.from_run(config, folder.path, arguments)
     ray = {"address": arguments.ray, "num_cpus": arguments.env_cpus} if config.backend == "ray" else None
-    workers = WorkerOptions(restart_workers=arguments.restart_workers, wait_for=config.wait_for, ray=ray)
+    workers = WorkerOptions(restart_workers=arguments.restart_workers, ray=ray)
     with closing(environment.vector(config.n_envs, config.backend, config.seed, workers)) as env:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "resumed at step", UserWarning)  # printed below

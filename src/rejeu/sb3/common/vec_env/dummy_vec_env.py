@@ -54,13 +54,13 @@ class DummyVecEnv(SingleEnvs):
         self.n_steps = 0
         """Number of steps of the vector."""
         self._actions: Any = None
-        self._encoders = [as_declared(env.observation_space) for env in self.envs]
+        self._encode = [as_declared(env.observation_space) for env in self.envs]
 
     def reset(self) -> Any:
         parts = []
         for i, env in enumerate(self.envs):
             obs, self.reset_infos[i] = self._located(i, reset_env, env, self._seeds[i], self._options[i])
-            parts.append(self._encoders[i].encode(obs))
+            parts.append(self._encode[i](obs))
         self._reset_seeds()
         self._reset_options()
         return stacked(self.observation_space, parts)
@@ -73,8 +73,8 @@ class DummyVecEnv(SingleEnvs):
         self.n_steps += 1
         return self._stepped(
             # Copies: an environment may write its next observation into the same array.
-            self._located(i, step_and_reset, env, encoders, action)
-            for i, (env, encoders, action) in enumerate(zip(self.envs, self._encoders, self._actions, strict=False))
+            self._located(i, step_and_reset, env, encode, action)
+            for i, (env, encode, action) in enumerate(zip(self.envs, self._encode, self._actions, strict=False))
         )
 
     def _located(self, i: int, function: Callable[..., Any], *arguments: Any) -> Any:
