@@ -57,7 +57,7 @@ def interface() -> Iterator[Any]:
 
 
 def push(source: str | Path, repo: str, private: bool = False, note: Callable[[str], Any] = print) -> str:
-    """Writes a model and what is known of its training to a repository, which is created; returns its address.
+    """Writes a model and the record of its training to a repository, which is created; returns its address.
 
     The repository gets the best model, an ONNX file if ``rejeu[export]`` is installed, the tables, the learning curve and
     the video of the run, and a card. Server and token are those of ``huggingface_hub`` (``HF_ENDPOINT``, ``HF_TOKEN``).
@@ -74,12 +74,12 @@ def push(source: str | Path, repo: str, private: bool = False, note: Callable[[s
         OSError: if the hub cannot be reached or refuses.
         MissingExtra: if ``huggingface-hub`` is not installed.
     """
-    with tempfile.TemporaryDirectory() as made, interface() as hub:
-        agent = lay_out(source, Path(made), repo, note)
+    with tempfile.TemporaryDirectory() as folder, interface() as hub:
+        agent = lay_out(source, Path(folder), repo, note)
         api = hub.HfApi()
         address = api.create_repo(repo, private=private or None, exist_ok=True)
         message = f"{agent.name}, {counted(agent.num_timesteps, 'step')}"
-        api.upload_folder(repo_id=repo, folder_path=made, commit_message=message)
+        api.upload_folder(repo_id=repo, folder_path=folder, commit_message=message)
     return str(address)
 
 
@@ -111,7 +111,7 @@ def lay_out(source: str | Path, folder: Path, repo: str, note: Callable[[str], A
         agent.export(folder / ONNX)
     except (ImportError, OSError, RuntimeError, ValueError) as error:
         note(f"without {ONNX}: {brief(error)}")
-    names = {one.name for one in folder.iterdir()}
+    names = {path.name for path in folder.iterdir()}
     (folder / CARD).write_text(card(agent, repo, source, names), encoding="utf-8")
     return agent
 
@@ -136,8 +136,8 @@ def pull(repo: str, out: str | Path | None = None) -> Path:
     check_free(out)
     parent = out.absolute().parent
     parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=parent) as made, interface() as hub:
-        room = Path(made) / "model"
+    with tempfile.TemporaryDirectory(dir=parent) as temporary, interface() as hub:
+        room = Path(temporary) / "model"
         names = [name for name in hub.HfApi().list_repo_files(repo) if is_wanted(name)]
         if MODEL not in names and not any(name.endswith(".zip") for name in names):
             raise FileNotFoundError(f"{repo} has no {MODEL}, and no zip file of Stable-Baselines3")
@@ -172,13 +172,14 @@ def card(agent: Agent, repo: str, source: Path, names: set[str]) -> str:
     """
     env_id = agent.trained_on[0] if agent.trained_on is not None else "an unknown environment"
     evaluation = evaluated(source)
-    about: dict[str, Any] = {"library_name": "rejeu", "tags": ["reinforcement-learning", "rejeu", agent.name, env_id]}
+    tags = ["reinforcement-learning", "rejeu", agent.name, env_id]
+    metadata: dict[str, Any] = {"library_name": "rejeu", "tags": tags}
     if evaluation is not None:
         metric = {"type": "mean_reward", "name": "mean return", "value": evaluation[1]}
         task, dataset = {"type": "reinforcement-learning"}, {"name": env_id, "type": env_id}
         results = [{"task": task, "dataset": dataset, "metrics": [metric]}]
-        about["model-index"] = [{"name": agent.name, "results": results}]
-    lines = ["---", *(f"{key}: {json.dumps(value)}" for key, value in about.items()), "---", ""]  # JSON is YAML
+        metadata["model-index"] = [{"name": agent.name, "results": results}]
+    lines = ["---", *(f"{key}: {json.dumps(value)}" for key, value in metadata.items()), "---", ""]  # JSON is YAML
     lines += [f"# {agent.name} on {env_id}", "", f"Trained for {counted(agent.num_timesteps, 'step')} with rejeu.", ""]
     lines += [evaluation[0], ""] if evaluation is not None else []
     lines += ["```", f"rejeu pull {repo}", f"rejeu evaluate {repo.rpartition('/')[2]}/{MODEL}", "```", ""]

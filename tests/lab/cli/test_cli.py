@@ -636,7 +636,7 @@ def test_a_warning_is_one_line_on_the_command_line(capsys):
     with pytest.MonkeyPatch.context() as patch:
         warn = lambda out: warnings.warn("\x1b[33mWARN: one\n  two\x1b[0m", UserWarning, stacklevel=1)  # noqa: E731
         patch.setattr("rejeu.lab.runs.begin.check_free", warn)
-        patch.setattr("rejeu.lab.runs.environment.from_arguments", lambda *_: (_ for _ in ()).throw(ValueError("over")))
+        patch.setattr("rejeu.lab.runs.begin.from_arguments", lambda *_: (_ for _ in ()).throw(ValueError("over")))
         with warnings.catch_warnings():
             warnings.simplefilter("always")
             assert main(argv) == 2

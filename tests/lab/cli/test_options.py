@@ -109,7 +109,7 @@ def game():
 def test_watch_and_play(spy, monkeypatch, capsys):
     found, watched, played = spy(models, "find_model"), spy(play, "watch", game()), spy(play, "play", game())
     spy(models, "load", "agent")
-    monkeypatch.setattr("rejeu.lab.runs.environment.recorded_id", lambda model: TYPED)
+    monkeypatch.setattr("rejeu.lab.cli.models.recorded_id", lambda model: TYPED)
     common = ["--seed", "5", "--fps", "20", "--episodes", "2", "--which", "last", "--json"]
     assert main(["watch", "run", "--env", TYPED, *common]) == 0
     assert includes(found, which="last")
@@ -119,7 +119,7 @@ def test_watch_and_play(spy, monkeypatch, capsys):
     assert main(["play", TYPED, "--keys", "a=0", "--record", "shown", "--against", "other", *common]) == 0
     assert includes(found, run=Path("other"), which="last")
     assert includes(played, keys={"a": 0}, seed=5, fps=20.0, episodes=2, record=Path("shown"), against="agent")
-    monkeypatch.setattr("rejeu.lab.runs.environment.recorded_id", lambda model: "Acrobot-v1")
+    monkeypatch.setattr("rejeu.lab.cli.models.recorded_id", lambda model: "Acrobot-v1")
     assert main(["play", TYPED, "--against", "other"]) == 2
 
 
@@ -263,7 +263,7 @@ def test_train(sessions, tmp_path):
 def test_workers_and_datasets_of_train(spy):
     made, shown = spy(Environment, "vector"), Train(env=TYPED, offline=Path("shown"))
     given = Train(env=TYPED, n_envs=3, backend="gymnasium-async", restart_workers=2)
-    environment = models.environment.from_arguments(TYPED, given)
+    environment = models.from_arguments(TYPED, given)
     begin.make_env(given, environment, None, 5)
     assert includes(made, n_envs=3, backend="gymnasium-async", seed=5)
     assert made[-1]["workers"].restart_workers == 2
@@ -379,7 +379,7 @@ def test_clone(spy, tmp_path):
 def test_wrappers_are_applied_in_the_order_in_which_they_are_named():
     argv = ["gymnasium.wrappers:FlattenObservation", "gymnasium.wrappers:RecordEpisodeStatistics"]
     given = dataclasses.replace(RunConfig(env=TYPED), wrappers=tuple(argv))
-    env = models.environment.from_arguments(TYPED, given).make()
+    env = models.from_arguments(TYPED, given).make()
     assert isinstance(env, gym.wrappers.RecordEpisodeStatistics)
     assert isinstance(env.env, gym.wrappers.FlattenObservation)
     env.close()

@@ -17,10 +17,10 @@ def run_check(arguments: Check) -> tuple[int, dict[str, Any]]:
     from rejeu.envs import checker  # Gymnasium's checker, which it imports, is for environments of one's own only
 
     with closing(environment.from_arguments(arguments.env, arguments).make()) as env:
-        found = sorted(checker.findings(env))
+        findings = sorted(checker.findings(env))
         package = None if arguments.all else installed_package(env)
-    shown = found if package is None else [finding for finding in found if finding.level == "error"]
-    n_errors, n_hidden = sum(finding.level == "error" for finding in found), len(found) - len(shown)
+    shown = findings if package is None else [finding for finding in findings if finding.level == "error"]
+    n_errors, n_hidden = sum(finding.level == "error" for finding in findings), len(findings) - len(shown)
     n_warnings = len(shown) - n_errors
     if not arguments.json:
         for finding in shown:
@@ -30,8 +30,8 @@ def run_check(arguments: Check) -> tuple[int, dict[str, Any]]:
             text = f"{counted(n_hidden, 'warning')} on what only the authors of {package} can change; --all shows it"
             print(text, flush=True)
     counts = {"errors": n_errors, "warnings": n_warnings, "hidden_warnings": n_hidden}
-    findings = [finding._asdict() for finding in shown]
-    return int(n_errors > 0), {"env_id": arguments.env, **counts, "findings": findings}
+    listed = [finding._asdict() for finding in shown]
+    return int(n_errors > 0), {"env_id": arguments.env, **counts, "findings": listed}
 
 
 def installed_package(env: gym.Env) -> str | None:

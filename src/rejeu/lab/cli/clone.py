@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
@@ -18,11 +19,10 @@ from rejeu.envs.registry import register
 from rejeu.lab.cli.commands import Clone
 from rejeu.lab.cli.models import agent_of
 from rejeu.lab.reporting.report import write_report
-from rejeu.lab.runs import environment
 from rejeu.lab.runs.arguments import Train
 from rejeu.lab.runs.begin import begin
 from rejeu.lab.runs.config import RunConfig
-from rejeu.lab.runs.environment import Environment
+from rejeu.lab.runs.environment import Environment, from_arguments, from_run
 from rejeu.lab.runs.output import Stopwatch, echo
 from rejeu.lab.runs.session import Session
 from rejeu.logs.formatting import counted
@@ -32,12 +32,12 @@ def run_clone(arguments: Clone) -> tuple[int, dict[str, Any]]:
     """Clones and evaluates; the exit status is that of ``rejeu train``."""
     stopwatch = Stopwatch()
     shown = demonstrations.read(arguments.dataset)
-    made = environment_of(shown, arguments)
+    environment = environment_of(shown, arguments)
     task = Train(
-        env=made.run.typed,
-        env_kwargs=made.run.env_kwargs,
-        wrappers=made.run.wrappers,
-        imports=made.run.imports,
+        env=environment.run.typed,
+        env_kwargs=environment.run.env_kwargs,
+        wrappers=environment.run.wrappers,
+        imports=environment.run.imports,
         algorithm=arguments.algo,
         hyperparameters=arguments.hyperparameters,
         evaluate_episodes=arguments.evaluate_episodes,
@@ -49,13 +49,13 @@ def run_clone(arguments: Clone) -> tuple[int, dict[str, Any]]:
     )
     with ExitStack() as stack:
         session, stop = begin(task, stack, write_report), stack.enter_context(Interrupt())
-        expert = None if arguments.expert is None else expert_of(arguments.expert, arguments, made)
+        expert = None if arguments.expert is None else expert_of(arguments.expert, arguments, environment)
         demonstrations.check(session.agent, shown)
         if arguments.critic_updates:
             demonstrations.keeping_policy(session.agent)  # which raises before anything is trained
         session = session.in_new_folder(arguments.out)
         folder, seed = session.folder, session.config.seed
-        echo(f"environment   {made}")
+        echo(f"environment   {environment}")
         echo(f"algorithm     {session.config.algorithm}, seed {seed}")
         echo(f"shown         {shown}")
         echo(f"run folder    {folder.path}")
@@ -74,8 +74,8 @@ def run_clone(arguments: Clone) -> tuple[int, dict[str, Any]]:
         checkpoint.after_training(session.agent, None)
     recorded = {"episodes": len(shown.episodes), "steps": shown.n_steps, "mean_return": shown.mean_return}
     if learning.evaluate.best is not None:
-        found = learning.evaluate.best.evaluation
-        echo(f"clone         return {found.mean_return:,.2f}; the demonstrations have {shown.mean_return:,.2f}")
+        evaluation = learning.evaluate.best.evaluation
+        echo(f"clone         return {evaluation.mean_return:,.2f}; the demonstrations have {shown.mean_return:,.2f}")
     return status, {**result, "demonstrations": recorded}
 
 
@@ -84,22 +84,22 @@ def learn_from_expert(
 ) -> None:
     """Trains the agent by DAgger, and prints how good it is after each round; without an expert a person takes over."""
 
-    def say(i: int, known: Demonstrations) -> None:
-        found = session.agent.evaluate(session.config.evaluate_episodes, env=session.evaluation_env, seed=seed)
-        echo(f"round {i:>2}      {counted(known.n_steps, 'labeled step')}, return {found.mean_return:,.2f}")
+    def say(i: int, labeled: Demonstrations) -> None:
+        evaluation = session.agent.evaluate(session.config.evaluate_episodes, env=session.evaluation_env, seed=seed)
+        echo(f"round {i:>2}      {counted(labeled.n_steps, 'labeled step')}, return {evaluation.mean_return:,.2f}")
 
     with ExitStack() as stack:
         if expert is None:
             from rejeu.teaching.play.assist import Expert
 
             env = stack.enter_context(closing(session.environment.rendering()))
-            answer: Any = stack.enter_context(closing(Expert(env, fps=arguments.fps)))
+            label: Callable[[Any], Any] = stack.enter_context(closing(Expert(env, fps=arguments.fps)))
         else:
             env = stack.enter_context(closing(session.environment.make()))
-            answer = lambda obs: expert.predict(obs, deterministic=True)[0]  # noqa: E731
+            label = lambda obs: expert.predict(obs, deterministic=True)[0]  # noqa: E731
         demonstrations.dagger(
             session.agent,
-            answer,
+            label,
             env,
             shown,
             takes_over=expert is None,
@@ -112,13 +112,13 @@ def learn_from_expert(
         )
 
 
-def expert_of(run: Path, arguments: Clone, made: Environment) -> Agent:
+def expert_of(run: Path, arguments: Clone, environment: Environment) -> Agent:
     """Returns the agent that labels.
 
     Raises:
         ValueError: if it was trained on another environment, or has a memory.
     """
-    agent = agent_of("--expert", run, arguments.which, made, arguments.device)
+    agent = agent_of("--expert", run, arguments.best_or_last, environment, arguments.device)
     if agent.learner.algorithm.recall is not None:
         raise ValueError(
             f"--expert {run}: {agent.name} has a memory, and labels single steps; use one without a memory"
@@ -133,10 +133,10 @@ def environment_of(shown: Demonstrations, arguments: Clone) -> Environment:
         ValueError: if neither says which.
     """
     if arguments.env is not None:
-        return environment.from_arguments(arguments.env, arguments)
+        return from_arguments(arguments.env, arguments)
     spec = shown.spec
     if spec is None or spec.additional_wrappers:
         raise ValueError(f"{arguments.dataset} does not say how to make its environment; name it: --env ENV")
     registered = gym.registry[spec.id].kwargs if register(spec.id) and spec.id in gym.registry else {}
     changed = {key: value for key, value in spec.kwargs.items() if key not in registered or registered[key] != value}
-    return environment.from_run(RunConfig(env=spec.id, env_kwargs=changed), arguments.dataset, arguments)
+    return from_run(RunConfig(env=spec.id, env_kwargs=changed), arguments.dataset, arguments)

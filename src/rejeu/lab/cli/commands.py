@@ -39,7 +39,7 @@ WHICH = "Of a folder: the model that evaluated best in training, or the last."
 
 PORT = 8080
 """Where the studio is looked for first."""
-Which = Annotated[Literal["best", "last"], Shown("{best,last}", help=WHICH)]
+Which = Annotated[Literal["best", "last"], Shown("{best,last}", "which", WHICH)]
 EnvironmentId = Annotated[str, Shown("ENV", is_positional=True)]
 ModelPath = Annotated[
     Path, Shown("RUN", is_positional=True, help="Folder of a run, or a model file (.safetensors, .zip).")
@@ -82,7 +82,7 @@ class Clone(RunOptions):
     """With an expert: how often the clone acts and is trained again."""
     round_steps: Annotated[Positive, Shown("N"), Topic.TRAINING] = 1000
     """With an expert: environment steps of each round; the last episode is completed."""
-    which: Annotated[Which, Topic.TRAINING] = "best"
+    best_or_last: Annotated[Which, Topic.TRAINING] = "best"
     evaluate_episodes: EpisodeCount = None
     device: Annotated[str, Shown("NAME"), Topic.TRAINING] = "auto"
     """As for rejeu train."""
@@ -180,7 +180,7 @@ class Evaluate(RunOptions):
     """Of the environments; by default a random one."""
     success_threshold: Return = None
     """Return from which on an episode counts as a success; by default as in training."""
-    which: Which = "best"
+    best_or_last: Which = "best"
     json: Json = False
 
 
@@ -204,7 +204,7 @@ class Export(RunOptions):
     frame_stack: Count = None
     """Frames of which each observation is a stack: the file then takes single frames. By default those of the agent's
     setting frame_stack."""
-    which: Which = "best"
+    best_or_last: Which = "best"
     json: Json = False
 
 
@@ -219,7 +219,7 @@ class Record(RunOptions):
     """How many."""
     seed: SeedOrNone = None
     """Of the environment; by default a random one."""
-    which: Which = "best"
+    best_or_last: Which = "best"
     json: Json = False
 
 
@@ -243,7 +243,7 @@ class Play(EnvironmentOptions):
     """New or empty folder for a Minari dataset and a video of what you play."""
     against: Annotated[Path | None, Shown("RUN")] = None
     """Folder of a run, or a model file, whose agent plays the same episodes next to you."""
-    which: Which = "best"
+    best_or_last: Which = "best"
     json: Json = False
 
 
@@ -260,7 +260,7 @@ class Watch(RunOptions):
     """Close after so many; by default when you do."""
     seed: SeedOrNone = None
     """Of the first episode; each further one has the next seed. By default a random one."""
-    which: Which = "best"
+    best_or_last: Which = "best"
     fps: Rate = None
     json: Json = False
 
@@ -376,7 +376,7 @@ class Compare:
     runs: Annotated[tuple[Path, ...], Shown("RUN ...", is_positional=True)]
     """Run folders, or folders of run folders."""
     by: Annotated[Literal["algorithm", "setting", "env"] | None, Shown("{algorithm,setting,env}")] = None
-    """What makes a group; by default the first of these in which the runs differ."""
+    """Basis of the groups; by default the first of these in which the runs differ."""
     x: Annotated[Literal["steps", "time"], Shown("{steps,time}")] = "steps"
     """Compare over environment steps or over training time."""
     score: Annotated[Literal["training", "evaluation"], Shown("{training,evaluation}")] = "training"
@@ -423,7 +423,7 @@ class Import(EnvironmentOptions):
     """
 
     model: Annotated[Path, Shown("FILE", is_positional=True, help="The zip file, or a folder of RL Zoo.")]
-    which: Which = "last"
+    best_or_last: Which = "last"
     """In a folder, best_model.zip or the model at the end of training."""
     vecnormalize: Annotated[Path | None, Shown("FILE")] = None
     """File of the VecNormalize that the policy was trained behind; by default the one beside the zip file. "none" for none."""
@@ -469,7 +469,7 @@ TASKS: dict[str, tuple[Callable[..., Any], ...]] = {
     "teach": (Play, Course, Class),
 }
 """The arguments of each command, by what people want to do, in the order of the help."""
-COMMANDS = {kind.__name__.lower(): kind for kinds in TASKS.values() for kind in kinds}
+COMMANDS = {command.__name__.lower(): command for commands in TASKS.values() for command in commands}
 """The arguments of each command, by its name."""
 MODULES = {
     "branch": "resume",

@@ -64,8 +64,8 @@ def show_comparison(comparison: Comparison) -> None:
     show_table(head, rows, 2)
     console = Console(highlight=False)
     console.print(comparison.definition, soft_wrap=True)
-    for one in comparison.improvements:
-        better, other, env, text = map(escape, one.cells)
-        console.print(f"{better} scores higher than {other} on {env} with probability {text}", soft_wrap=True)
+    for improvement in comparison.improvements:
+        better, worse, env, text = map(escape, improvement.cells)
+        console.print(f"{better} scores higher than {worse} on {env} with probability {text}", soft_wrap=True)
     for note in comparison.notes:
         console.print(f"note: {escape(note)}", soft_wrap=True)

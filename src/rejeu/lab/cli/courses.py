@@ -12,8 +12,8 @@ from rejeu.core.language import chosen, said
 from rejeu.core.validation import whole
 from rejeu.lab.cli import dumps
 from rejeu.lab.cli.commands import Class, Course
-from rejeu.lab.runs import environment
 from rejeu.lab.runs.config import RunConfig
+from rejeu.lab.runs.environment import from_run
 from rejeu.lab.runs.output import echo
 from rejeu.logs.formatting import quoted, show_table
 from rejeu.teaching.courses import grading, leaderboard, write
@@ -28,27 +28,28 @@ def run_course(arguments: Course) -> tuple[int, dict[str, Any]]:
     if len(arguments.paths) != 1:
         raise ValueError(f"rejeu course {arguments.language} needs one FOLDER, got {len(arguments.paths)}")
     written: list[Path] = []
-    kept: list[Path] = []
+    existing: list[Path] = []
     for path, is_new in write(arguments.language, arguments.paths[0]):
-        (written if is_new else kept).append(path)
+        (written if is_new else existing).append(path)
         change = "" if is_new else " exists and was not changed; delete or rename it to get a new copy"
         echo(f"{path}{change}")
-    return 0, {"written": written, "kept": kept}
+    return 0, {"written": written, "kept": existing}
 
 
 def grade(arguments: Course) -> tuple[int, dict[str, Any]]:
     """Prints which checks each notebook passes; the exit status is 2 if a file could not be graded."""
     grades = []
     for path in arguments.paths:
-        one = grading.grade(path)
-        grades.append(one)
-        say = partial(said, language=one.language)
-        echo(say("{}: {}", path, one.error or say("{} of {} passed", one.n_passed, len(one.found))))
-        for name, found in one.found.items():
-            if found != "" and not one.error:
-                echo(say("{}: {}", f"  {name}", found or say("its check did not run; is there an error in its cell?")))
-    status = 2 if any(one.error for one in grades) else 0
-    return status, {"notebooks": [one._asdict() | {"passed": one.n_passed} for one in grades]}
+        notebook = grading.grade(path)
+        grades.append(notebook)
+        say = partial(said, language=notebook.language)
+        echo(say("{}: {}", path, notebook.error or say("{} of {} passed", notebook.n_passed, len(notebook.found))))
+        for name, problem in notebook.found.items() if not notebook.error else ():
+            if problem != "":
+                text = problem or say("its check did not run; is there an error in its cell?")
+                echo(say("{}: {}", f"  {name}", text))
+    status = 2 if any(notebook.error for notebook in grades) else 0
+    return status, {"notebooks": [notebook._asdict() | {"passed": notebook.n_passed} for notebook in grades]}
 
 
 def run_class(arguments: Class) -> tuple[int, dict[str, Any]]:
@@ -62,13 +63,13 @@ def run_class(arguments: Class) -> tuple[int, dict[str, Any]]:
         )
     paths, language = leaderboard.models(arguments.folder), chosen(arguments.language)
     env_id = "" if arguments.env is not None else leaderboard.usual_env_id(paths)
-    made = environment.from_run(RunConfig(env=env_id), arguments.folder, arguments)
-    echo(said("{}, {} episodes of each of {} models", made, episodes, len(paths), language=language))
+    environment = from_run(RunConfig(env=env_id), arguments.folder, arguments)
+    echo(said("{}, {} episodes of each of {} models", environment, episodes, len(paths), language=language))
     board = leaderboard.build(
         arguments.folder,
         paths,
-        made.env_id,
-        lambda n: made.vector(n, "gymnasium", arguments.seed),
+        environment.env_id,
+        lambda n: environment.vector(n, "gymnasium", arguments.seed),
         episodes,
         arguments.seed,
         60 * arguments.minutes,

@@ -25,14 +25,15 @@ def show(algorithms: Mapping[str, str]) -> None:
     print(columns([*algorithms.items()]))
     print("\nenvironments with tuned hyperparameters, the preset of rejeu train first; in brackets, names for --preset")
     rows: dict[str, list[tuple[str, ...]]] = {}
-    for one in presets.every():
-        steps, result = f"{one.total_steps:,} steps", presets.find_result(one.env_id, one.algorithm, one.name)
-        shown = one.source if result is None else str(result)
+    for preset in presets.every():
+        steps = f"{preset.total_steps:,} steps"
+        result = presets.find_result(preset.env_id, preset.algorithm, preset.name)
+        shown = preset.source if result is None else str(result)
         if result is not None and result.budget.endswith(" steps") and result.budget != steps:
             shown += f", after {result.budget}"
-        of_env = rows.setdefault(one.env_id, [])
-        algorithm = f"{one.algorithm} ({one.name})" if one.name else one.algorithm
-        of_env.append(("" if of_env else one.env_id, algorithm, steps, shown))
+        of_env = rows.setdefault(preset.env_id, [])
+        algorithm = f"{preset.algorithm} ({preset.name})" if preset.name else preset.algorithm
+        of_env.append(("" if of_env else preset.env_id, algorithm, steps, shown))
     print(columns([row for of_env in rows.values() for row in of_env]))
     print("\nIn brackets: 95 % confidence interval of a mean return, lowest and highest success rate of a seed.")
     print("Any other Gymnasium or EnvPool id is trained without a preset.")
@@ -53,8 +54,8 @@ def described(is_extended: bool) -> dict[str, str]:
 
 def as_dict(preset: Preset) -> dict[str, Any]:
     """Returns a preset with its measured result, which is None if there is none."""
-    known = {name: value for name, value in vars(preset).items() if name not in ("backend", "success_threshold")}
-    return {**known, "result": presets.find_result(preset.env_id, preset.algorithm, preset.name)}
+    fields = {name: value for name, value in vars(preset).items() if name not in ("backend", "success_threshold")}
+    return {**fields, "result": presets.find_result(preset.env_id, preset.algorithm, preset.name)}
 
 
 def columns(rows: Sequence[tuple[str, ...]]) -> str:

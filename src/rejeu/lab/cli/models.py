@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from contextlib import closing, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from rejeu.agents import Agent, load
 from rejeu.agents.exporting import export
@@ -13,10 +13,9 @@ from rejeu.checkpoints.run_folder import RunFolder, find_model
 from rejeu.core import devices
 from rejeu.core.errors import CheckpointError
 from rejeu.export import FORMATS, target_of
-from rejeu.lab.cli.commands import Evaluate, Export, Import, Play, Pull, Push, Record, Watch
-from rejeu.lab.runs import environment
+from rejeu.lab.cli.commands import Evaluate, Export, Import, Play, Pull, Push, Record, Watch, Which
 from rejeu.lab.runs.config import value
-from rejeu.lab.runs.environment import Environment
+from rejeu.lab.runs.environment import Environment, environment_of, from_arguments, recorded_id
 from rejeu.lab.runs.output import echo
 from rejeu.logs.formatting import counted, quoted
 from rejeu.logs.video import record_video
@@ -31,54 +30,54 @@ def run_evaluate(arguments: Evaluate) -> tuple[int, dict[str, Any]]:
     episodes, minutes = arguments.episodes, arguments.minutes
     if minutes is None and episodes is None:
         episodes = 100
-    model = find_model(arguments.run, arguments.which)
-    made = environment.environment_of(model, arguments)
+    model = find_model(arguments.run, arguments.best_or_last)
+    environment = environment_of(model, arguments)
     agent = load(model, device=arguments.device)
     n_envs = 16 if episodes is None else min(episodes, 16)
-    with closing(made.vector(n_envs, arguments.backend, arguments.seed)) as env:
-        echo(f"{made} on {env.backend}, {model}")
-        found = agent.evaluate(episodes, env=env, success_threshold=arguments.success_threshold, minutes=minutes)
-        echo(found)
-        about = {"model": model, "env_id": made.env_id, "backend": env.backend}
-    each = {"returns": found.returns, "lengths": found.lengths, "successes": found.successes}
-    return 0, {**about, **found.to_dict(), **each}
+    with closing(environment.vector(n_envs, arguments.backend, arguments.seed)) as env:
+        echo(f"{environment} on {env.backend}, {model}")
+        evaluation = agent.evaluate(episodes, env=env, success_threshold=arguments.success_threshold, minutes=minutes)
+        echo(evaluation)
+    each = {"returns": evaluation.returns, "lengths": evaluation.lengths, "successes": evaluation.successes}
+    facts = {"model": model, "env_id": environment.env_id, "backend": env.backend}
+    return 0, {**facts, **evaluation.to_dict(), **each}
 
 
 def run_record(arguments: Record) -> tuple[int, dict[str, Any]]:
     """Records a video of an agent and prints its path."""
-    model = find_model(arguments.run, arguments.which)
+    model = find_model(arguments.run, arguments.best_or_last)
     default = RunFolder(arguments.run).video if arguments.run.is_dir() else model.with_suffix(".mp4")
     out = default if arguments.out is None else arguments.out
-    made = environment.environment_of(model, arguments)
-    path = record_video(load(model), out, env=made.rendering, episodes=arguments.episodes, seed=arguments.seed)
-    echo(f"{path}: {counted(arguments.episodes, 'episode')} of {model} in {made}")
-    return 0, {"video": path, "episodes": arguments.episodes, "model": model, "env_id": made.env_id}
+    environment = environment_of(model, arguments)
+    path = record_video(load(model), out, env=environment.rendering, episodes=arguments.episodes, seed=arguments.seed)
+    echo(f"{path}: {counted(arguments.episodes, 'episode')} of {model} in {environment}")
+    return 0, {"video": path, "episodes": arguments.episodes, "model": model, "env_id": environment.env_id}
 
 
 def run_export(arguments: Export) -> tuple[int, dict[str, Any]]:
     """Writes the policy of an agent to a file of another format, and prints how it compares with ``predict``."""
-    model = find_model(arguments.run, arguments.which)
+    model = find_model(arguments.run, arguments.best_or_last)
     out, to = arguments.out, arguments.to
     if out is None or out.is_dir():
         to = to or "onnx"
         beside = model.parent / "policy" if arguments.run.is_dir() else model.with_suffix("")
         out = (beside if out is None else out / beside.name).with_suffix(FORMATS[target_of(out or beside, to)].suffix)
     target_of(out, to)  # an error before the agent is loaded
-    made = None
+    environment = None
     try:
-        made = environment.environment_of(model, arguments)
+        environment = environment_of(model, arguments)
     except (CheckpointError, ImportError, ValueError) as error:
         if arguments.env is not None:
             raise
         echo(f"the observations are sampled from the observation space, because there is no environment: {error}")
-    agent, make_env = load(model), None if made is None else made.make
-    if arguments.env is not None and made is not None and not made.wrappers:
-        agent.trained_on = made.env_id, made.run.env_kwargs
-    found = export(
+    agent, make_env = load(model), None if environment is None else environment.make
+    if arguments.env is not None and environment is not None and not environment.wrappers:
+        agent.trained_on = environment.env_id, environment.run.env_kwargs
+    exported = export(
         agent, out, to, arguments.noise, arguments.batch, make_env, str(arguments.run), arguments.frame_stack
     )
-    echo(found)
-    return 0, found.to_dict()
+    echo(exported)
+    return 0, exported.to_dict()
 
 
 def run_watch(arguments: Watch) -> tuple[int, dict[str, Any] | None]:
@@ -87,9 +86,9 @@ def run_watch(arguments: Watch) -> tuple[int, dict[str, Any] | None]:
 
     if len(arguments.runs) > 1:
         return watch_together(arguments)
-    model = find_model(arguments.runs[0], arguments.which)
-    made = environment.environment_of(model, arguments)
-    game = watch(load(model), made.make, seed=arguments.seed, fps=arguments.fps, episodes=arguments.episodes)
+    model = find_model(arguments.runs[0], arguments.best_or_last)
+    environment = environment_of(model, arguments)
+    game = watch(load(model), environment.make, seed=arguments.seed, fps=arguments.fps, episodes=arguments.episodes)
     echo(scores(game))
     return 0, as_dict(game)
 
@@ -106,14 +105,13 @@ def watch_together(arguments: Watch) -> tuple[int, None]:
         raise ValueError("rejeu watch takes one or two different agents; rejeu studio compares more")
     if arguments.fps is not None or arguments.episodes is not None:
         raise ValueError("--fps and --episodes are for one agent, in a window; leave them out")
-    models = [find_model(run, arguments.which) for run in arguments.runs]
+    models = [find_model(run, arguments.best_or_last) for run in arguments.runs]
     guests = {
-        str(run): (model, environment.environment_of(model, arguments))
-        for run, model in zip(arguments.runs, models, strict=True)
+        str(run): (model, environment_of(model, arguments)) for run, model in zip(arguments.runs, models, strict=True)
     }
     seed = [] if arguments.seed is None else [("seed", str(arguments.seed))]
     page = "/play", [*(("agent", name) for name in guests), ("watch", "1"), *seed]
-    open_studio(Path("runs"), guests=guests, page=page, given=arguments)
+    open_studio(Path("runs"), guests=guests, page=page, options=arguments)
     return 0, None
 
 
@@ -122,11 +120,11 @@ def run_play(arguments: Play) -> tuple[int, dict[str, Any]]:
     from rejeu.teaching.play import play
     from rejeu.teaching.play.keys import full_name
 
-    made = environment.from_arguments(full_name(arguments.env), arguments)
+    environment = from_arguments(full_name(arguments.env), arguments)
     against = arguments.against
-    agent = None if against is None else agent_of("--against", against, arguments.which, made)
+    agent = None if against is None else agent_of("--against", against, arguments.best_or_last, environment)
     game = play(
-        made.make,
+        environment.make,
         keys=parse_keys(arguments.keys),
         seed=arguments.seed,
         fps=arguments.fps,
@@ -140,15 +138,15 @@ def run_play(arguments: Play) -> tuple[int, dict[str, Any]]:
     return 0, as_dict(game)
 
 
-def agent_of(option: str, run: Path, which: Literal["best", "last"], made: Environment, device: str = "auto") -> Agent:
+def agent_of(option: str, run: Path, best_or_last: Which, environment: Environment, device: str = "auto") -> Agent:
     """Returns the agent of a run folder or model file that an option names.
 
     Raises:
         ValueError: if it was trained on another environment.
     """
-    model = find_model(run, which)
-    if (trained_on := environment.recorded_id(model)) != made.env_id:
-        raise ValueError(f"{option} {run}: that agent plays {trained_on}, not {made.env_id}")
+    model = find_model(run, best_or_last)
+    if (trained_on := recorded_id(model)) != environment.env_id:
+        raise ValueError(f"{option} {run}: that agent plays {trained_on}, not {environment.env_id}")
     return load(model, device=device)
 
 
@@ -172,12 +170,9 @@ def parse_keys(assignments: Iterable[str]) -> dict[str, Any]:
 
 def as_dict(game: Game) -> dict[str, Any]:
     """Returns the players with their scores."""
-    return {
-        "players": [
-            {"name": one.name, "episodes": len(one.scores), "mean": one.mean, "best": one.best, "scores": one.scores}
-            for one in game.players
-        ]
-    }
+    facts = [(player.name, len(player.scores), player.mean, player.best, player.scores) for player in game.players]
+    names = ("name", "episodes", "mean", "best", "scores")
+    return {"players": [dict(zip(names, values, strict=True)) for values in facts]}
 
 
 def scores(game: Game) -> str:
@@ -196,16 +191,14 @@ def run_import(arguments: Import) -> tuple[int, dict[str, Any]]:
     from rejeu.agents.zoo import model_in
 
     model = arguments.model
-    model = model_in(model, arguments.which) if model.is_dir() else model
+    model = model_in(model, arguments.best_or_last) if model.is_dir() else model
     statistics: Any = False if str(arguments.vecnormalize) == "none" else arguments.vecnormalize
     out = model.with_suffix(".safetensors") if arguments.out is None else arguments.out
     if out.exists():
         raise FileExistsError(f"{out} exists; name another file with --out")
-    made = (
-        None if arguments.env is None else environment.from_arguments(arguments.env, arguments).vector(1, "auto", None)
-    )
-    with nullcontext() if made is None else closing(made):
-        agent = load_zip(model, made, statistics, **arguments.hyperparameters)
+    env = None if arguments.env is None else from_arguments(arguments.env, arguments).vector(1, "auto", None)
+    with nullcontext() if env is None else closing(env):
+        agent = load_zip(model, env, statistics, **arguments.hyperparameters)
         path = agent.save(out)
     echo(f"{path}: {agent.name}, {counted(agent.num_timesteps, 'step')}, {counted(agent.n_updates, 'update')}")
     for note in agent.notes:
@@ -219,7 +212,7 @@ def run_push(arguments: Push) -> tuple[int, dict[str, Any]]:
 
     if arguments.out is not None:
         hub.lay_out(arguments.run, arguments.out, arguments.repo, echo)
-        echo(f"{arguments.out}: {', '.join(sorted(one.name for one in arguments.out.iterdir()))}")
+        echo(f"{arguments.out}: {', '.join(sorted(path.name for path in arguments.out.iterdir()))}")
         return 0, {"folder": arguments.out}
     address = hub.push(arguments.run, arguments.repo, arguments.private, echo)
     echo(address)

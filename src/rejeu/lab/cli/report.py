@@ -60,7 +60,7 @@ def replay(path: Path, arguments: Report) -> None:
             goal = goal_of(env.reset(seed=seed)[0])
             rows.append([seed, played.mean_return, f"{played.mean_length:.0f}", played.success_rate, *goal])
     head = ["seed", "return", "length", "success", *(f"goal_{i}" for i in range(len(rows[0]) - 4))]
-    atomic.write(RunFolder(path).replays, "".join(",".join(str(one) for one in row) + "\n" for row in [head, *rows]))
+    atomic.write(RunFolder(path).replays, "".join(",".join(map(str, row)) + "\n" for row in [head, *rows]))
 
 
 def goal_of(obs: Any) -> list[float]:

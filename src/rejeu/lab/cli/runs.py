@@ -38,7 +38,7 @@ def run_status(arguments: Status) -> tuple[int, Row]:
     row = {"run": utf8(arguments.run.name), **describe(run_list.read(arguments.run))}
     if not arguments.json:
         show([row], arguments.run)
-        print("".join(f"warning: {one}\n" for one in row["warnings"]), end="")
+        print("".join(f"warning: {text}\n" for text in row["warnings"]), end="")
     return EXIT[row["state"]], row
 
 
@@ -48,20 +48,20 @@ def show(rows: Sequence[Row], folder: Path) -> None:
         print(f"there are no runs in {folder}; rejeu train ENV makes one")
         return
     show_table(COLUMNS, map(texts, rows), N_TEXT)
-    print("".join(f"note: {cells(row)['run']}: {one}\n" for row in rows for one in row["notes"]), end="")
+    print("".join(f"note: {cells(row)['run']}: {note}\n" for row in rows for note in row["notes"]), end="")
 
 
 def follow(reader: Rows) -> None:
     """Shows the rows on a terminal, and when they change again, until Ctrl-C; elsewhere each time below the last."""
     from rich.live import Live
 
-    seen: list[Row] = []
+    previous: list[Row] = []
     with leaving("no longer followed"), Live(console=console(highlight=False), auto_refresh=False) as live:
         while True:
             rows = reader.read()
-            if rows != seen and live.console.is_terminal:
+            if rows != previous and live.console.is_terminal:
                 live.update(table_of(COLUMNS, map(texts, rows), N_TEXT), refresh=True)
-            elif rows != seen:
+            elif rows != previous:
                 show_table(COLUMNS, map(texts, rows), N_TEXT)
-            seen = rows
+            previous = rows
             time.sleep(EVERY)

@@ -29,7 +29,8 @@ def run_studio(arguments: Studio) -> tuple[int, None]:
     """
     if arguments.folder.exists() and not arguments.folder.is_dir():
         raise NotADirectoryError(f"{arguments.folder} is no folder; expected one of runs, such as runs")
-    open_studio(arguments.folder, arguments.port, not arguments.no_browser, given=arguments, hosts=arguments.allow_host)
+    folder, port, has_browser = arguments.folder, arguments.port, not arguments.no_browser
+    open_studio(folder, port, has_browser, options=arguments, hosts=arguments.allow_host)
     return 0, None
 
 
@@ -39,7 +40,7 @@ def open_studio(
     has_browser: bool = True,
     guests: Mapping[str, tuple[Path, Environment]] | None = None,
     page: tuple[str, Sequence[tuple[str, str]]] = ("/", ()),
-    given: RunOptions = NOTHING,
+    options: RunOptions = NOTHING,
     hosts: Sequence[str] = (),
 ) -> None:
     """Serves the studio until Ctrl-C.
@@ -50,7 +51,7 @@ def open_studio(
         has_browser: whether the page is opened in the web browser.
         guests: models that may be elsewhere, with their environments, by their names.
         page: that is opened, and its query.
-        given: the environment and the modules that the command line names, and which runs may therefore import.
+        options: the environment and the modules that the command line names, and which runs may therefore import.
         hosts: further ``NAME:PORT`` under which the studio is asked.
 
     Raises:
@@ -67,9 +68,9 @@ def open_studio(
         if has_browser:
             webbrowser.open(pages.enter_context(redirection(address)))
 
-    env_id = "" if given.env is None else from_arguments(given.env, given).env_id
-    options = {one.name: getattr(given, one.name) for one in fields(EnvironmentOptions)}
-    typed = RunConfig(env=env_id, env_argument=given.env or "", **options)
+    env_id = "" if options.env is None else from_arguments(options.env, options).env_id
+    values = {field.name: getattr(options, field.name) for field in fields(EnvironmentOptions)}
+    typed = RunConfig(env=env_id, env_argument=options.env or "", **values)
     with ExitStack() as pages:
         server.serve(state.Studio(folder, guests, typed), port, ready, page, hosts)
 

@@ -43,8 +43,8 @@ def run_sweep(arguments: Sweep) -> tuple[int, dict[str, Any]]:
 
 def resume(arguments: Resume) -> tuple[int, dict[str, Any]]:
     """Completes the sweep in a folder, failed runs included; returns the exit status and the result."""
-    given = {key: getattr(arguments, key) for key in ("env_kwargs", "wrappers", "imports")}
-    typed = RunConfig(env=arguments.env or "", **given)
+    options = {key: getattr(arguments, key) for key in ("env_kwargs", "wrappers", "imports")}
+    typed = RunConfig(env=arguments.env or "", **options)
     folder = read_folder(arguments.run, typed)
     return complete(folder, typed, arguments.workers, arguments.ray, retry=True)
 
@@ -64,7 +64,7 @@ def complete(
 def finish(folder: SweepFolder, works: list[Work], typed: RunConfig, stop: Interrupt) -> tuple[int, dict[str, Any]]:
     """Says what has become of the jobs and compares the runs; returns the exit status and the result."""
     result = SweepResult(folder.path, tuple(works))
-    states = {one.state for one in result.outcomes}
+    states = {outcome.state for outcome in result.outcomes}
     resume = f"rejeu resume {quoted(folder.path)}{again(folder.jobs, typed)}"
     echo(f"{counted(len(works), 'run')}: {states_text(result.outcomes)}")
     if "failed" in states:
@@ -110,15 +110,15 @@ def make_jobs(arguments: Train) -> tuple[Job, ...]:
     """
     assert arguments.seeds is not None
     first = arguments.seed or 0
-    given = {one.name: getattr(arguments, one.name) for one in dataclasses.fields(RunConfig)}
+    values = {field.name: getattr(arguments, field.name) for field in dataclasses.fields(RunConfig)}
     installed_logs(arguments)
     devices.named(arguments.device, "--device")
     choice("--backend", arguments.backend or "auto", BACKENDS)
     if arguments.algorithm is not None:
-        given["algorithm"] = find_agent(arguments.algorithm).algorithm.Config.name
+        values["algorithm"] = find_agent(arguments.algorithm).algorithm.Config.name
     if arguments.ray not in (None, "auto"):
         os.environ["RAY_ADDRESS"] = arguments.ray  # no file may name an address
-    run = RunConfig(**{**given, "ray": None if arguments.ray is None else "auto", "imports": ()})
+    run = RunConfig(**{**values, "ray": None if arguments.ray is None else "auto", "imports": ()})
     return tuple(
         Job(
             name=f"seed_{seed}",
@@ -195,8 +195,8 @@ def train_sessions(sessions: list[Session], stop: Interrupt, stopwatch: Stopwatc
     with ExitStack() as stack:
         learnings = [stack.enter_context(session.training(stop)) for session in sessions]
         calls = [
-            training.start_call(one.agent, one.limits.steps, None, one.limits.minutes, one.log_interval, True)
-            for one in sessions
+            training.start_call(agent, session.limits.steps, None, session.limits.minutes, session.log_interval, True)
+            for agent, session in zip(agents, sessions, strict=True)
         ]
         learn_together(
             agents,

@@ -1,8 +1,8 @@
-"""What is asked of a run: to begin, to continue, to branch. The arguments of commands, and of the forms of the studio."""
+"""Arguments of a run, to begin, continue or branch it: those of commands, and of the forms of the studio."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -118,7 +118,7 @@ class Branch(Continued):
 
 def of_task(task: Task) -> tuple[str, Any]:
     """Returns the command that does what a process is asked to do, and its arguments."""
-    run = {one.name: getattr(task.run, one.name) for one in fields(task.run)}
+    run = vars(task.run)
     shared: dict[str, Any] = {"no_report": task.no_report, "no_video": task.no_video}
     if not task.resume:
         return "train", Train(**run, **shared, out=Path(task.folder))
@@ -130,16 +130,16 @@ def of_task(task: Task) -> tuple[str, Any]:
 
 def check_options(arguments: Any) -> None:
     """Raises ``ValueError`` if options exclude each other."""
-    given = {key: value for key, value in vars(arguments).items() if value is not None}
-    if {"steps", "minutes"} <= given.keys():
+    options = {key: value for key, value in vars(arguments).items() if value is not None}
+    if {"steps", "minutes"} <= options.keys():
         raise ValueError("--steps and --minutes exclude each other; give one of them")
-    if given.get("by_hand") and "expert" in given:
+    if options.get("by_hand") and "expert" in options:
         raise ValueError("--by-hand and --expert exclude each other; give one of them")
-    if given.get("assist") and "seeds" in given:
+    if options.get("assist") and "seeds" in options:
         raise ValueError("--assist is for a single run; leave it out, or --seeds")
-    if {"pause", "seeds"} <= given.keys():
+    if {"pause", "seeds"} <= options.keys():
         raise ValueError("--pause is for a single run; leave it out, or --seeds")
-    if "jobs" in given and "seeds" not in given:
+    if "jobs" in options and "seeds" not in options:
         raise ValueError("--jobs is for several seeds; give --seeds N too")
-    if "backend" in vars(arguments) and given.get("backend") != "ray" and {"ray", "env_cpus"} & given.keys():
+    if "backend" in vars(arguments) and options.get("backend") != "ray" and {"ray", "env_cpus"} & options.keys():
         raise ValueError("--ray and --env-cpus are for --backend ray; give it too, or leave them out")

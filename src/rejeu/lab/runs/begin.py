@@ -28,10 +28,9 @@ from rejeu.core.errors import BadEnvironmentError
 from rejeu.core.spaces import leaves
 from rejeu.envs.make import VectorEnv, WorkerOptions, make_vector
 from rejeu.envs.registry import ENVPOOL_SIZE, is_envpool_installed, provider, register, usable_envpool
-from rejeu.lab.runs import environment
 from rejeu.lab.runs.arguments import Train
 from rejeu.lab.runs.config import DecidedRun, merged
-from rejeu.lab.runs.environment import Environment, module_of
+from rejeu.lab.runs.environment import Environment, from_arguments, module_of
 from rejeu.lab.runs.session import Report, Session, TrainingLimits, installed_logs, make_evaluation_env
 
 MANY = 64
@@ -51,49 +50,49 @@ def begin(arguments: Train, stack: ExitStack, report: Report) -> Session:
     seed = int(np.random.default_rng().integers(10_000)) if arguments.seed is None else arguments.seed
     logs = installed_logs(arguments)
     algorithm = None if arguments.algorithm is None else find_agent(arguments.algorithm).algorithm.Config.name
-    made = environment.from_arguments(arguments.env, arguments)
-    preset = find_preset(made.env_id, algorithm, None if arguments.preset is None else str(arguments.preset))
-    env = stack.enter_context(closing(make_env(arguments, made, preset, seed)))
+    environment = from_arguments(arguments.env, arguments)
+    preset = find_preset(environment.env_id, algorithm, None if arguments.preset is None else str(arguments.preset))
+    env = stack.enter_context(closing(make_env(arguments, environment, preset, seed)))
     is_long = arguments.is_long and not arguments.hyperparameters and env.n_envs < MANY
     algorithm = algorithm or choose_algorithm(preset, env.env_id, env.observation_space, env.action_space, is_long)
-    config = make_config(arguments, made, preset, algorithm, env, seed, logs)
+    config = make_config(arguments, environment, preset, algorithm, env, seed, logs)
     general: dict[str, Any] = {"seed": seed, "success_threshold": config.success_threshold, "device": config.device}
     agent = AGENTS[algorithm](config.policy, env, **general, **config.hyperparameters)
     if env.backend not in ("envpool", "jax"):
-        check_own_environment(made, agent.config)
+        check_own_environment(environment, agent.config)
     return Session(
         agent,
         config,
         RunFolder(Path()),
-        made,
-        stack.enter_context(closing(make_evaluation_env(config, made))),
+        environment,
+        stack.enter_context(closing(make_evaluation_env(config, environment))),
         TrainingLimits(config.steps, config.minutes, pause_steps=arguments.pause),
         is_new=True,
         report=None if arguments.no_report else report,
         has_video=not arguments.no_video,
-        backend=describe_backend(env, made, preset),
+        backend=describe_backend(env, environment, preset),
     )
 
 
-def make_env(arguments: Train, made: Environment, preset: Preset | None, seed: int) -> VectorEnv:
+def make_env(arguments: Train, environment: Environment, preset: Preset | None, seed: int) -> VectorEnv:
     """Returns the training environments."""
     if arguments.assist:
-        return make_vector(made.rendering, 1, "gymnasium", seed)
+        return make_vector(environment.rendering, 1, "gymnasium", seed)
     n_envs = arguments.n_envs or (preset.n_envs if preset else 1)
-    backend = preset.backend if preset and made.is_plain else "auto"
-    is_elsewhere = backend == "envpool" and (register(made.env_id) or provider(made.env_id))
+    backend = preset.backend if preset and environment.is_plain else "auto"
+    is_elsewhere = backend == "envpool" and (register(environment.env_id) or provider(environment.env_id))
     if is_elsewhere and arguments.backend is None and usable_envpool() is None:
         backend = "gymnasium"
     backend = arguments.backend or backend
     workers = WorkerOptions(restart_workers=arguments.restart_workers)
     if backend == "ray" or arguments.ray is not None:
         workers = workers._replace(ray={"address": arguments.ray, "num_cpus": arguments.env_cpus})
-    return made.vector(n_envs, backend, seed, workers)
+    return environment.vector(n_envs, backend, seed, workers)
 
 
-def describe_backend(env: VectorEnv, made: Environment, preset: Preset | None) -> str:
+def describe_backend(env: VectorEnv, environment: Environment, preset: Preset | None) -> str:
     """Returns the backend, with a hint if the preset uses EnvPool and that is not installed."""
-    is_slower = env.backend == "gymnasium" and made.is_plain and preset is not None and preset.backend == "envpool"
+    is_slower = env.backend == "gymnasium" and environment.is_plain and preset and preset.backend == "envpool"
     if not is_slower or is_envpool_installed():
         return env.backend
     return f'{env.backend}; EnvPool would be faster ({ENVPOOL_SIZE}): pip install "rejeu[envpool]"'
@@ -109,7 +108,7 @@ def untuned(algorithm: str, env: VectorEnv) -> Mapping[str, Any]:
 
 def make_config(
     arguments: Train,
-    made: Environment,
+    environment: Environment,
     preset: Preset | None,
     algorithm: str,
     env: VectorEnv,
@@ -122,16 +121,16 @@ def make_config(
         TypeError: for an unknown hyperparameter, with the nearest known one.
         ValueError: for an invalid value.
     """
-    base = presets.default(made.env_id, algorithm, untuned(algorithm, env)) if preset is None else preset
+    base = presets.default(environment.env_id, algorithm, untuned(algorithm, env)) if preset is None else preset
     hyperparameters = merged(arguments.hyperparameters, base.hyperparameters)
     config = validation.build(AGENTS[algorithm].algorithm.Config, hyperparameters)
     nested = isinstance(env.observation_space, spaces.Dict | spaces.Tuple)
     return DecidedRun(
-        env=made.env_id,
-        env_argument=made.run.env,
-        env_kwargs=dict(made.run.env_kwargs),
-        wrappers=made.run.wrappers,
-        imports=made.run.imports,
+        env=environment.env_id,
+        env_argument=environment.run.env,
+        env_kwargs=dict(environment.run.env_kwargs),
+        wrappers=environment.run.wrappers,
+        imports=environment.run.imports,
         algorithm=algorithm,
         preset=preset is not None,
         hyperparameters=configs.to_json(config),
@@ -163,11 +162,11 @@ def with_dataset(arguments: Train) -> Train:
     name = arguments.algorithm or (OFFLINE if arguments.preset is None else None)
     if name is not None and not issubclass(find_agent(name), OffPolicyAgent):
         raise ValueError(f"--offline needs an algorithm with a replay buffer, such as {OFFLINE}; {name} has none")
-    given = {"demonstrations": str(arguments.offline), "offline": True}
-    return replace(arguments, algorithm=name, hyperparameters={**arguments.hyperparameters, **given}, offline=None)
+    dataset = {"demonstrations": str(arguments.offline), "offline": True}
+    return replace(arguments, algorithm=name, hyperparameters={**arguments.hyperparameters, **dataset}, offline=None)
 
 
-def check_own_environment(made: Environment, config: Any) -> None:
+def check_own_environment(environment: Environment, config: Any) -> None:
     """Prints the errors of an environment of one's own, and warns of episodes that never end; ``config`` is the algorithm's.
 
     A new environment takes some steps; random numbers of NumPy and Python are as before.
@@ -175,50 +174,51 @@ def check_own_environment(made: Environment, config: Any) -> None:
     Raises:
         BadEnvironmentError: if there are errors.
     """
-    if not is_own(made):
+    if not is_own(environment):
         return
     from rejeu.envs import checker
 
     states = random.getstate(), np.random.get_state()  # noqa: NPY002 - of other code
-    with closing(made.make()) as env:
+    with closing(environment.make()) as env:
         keeps_infos = getattr(getattr(config, "hindsight", None), "copy_info_dict", False)
-        found = sorted(checker.quick_findings(env, keeps_infos))
+        findings = sorted(checker.quick_findings(env, keeps_infos))
     random.setstate(states[0])
     np.random.set_state(states[1])  # noqa: NPY002
-    errors = [finding.text for finding in found if finding.level == "error"]
-    for finding in found:
+    errors = [finding.text for finding in findings if finding.level == "error"]
+    for finding in findings:
         if finding.level == "warning":
             warnings.warn(finding.text, UserWarning, stacklevel=2)
     for text in errors:
         print(f"error: {text}", file=sys.stderr)
     if errors:
         raise BadEnvironmentError(
-            f"{made.run.env} has {counted(len(errors), 'error')}, so nothing is trained; rejeu check shows its warnings too"
+            f"{environment.run.env} has {counted(len(errors), 'error')}, so nothing is trained; rejeu check shows its "
+            "warnings too"
         )
 
 
-def is_own(made: Environment) -> bool:
+def is_own(environment: Environment) -> bool:
     """Returns whether the code of an environment or of a wrapper is not that of an installed package."""
-    spec = gym.registry.get(made.env_id)
-    parts = [] if spec is None else [spec.entry_point, *(one.entry_point for one in spec.additional_wrappers)]
-    modules = [module_of(one) for one in (*parts, *made.wrappers)]
+    spec = gym.registry.get(environment.env_id)
+    entries = [] if spec is None else [spec.entry_point, *(wrapper.entry_point for wrapper in spec.additional_wrappers)]
+    modules = [module_of(entry_point) for entry_point in (*entries, *environment.wrappers)]
     return any(module is not None and not is_installed(module) for module in modules)
 
 
 def is_installed(module: str) -> bool:
     """Returns whether a module is part of an installed package, or not imported yet, which those of one's own are."""
     package = module.partition(".")[0]
-    found = sys.modules.get(package)
-    if found is None or package == "rejeu":
+    imported = sys.modules.get(package)
+    if imported is None or package == "rejeu":
         return True
-    places = [getattr(found, "__file__", None), *getattr(found, "__path__", ())]
-    return any({"site-packages", "dist-packages"} & {*Path(place).resolve().parts} for place in places if place)
+    paths = [getattr(imported, "__file__", None), *getattr(imported, "__path__", ())]
+    return any({"site-packages", "dist-packages"} & {*Path(path).resolve().parts} for path in paths if path)
 
 
-def counted(n: int, what: str) -> str:
+def counted(n: int, noun: str) -> str:
     """Returns a number with its noun.
 
     >>> counted(0, "error"), counted(1, "error"), counted(2, "error")
     ('no errors', '1 error', '2 errors')
     """
-    return f"{n or 'no'} {what}{'' if n == 1 else 's'}"
+    return f"{n or 'no'} {noun}{'' if n == 1 else 's'}"

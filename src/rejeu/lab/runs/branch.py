@@ -38,12 +38,12 @@ def nearest(checkpoints: Path, step: int | None) -> Path:
         FileNotFoundError: if there is none.
     """
     every = checkpoint_files(checkpoints)
-    found = next((path for path in every if step is None or step_of(path) <= step), None)
-    if found is None:
+    checkpoint = next((path for path in every if step is None or step_of(path) <= step), None)
+    if checkpoint is None:
         steps = ", ".join(f"{step_of(path):,}" for path in reversed(every))
         has = f"there are those of steps {steps}" if every else f"there is no checkpoint in {checkpoints}"
         raise FileNotFoundError(f"--at {step}: no checkpoint is of this step or before it; {has}")
-    return found
+    return checkpoint
 
 
 def branch(arguments: Branch, report: Report) -> tuple[int, dict[str, Any]]:

@@ -76,8 +76,8 @@ def merged(values: Mapping[str, Any], before: Mapping[str, Any], option: str = "
     {'policy_kwargs': {'layer_norm': True, 'net_arch': [64, 64]}, 'gamma': 0.9}
     """
     result = dict(before)
-    for name, one in values.items():
-        result = with_value(result, name.split("."), one, f"{option} {name}")
+    for name, value in values.items():
+        result = with_value(result, name.split("."), value, f"{option} {name}")
     return result
 
 
@@ -104,13 +104,13 @@ def value(text: str) -> Any:
     return text
 
 
-def written(what: Any) -> str:
+def written(setting: Any) -> str:
     """Returns the text from which :func:`value` reads this, if there is one.
 
-    >>> [value(written(one)) for one in (2, "8x8", True, [1, "a"], "2")]
+    >>> [value(written(setting)) for setting in (2, "8x8", True, [1, "a"], "2")]
     [2, '8x8', True, [1, 'a'], '2']
     """
-    return what if isinstance(what, str) and value(what) == what else json.dumps(what, default=str)
+    return setting if isinstance(setting, str) and value(setting) == setting else json.dumps(setting, default=str)
 
 
 R = TypeVar("R", bound="RunConfig")
@@ -153,10 +153,10 @@ class Option(NamedTuple):
     name: str
     """With its dashes; of a positional argument its metavar."""
     shown: Shown
-    kind: Any
-    """The type of the value: ``bool``, ``int``, ``float``, ``str``, ``Path``, ``dict``, ``tuple`` or a ``Literal``."""
+    type: Any
+    """That of the value: ``bool``, ``int``, ``float``, ``str``, ``Path``, ``dict``, ``tuple`` or a ``Literal``."""
     item: Any
-    """The type of one word: that of the value, or of an element of a tuple."""
+    """The type of one word: ``type``, or that of an element of a tuple."""
     group: Topic
     limits: dict[str, float]
     """Of a number: ``ge``, ``gt`` and ``le``."""
@@ -301,8 +301,8 @@ class RunConfig(EnvironmentOptions):
         >>> RunConfig(env="my_env.py", env_kwargs={"g": 9.8}).environment_words(option=True)
         ['--env', 'my_env.py', '--env-kwargs', 'g=9.8']
         """
-        named = ["--env", self.typed] if option else [self.typed]
-        return self.as_words(*(named if self.names_code or not option else ()))
+        words = ["--env", self.typed] if option else [self.typed]
+        return self.as_words(*(words if self.names_code or not option else ()))
 
     def again(self) -> str:
         """Returns the options with which ``rejeu evaluate RUN`` and the like make the environment, a space before each.
@@ -321,11 +321,11 @@ class RunConfig(EnvironmentOptions):
         if self.origin is not None:
             return [*self.origin.words(), *self.environment_words(option=True)]
         words = ["train", *self.environment_words()]
-        for one in options(RunConfig):
-            value = getattr(self, one.field)
-            if one.field in WORDS_OF_THEIR_OWN or value == one.default or isinstance(value, bool):
+        for option in options(RunConfig):
+            value = getattr(self, option.field)
+            if option.field in WORDS_OF_THEIR_OWN or value == option.default or isinstance(value, bool):
                 continue
-            words.append(one.name)
+            words.append(option.name)
             text = repr(value).removesuffix(".0") if isinstance(value, float) else str(value)
             words += value if isinstance(value, tuple) else [text]
         return [*words, *assignment_words("--set", self.hyperparameters)]
@@ -365,33 +365,35 @@ class Task:
     no_video: bool = False
 
 
-def options(kind: type) -> Iterator[Option]:
-    """Yields the fields of a dataclass that the command line shows: flags, and those with a :class:`Shown`.
+def options(schema: type) -> Iterator[Option]:
+    """Yields the fields of the dataclass ``schema`` that the command line shows: flags, and those with a :class:`Shown`.
 
     A :class:`Topic` next to it is the list of the help that it is in.
     """
-    hints = get_type_hints(kind, include_extras=True)
-    for one in dataclasses.fields(kind):
-        hint, marks = unmarked(hints[one.name])
+    hints = get_type_hints(schema, include_extras=True)
+    for argument in dataclasses.fields(schema):
+        hint, marks = unmarked(hints[argument.name])
         shown_as = next((mark for mark in marks if isinstance(mark, Shown)), Shown() if hint is bool else None)
         if shown_as is None:
             continue
         if get_origin(hint) in (Union, UnionType):
             hint, inner = unmarked(get_args(hint)[0])  # None and others are no words
             marks = [*marks, *inner]
-        kind_of = get_origin(hint) if get_origin(hint) in (tuple, dict) else hint
+        value_type = get_origin(hint) if get_origin(hint) in (tuple, dict) else hint
         numbers = [(key, getattr(mark, key)) for mark in marks if isinstance(mark, Meta) for key in ("ge", "gt", "le")]
-        has_default = one.default is not dataclasses.MISSING
+        has_default = argument.default is not dataclasses.MISSING
         yield Option(
-            field=one.name,
-            name=shown_as.metavar if shown_as.is_positional else f"--{(shown_as.name or one.name).replace('_', '-')}",
+            field=argument.name,
+            name=shown_as.metavar
+            if shown_as.is_positional
+            else f"--{(shown_as.name or argument.name).replace('_', '-')}",
             shown=shown_as,
-            kind=kind_of,
-            item=unmarked(get_args(hint)[0])[0] if kind_of is tuple else hint,
+            type=value_type,
+            item=unmarked(get_args(hint)[0])[0] if value_type is tuple else hint,
             group=next((mark for mark in marks if isinstance(mark, Topic)), Topic.FIRST),
             limits={key: limit for key, limit in numbers if limit is not None},
-            default=one.default if has_default else None,
-            is_required=not has_default and one.default_factory is dataclasses.MISSING,
+            default=argument.default if has_default else None,
+            is_required=not has_default and argument.default_factory is dataclasses.MISSING,
         )
 
 
@@ -401,7 +403,7 @@ def unmarked(hint: Any) -> tuple[Any, list[Any]]:
 
 
 def read(path: Path) -> DecidedRun:
-    """Returns what :func:`write` wrote.
+    """Returns the description of a run from its ``config.json``.
 
     Raises:
         CheckpointError: if the file is damaged.
@@ -414,7 +416,7 @@ def read(path: Path) -> DecidedRun:
 
 
 def read_folder(folder: RunFolder) -> DecidedRun:
-    """Returns what the ``config.json`` of a run says.
+    """Returns the description of the run in a folder.
 
     Raises:
         FileNotFoundError: if it is not a run folder.
@@ -438,7 +440,7 @@ def write_task(path: Path, task: Task) -> None:
 
 
 def read_task(path: Path) -> Task:
-    """Returns what :func:`write_task` wrote.
+    """Returns the task in a file.
 
     Raises:
         CheckpointError, ValueError: if it is damaged.

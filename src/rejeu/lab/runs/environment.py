@@ -54,10 +54,10 @@ def find_id(name: str) -> str:
     new |= {key for key, entry in REGISTRY.items() if getattr(entry.kind, "__module__", None) == module.__name__}
     if env_id in gym.registry:
         return env_id
-    found = " and ".join(sorted(new))
+    names = " and ".join(sorted(new))
     if not env_id and len(new) == 1:
-        return found
-    if not new and any(str(getattr(one, "__module__", "")).startswith("pettingzoo.") for one in vars(module).values()):
+        return names
+    if not new and any("pettingzoo." in str(getattr(value, "__module__", "")) for value in vars(module).values()):
         raise ValueError(f"{source} has an environment of several agents, as PettingZoo's, and rejeu trains one agent")
     if not new:
         raise ValueError(
@@ -65,8 +65,8 @@ def find_id(name: str) -> str:
             "max_episode_steps=...) to it, with the name of your class"
         )
     if not env_id:
-        raise ValueError(f"{source} registers {found}; name one of them: {source}:{min(new)}")
-    raise ValueError(f"{source} registers {found}, not {env_id!r}")
+        raise ValueError(f"{source} registers {names}; name one of them: {source}:{min(new)}")
+    raise ValueError(f"{source} registers {names}, not {env_id!r}")
 
 
 def module_of(entry_point: Any) -> str | None:
@@ -210,68 +210,69 @@ class Wrapped:
         return env
 
 
-def from_arguments(env: str, given: EnvironmentOptions) -> Environment:
+def from_arguments(env: str, options: EnvironmentOptions) -> Environment:
     """Returns the environment that was named on the command line; imports its module.
 
     Raises:
         ValueError: if there is none, with the nearest; or for an invalid wrapper or keyword argument.
         ImportError: if a module cannot be imported.
     """
-    for name in given.imports:
+    for name in options.imports:
         import_source(name)
-    kwargs = merged(given.env_kwargs, {}, "--env-kwargs")
-    wrappers = tuple(find_wrapper(name) for name in given.wrappers)
-    run = RunConfig(env=env, env_kwargs=kwargs, wrappers=given.wrappers, imports=given.imports)
+    kwargs = merged(options.env_kwargs, {}, "--env-kwargs")
+    wrappers = tuple(find_wrapper(name) for name in options.wrappers)
+    run = RunConfig(env=env, env_kwargs=kwargs, wrappers=options.wrappers, imports=options.imports)
     return Environment(find_id(env), run, wrappers)
 
 
-def from_run(run: RunConfig, where: object, given: RunOptions) -> Environment:
+def from_run(run: RunConfig, where: object, options: RunOptions) -> Environment:
     """Returns the environment of a run: what the command line says, else what its folder says.
 
     Args:
         run: as the folder or the model has it.
         where: the folder or file that names it, for messages.
-        given: the command line; ``--env`` replaces everything, keyword arguments alone replace those of the same name.
+        options: of the command line; ``--env`` replaces everything, keyword arguments alone replace those of the same name.
 
     Raises:
         CheckpointError: if something must be typed again, with the options to type.
         ValueError: as for :func:`from_arguments`.
     """
-    if given.env is not None:
-        return from_arguments(given.env, given)
+    if options.env is not None:
+        return from_arguments(options.env, options)
     if not is_plain_id(run.env):
         raise CheckpointError(
             f"{where} names the environment {str(run.env)[:60]!r}, and no file may name what is imported; name it "
             "yourself on the command line: --env ID"
         )
-    own = merged(given.env_kwargs, {}, "--env-kwargs")
-    kept = {key: value for key, value in run.env_kwargs.items() if key not in own}
-    if not is_plain_id(run.typed) or (run.wrappers and not given.wrappers) or not are_plain(kept):
-        wrappers = given.wrappers or run.wrappers
-        again = RunConfig(env=run.typed, env_kwargs={**kept, **own}, wrappers=wrappers).again()
+    typed = merged(options.env_kwargs, {}, "--env-kwargs")
+    recorded = {key: value for key, value in run.env_kwargs.items() if key not in typed}
+    if not is_plain_id(run.typed) or (run.wrappers and not options.wrappers) or not are_plain(recorded):
+        wrappers = options.wrappers or run.wrappers
+        again = RunConfig(env=run.typed, env_kwargs={**recorded, **typed}, wrappers=wrappers).again()
         raise CheckpointError(
             f"{where} was trained on an environment that is imported or made with more than numbers, which no file may ask "
             f"for; if you trust it, name it again:{again if len(again) < 500 and again.isprintable() else ' --env ENV'}"
         )
-    named = RunConfig(env=run.env, env_kwargs={**kept, **own}, wrappers=given.wrappers, imports=given.imports)
-    return Environment(run.env, named, tuple(find_wrapper(name) for name in given.wrappers))
+    kwargs = {**recorded, **typed}
+    description = RunConfig(env=run.env, env_kwargs=kwargs, wrappers=options.wrappers, imports=options.imports)
+    return Environment(run.env, description, tuple(find_wrapper(name) for name in options.wrappers))
 
 
-def environment_of(model: Path, given: RunOptions) -> Environment:
+def environment_of(model: Path, options: RunOptions) -> Environment:
     """Returns the environment for a model: what the command line says, else what the file and its run folder say.
 
     Raises:
         CheckpointError: if they do not say, if it must be typed again, or if the file is not a model.
         ValueError: if there is no such environment.
     """
-    if given.env is not None:
-        return from_arguments(given.env, given)
+    if options.env is not None:
+        return from_arguments(options.env, options)
     env_id, folder = recorded_id(model), RunFolder(model.parent)
     if model in (folder.best, folder.agent) and folder.config.is_file():
         config = read_folder(folder)
         if config.env == env_id:
-            return from_run(config, folder.path, given)
-    return from_run(RunConfig(env=env_id), model, given)
+            return from_run(config, folder.path, options)
+    return from_run(RunConfig(env=env_id), model, options)
 
 
 def recorded_id(model: Path) -> Any:

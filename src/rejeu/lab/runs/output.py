@@ -1,4 +1,4 @@
-"""What ``rejeu train`` and ``rejeu resume`` print."""
+"""Output of ``rejeu train`` and ``rejeu resume`` on the terminal."""
 
 from __future__ import annotations
 
@@ -42,14 +42,14 @@ class Stopwatch:
 
 def header(config: DecidedRun, environment: Environment, backend: str, folder: RunFolder) -> str:
     """Returns the first lines of a run; ``backend`` describes the backend."""
-    what = "preset" if config.preset else "no preset"
+    preset = "preset" if config.preset else "no preset"
     length = f"{config.minutes:g} minutes" if config.steps is None else f"{config.steps:,} steps"
     every = f"evaluated on {counted(config.evaluate_episodes, 'episode')} every {config.evaluate_every:,} steps"
     return "\n".join(
         [
             f"environment   {environment}, {config.n_envs} at once",
             f"backend       {backend}",
-            f"algorithm     {config.algorithm}, {what}, seed {config.seed}",
+            f"algorithm     {config.algorithm}, {preset}, seed {config.seed}",
             f"training      {length}, {every}",
             f"run folder    {folder.path}",
         ]
@@ -105,7 +105,7 @@ def as_dict(
         "training": {"episodes": last.n, **{name: getattr(last, name) for name in means}},
         "best": None if best is None else {"step": best.step, **best.evaluation.to_dict()},
         "files": sorted(path.name for path in folder.path.iterdir()),
-        "not_written": [what for what, failure in agent.failed_writes.failures.items() if not failure.written],
+        "not_written": [output for output, failure in agent.failed_writes.failures.items() if not failure.written],
     }
 
 
@@ -118,9 +118,9 @@ def summary(
     if not facts["complete"]:
         can_resume = checkpoint_files(folder.checkpoints)
         how = f"; rejeu resume {quoted(folder.path)}{options} continues" if can_resume else ""
-        what = "paused" if facts["signal"] is None else f"stopped by {NAMES[facts['signal']]}"
+        ending = "paused" if facts["signal"] is None else f"stopped by {NAMES[facts['signal']]}"
         saved = "; everything is saved" if agent.failed_writes.complete else ""
-        lines.append(f"{what}{saved}{how}")
+        lines.append(f"{ending}{saved}{how}")
     if (last := facts["training"])["episodes"]:
         success = "" if math.isnan(last["success_rate"]) else f"success {last['success_rate']:.1%}, "
         text = f"return {last['mean_return']:.2f} ± {last['std_return']:.2f}, length {last['mean_length']:.1f}"

@@ -10,7 +10,7 @@ import difflib
 import inspect
 import shutil
 import textwrap
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from decimal import Decimal
 from pathlib import Path
@@ -32,7 +32,7 @@ ELSEWHERE = {
     "--total-timesteps": "did you mean --steps?",
     "--max-episode-steps": "a time limit is given where the environment is registered, or by a wrapper",
 }
-"""What other programs have as options, and what replaces it in ``rejeu train``, by their names."""
+"""Options of other programs, and what replaces them in ``rejeu train``, by their names."""
 
 
 HYPERPARAMETERS = """
@@ -41,7 +41,7 @@ n_epochs n_steps normalize optimizer policy_kwargs target_update_interval tau tr
 """
 """Hyperparameters that other programs have as options."""
 PARTS = {"net_arch": "[64,64]", "activation_fn": "relu"}
-"""The same that are parts of ``policy_kwargs``."""
+"""Entries of ``policy_kwargs`` that other programs have as options, each with an example."""
 
 
 DASHED = "{name} needs a value, got {text!r}; a path that begins with a dash is written ./{text}"
@@ -61,15 +61,15 @@ class Parser(argparse.ArgumentParser):
 
 
 def parse(
-    argv: Sequence[str], commands: Mapping[str, Any], tasks: Mapping[str, Iterable[Any]], about: str
+    argv: Sequence[str], commands: Mapping[str, Any], tasks: Mapping[str, Iterable[Any]], description: str
 ) -> tuple[str, Any]:
     """Returns the name of a command and its arguments.
 
     Args:
         argv: the words after ``rejeu``.
         commands: the dataclass of the arguments of each command.
-        tasks: the same, by what people want to do.
-        about: the text at the head of the help.
+        tasks: these dataclasses, by what people want to do.
+        description: the text at the head of the help.
 
     Raises:
         ValueError: for an unknown command or option, with the nearest; a value that is missing, out of range, not a number
@@ -80,80 +80,75 @@ def parse(
         raise ValueError("expected a command, such as rejeu train parking-v0; rejeu --help lists all")
     command, *words = argv
     if command in ("-h", "--help"):
-        overview(tasks, about).parse_args([command])
+        overview(tasks, description).parse_args([command])
     if command not in commands:
         raise ValueError(f"no command is called {command!r}; {nearest(command, commands)}")
-    known = {one.name: one for one in options(commands[command])}
-    parser = make_parser(command, commands[command], known.values(), {"-h", "--help"} & {*words})
+    declared = {option.name: option for option in options(commands[command])}
+    parser = make_parser(command, commands[command], declared.values(), {"-h", "--help"} & {*words})
     try:
-        typed, rest = parser.parse_known_intermixed_args([normalized(word) for word in words])
+        typed, leftover = parser.parse_known_intermixed_args([normalized(word) for word in words])
     except argparse.ArgumentError as error:
         raise ValueError(problem(error, command, words)) from None
-    if unknown := next((word for word in rest if word.startswith("-")), ""):
+    if unknown := next((word for word in leftover if word.startswith("-")), ""):
         name = unknown.partition("=")[0]
-        named = {key: one for key, one in known.items() if not one.shown.is_positional}
-        raise ValueError(f"rejeu {command} has no option {name}; {replacement(name, command, named)}")
-    if rest:
-        raise ValueError(f"rejeu {command} does not expect {rest[0]!r}; rejeu {command} --help shows what it takes")
-    values = {name: value for name, value in vars(typed).items() if value is not None}
-    chosen = {one.field: collected(one, values[one.field]) for one in known.values() if one.field in values}
-    return command, commands[command](**chosen)
+        flags = {key: option for key, option in declared.items() if not option.shown.is_positional}
+        raise ValueError(f"rejeu {command} has no option {name}; {replacement(name, command, flags)}")
+    if leftover:
+        raise ValueError(f"rejeu {command} does not expect {leftover[0]!r}; rejeu {command} --help shows what it takes")
+    fields = {option.field: option for option in declared.values()}
+    values = {name: collected(fields[name], value) for name, value in vars(typed).items() if value is not None}
+    return command, commands[command](**values)
 
 
-def overview(tasks: Mapping[str, Iterable[Any]], about: str) -> argparse.ArgumentParser:
+def overview(tasks: Mapping[str, Iterable[Any]], description: str) -> argparse.ArgumentParser:
     """Returns the parser whose help lists the commands."""
     usage = "rejeu COMMAND ...\n       rejeu COMMAND --help"
-    parser = Parser("rejeu", usage, about, formatter_class=argparse.RawDescriptionHelpFormatter)
-    for task, kinds in tasks.items():
+    parser = Parser("rejeu", usage, description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    for task, schemas in tasks.items():
         listed = parser.add_argument_group(task)
-        for kind in kinds:
-            listed.add_argument(kind.__name__.lower(), help=kind.__doc__.partition("\n")[0].replace("%", "%%"))
+        for schema in schemas:
+            listed.add_argument(schema.__name__.lower(), help=schema.__doc__.partition("\n")[0].replace("%", "%%"))
     return parser
 
 
-def make_parser(command: str, kind: type, known: Iterable[Option], with_help: object) -> argparse.ArgumentParser:
+def make_parser(command: str, schema: type, declared: Iterable[Option], with_help: object) -> argparse.ArgumentParser:
     """Returns the parser of a command, by default without help texts. What is not given is no attribute of its result.
 
     The options of a command that has many are listed in groups.
     """
-    known = tuple(known)
-    positional = "".join(f" {one.name}" for one in known if one.shown.is_positional)
+    declared = tuple(declared)
+    positional = "".join(f" {option.name}" for option in declared if option.shown.is_positional)
     parser = Parser(
         f"rejeu {command}",
         f"rejeu {command}{positional} [options]",
-        description=filled(inspect.cleandoc(kind.__doc__ or "")) if with_help else None,
+        description=filled(inspect.cleandoc(schema.__doc__ or "")) if with_help else None,
         formatter_class=argparse.RawDescriptionHelpFormatter,
         argument_default=argparse.SUPPRESS,
         allow_abbrev=False,
         exit_on_error=False,
     )
-    docs = field_docs(kind) if with_help else {}
+    docs = field_docs(schema) if with_help else {}
     lists: dict[Topic, Any] = dict.fromkeys(Topic, parser)
-    if len(known) > MOST_IN_ONE_LIST:
-        lists |= {one: parser.add_argument_group(one) for one in Topic if one is not Topic.FIRST}
-    for one in known:
-        text = docs.get(one.field, one.shown.help).replace("%", "%%")
-        if one.kind is bool:
-            lists[one.group].add_argument(
-                one.name, dest=one.field, action="store_true", default=argparse.SUPPRESS, help=text
-            )
+    if len(declared) > MOST_IN_ONE_LIST:
+        lists |= {topic: parser.add_argument_group(topic) for topic in Topic if topic is not Topic.FIRST}
+    for option in declared:
+        text = docs.get(option.field, option.shown.help).replace("%", "%%")
+        if option.type is bool:
+            lists[option.group].add_argument(option.name, dest=option.field, action="store_true", help=text)
             continue
-        if isinstance(one.default, str | int | float | Path):
-            text += f" (default: {one.default:g})" if isinstance(one.default, float) else f" (default: {one.default})"
-        settings: dict[str, Any] = {
-            "metavar": one.shown.metavar.removesuffix(" ..."),
-            "help": text,
-            "type": reader(one),
-        }
-        if one.takes_many:
-            settings["nargs"] = "+" if one.is_required or not one.shown.is_positional else "*"
-        elif one.shown.is_positional and not one.is_required:
+        if isinstance(default := option.default, str | int | float | Path):
+            text += f" (default: {default:g})" if isinstance(default, float) else f" (default: {default})"
+        metavar = option.shown.metavar.removesuffix(" ...")
+        settings: dict[str, Any] = {"metavar": metavar, "help": text, "type": reader(option)}
+        if option.takes_many:
+            settings["nargs"] = "+" if option.is_required or not option.shown.is_positional else "*"
+        elif option.shown.is_positional and not option.is_required:
             settings |= {"nargs": "?", "default": None}
-        if one.shown.is_positional:
-            parser.add_argument(one.field, **settings)
+        if option.shown.is_positional:
+            parser.add_argument(option.field, **settings)
         else:
-            many = {dict: "extend", tuple: "extend" if one.takes_many else "append"}
-            lists[one.group].add_argument(one.name, dest=one.field, action=many.get(one.kind, "store"), **settings)
+            action = {dict: "extend", tuple: "extend" if option.takes_many else "append"}.get(option.type, "store")
+            lists[option.group].add_argument(option.name, dest=option.field, action=action, **settings)
     return parser
 
 
@@ -188,8 +183,8 @@ def problem(error: argparse.ArgumentError, command: str, words: Sequence[str]) -
         return f"{name} takes no value, got {text.partition(' argument ')[2]}; leave it out or write {name} alone"
     if not text.startswith("expected"):
         return text
-    place = next((i for i, word in enumerate(words) if normalized(word) == name), len(words))
-    following = next(iter(words[place + 1 :]), "--")
+    position = next((i for i, word in enumerate(words) if normalized(word) == name), len(words))
+    following = next(iter(words[position + 1 :]), "--")
     if following.startswith("--"):
         return f"{name} needs a value"
     return DASHED.format(name=name, text=following)
@@ -213,17 +208,17 @@ def read(option: Option, text: str) -> Any:
     Raises:
         ValueError: if it is of the wrong type or out of range.
     """
-    if get_origin(option.kind) is Literal and text not in get_args(option.kind):
-        raise ValueError(f"{option.name} {text!r} must be one of {', '.join(get_args(option.kind))}")
+    if get_origin(option.type) is Literal and text not in get_args(option.type):
+        raise ValueError(f"{option.name} {text!r} must be one of {', '.join(get_args(option.type))}")
     if option.item not in (int, float):
         if text.startswith("-"):
             raise ValueError(DASHED.format(name=option.name, text=text))
         return Path(text) if option.item is Path else text
-    what = "whole number" if option.item is int else "number"
+    expected = "whole number" if option.item is int else "number"
     try:
         value = int(text) if text.lstrip("+-").isdecimal() else float(text)
     except ValueError:
-        raise ValueError(f"{option.name} {text!r} must be a {what}") from None
+        raise ValueError(f"{option.name} {text!r} must be a {expected}") from None
     if option.item is float:
         names = {"ge": "least", "gt": "above", "le": "most"}
         limits = {names[key]: limit for key, limit in option.limits.items() if limit < MOST}
@@ -235,22 +230,22 @@ def read(option: Option, text: str) -> Any:
 
 def collected(option: Option, typed: Any) -> Any:
     """Returns the value of an option that was given: of one that may be repeated, that of all its words."""
-    return assigned(typed, option.name) if option.kind is dict else tuple(typed) if option.kind is tuple else typed
+    return assigned(typed, option.name) if option.type is dict else tuple(typed) if option.type is tuple else typed
 
 
-def replacement(name: str, command: str, known: Mapping[str, Any]) -> str:
+def replacement(name: str, command: str, options: Collection[str]) -> str:
     """Returns the part of a message that says what to write instead of an unknown option."""
-    if name in ELSEWHERE and "--envs" in known:
+    if name in ELSEWHERE and "--envs" in options:
         return ELSEWHERE[name].format(command=command)
     hyperparameter = name.removeprefix("--").replace("-", "_")
-    if hyperparameter in HYPERPARAMETERS.split() and "--set" in known:
+    if hyperparameter in HYPERPARAMETERS.split() and "--set" in options:
         return f"hyperparameters are given as --set {hyperparameter}=VALUE"
-    if hyperparameter in PARTS and "--set" in known:
+    if hyperparameter in PARTS and "--set" in options:
         return f"hyperparameters are given as --set policy_kwargs.{hyperparameter}={PARTS[hyperparameter]}"
-    return nearest(name if name.startswith("--") else f"-{name}", known)
+    return nearest(name if name.startswith("--") else f"-{name}", options)
 
 
-def nearest(name: str, known: Mapping[str, Any]) -> str:
+def nearest(name: str, names: Collection[str]) -> str:
     """Returns the part of a message that names the nearest known name, or all of them."""
-    near = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
-    return f"did you mean {near[0]}?" if near else f"there are {', '.join(known)}"
+    near = difflib.get_close_matches(name, names, n=1, cutoff=0.6)
+    return f"did you mean {near[0]}?" if near else f"there are {', '.join(names)}"

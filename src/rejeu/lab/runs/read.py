@@ -52,7 +52,7 @@ State = Literal["running", "finished", "paused", "interrupted", "crashed", "dama
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RunSummary:
-    """What is known of one run; see :func:`read_run`."""
+    """Record of one run, as its files show it; see :func:`read_run`."""
 
     path: Path
     name: str
@@ -111,21 +111,21 @@ class RunSummary:
             return ""
         preset = presets.find(self.config.env, self.config.algorithm)
         usual = default_hyperparameters(self.config.algorithm, preset.hyperparameters if preset else {})
-        taken = dict(flat(usual))  # by rejeu train if nothing is set
+        defaults = dict(flat(usual))  # by rejeu train if nothing is set
         values = dict(flat(self.config.hyperparameters))
         same = {
             name
             for name in values
-            if usual and name not in self.changed and taken.get(name, values[name]) == values[name]
+            if usual and name not in self.changed and defaults.get(name, values[name]) == values[name]
         }
-        given = {name: value for name, value in values.items() if name not in same}
+        hyperparameters = {name: value for name, value in values.items() if name not in same}
         minutes = self.config.checkpoint_minutes or 0.0
-        words = replace(self.config, hyperparameters=given, checkpoint_minutes=minutes).words()
+        words = replace(self.config, hyperparameters=hyperparameters, checkpoint_minutes=minutes).words()
         return " ".join(quoted(shown(word, MAX_WORD)) for word in ["rejeu", *words])
 
 
 def read_run(path: str | Path, columns: Collection[str] | None = None) -> RunSummary:
-    """Returns what is known of the run in a folder that ``rejeu train`` wrote or is writing.
+    """Returns the record of the run in a folder that ``rejeu train`` wrote or is writing.
 
     Args:
         path: the folder.
@@ -137,8 +137,8 @@ def read_run(path: str | Path, columns: Collection[str] | None = None) -> RunSum
     folder = Path(path)
     if not folder.is_dir():
         is_something = folder.exists()
-        said = f"{shown(folder, 300)} is no folder" if is_something else f"there is no run folder {shown(folder, 300)}"
-        raise FileNotFoundError(said)
+        text = f"{shown(folder, 300)} is no folder" if is_something else f"there is no run folder {shown(folder, 300)}"
+        raise FileNotFoundError(text)
     folder = folder.resolve()
     files = RunFolder(folder)
     if not any(path.is_file() for path in files.marks):
@@ -148,39 +148,39 @@ def read_run(path: str | Path, columns: Collection[str] | None = None) -> RunSum
     config, versions, notes = read_config(files.config)
     metrics, evaluations = (ordered(read_table(path)) for path in (files.metrics, files.evaluations))
     metrics = statistics_rows(metrics)
-    table = ordered(read_table(files.episodes, columns))
+    episodes = ordered(read_table(files.episodes, columns))
     replays = read_table(files.replays) if is_file(files.replays) else EMPTY
-    tables = (table, metrics, evaluations)
-    times = (table.column("seconds"), metrics.column("time/time_elapsed"), evaluations.column("seconds"))
+    tables = (episodes, metrics, evaluations)
+    last_steps = [int(table.column("step")[-1]) for table in tables if len(table)]
+    times = (episodes.column("seconds"), metrics.column("time/time_elapsed"), evaluations.column("seconds"))
     run = RunSummary(
         path=folder,
         name=shown(folder.name, MAX_NAME),
         config=config,
         versions={shown(name): shown(version) for name, version in versions.items() if version is not None},
-        steps=max(0, newest_step(files.checkpoints), *(int(part.column("step")[-1]) for part in tables if len(part))),
-        seconds=max((one[-1] for one in times if len(one) and math.isfinite(one[-1])), default=math.nan),
-        episodes=table,
+        steps=max(0, newest_step(files.checkpoints), *last_steps),
+        seconds=max((column[-1] for column in times if len(column) and math.isfinite(column[-1])), default=math.nan),
+        episodes=episodes,
         evaluations=evaluations,
         metrics=metrics,
         replays=replays,
         warnings=read_warnings(files.warnings),
         videos=tuple(find_videos(files)),
         models=tuple(path for path in (files.best, files.agent) if is_file(path)),
-        notes=(*notes, *(note for part in (*tables, replays) for note in part.notes)),
+        notes=(*notes, *(note for table in (*tables, replays) for note in table.notes)),
     )
     state = state_of(run)
     if state == "running":  # in its first seconds nothing was written
-        run = replace(
-            run, notes=tuple(one for one in run.notes if not re.fullmatch(r"(there is no )?\w+\.csv( is empty)?", one))
-        )
+        lasting = tuple(note for note in run.notes if not re.fullmatch(r"(there is no )?\w+\.csv( is empty)?", note))
+        run = replace(run, notes=lasting)
     return replace(run, state=state)
 
 
 def best_row(evaluations: Table) -> int | None:
     """Returns the row of the best evaluation, by success rate and then by mean return; None if there is none."""
     mean, rate = evaluations.column("mean_return"), evaluations.column("success_rate")
-    known = np.flatnonzero(np.isfinite(mean)).tolist()
-    return max(known, key=lambda row: (np.nan_to_num(rate[row], nan=-1.0), mean[row]), default=None)
+    rows = np.flatnonzero(np.isfinite(mean)).tolist()
+    return max(rows, key=lambda row: (np.nan_to_num(rate[row], nan=-1.0), mean[row]), default=None)
 
 
 def statistics_rows(table: Table) -> Table:
@@ -191,8 +191,8 @@ def statistics_rows(table: Table) -> Table:
     {'step': array([0.]), 'time/time_elapsed': array([0.5])}
     """
     columns = table.columns
-    known = np.isfinite(columns.get("time/time_elapsed", np.zeros(len(table))))
-    return Table({name: values[known] for name, values in columns.items() if not name.startswith("eval/")}, table.notes)
+    timed = np.isfinite(columns.get("time/time_elapsed", np.zeros(len(table))))
+    return Table({name: values[timed] for name, values in columns.items() if not name.startswith("eval/")}, table.notes)
 
 
 def read_config(path: Path) -> tuple[RunConfig, dict[str, str | None], list[str]]:
@@ -281,8 +281,8 @@ def is_locked(path: Path) -> bool:
 def is_recent(folder: Path) -> bool:
     """Returns whether a table of a run was written in the last minute."""
     run = RunFolder(folder)
-    known = filter(is_file, (*run.marks, run.evaluations))
-    return any(0 <= time.time() - path.lstat().st_mtime < RECENT for path in known)
+    paths = filter(is_file, (*run.marks, run.evaluations))
+    return any(0 <= time.time() - path.lstat().st_mtime < RECENT for path in paths)
 
 
 def read_warnings(path: Path) -> tuple[str, ...]:
@@ -299,8 +299,7 @@ def read_warnings(path: Path) -> tuple[str, ...]:
 def find_videos(folder: RunFolder) -> Iterator[Path]:
     """Yields the mp4 files of a run folder that are not symbolic links and not in linked folders."""
     if folder.videos.is_dir() and not folder.videos.is_symlink():
-        found = [one for one in folder.videos.iterdir() if one.suffix == ".mp4" and one.name[0] != "." and is_file(one)]
-        yield from sorted(found)[:MAX_VIDEOS]
+        yield from sorted(filter(is_file, folder.videos.glob("[!.]*.mp4")))[:MAX_VIDEOS]
     if is_file(folder.video):
         yield folder.video
 
@@ -313,11 +312,11 @@ def is_file(path: Path) -> bool:
         return False
 
 
-def default_hyperparameters(algorithm: str | None, given: Mapping[str, Any] = MappingProxyType({})) -> dict[str, Any]:
-    """Returns ``given`` and the defaults of an algorithm as JSON values; empty if it is neither rejeu's nor registered."""
+def default_hyperparameters(algorithm: str | None, tuned: Mapping[str, Any] = MappingProxyType({})) -> dict[str, Any]:
+    """Returns ``tuned`` and the defaults of an algorithm as JSON values; empty if it is neither rejeu's nor registered."""
     from rejeu.algorithms import config
 
-    kinds = dict(config.registered)
+    classes = dict(config.registered)
     if algorithm in CATALOG:
-        kinds[algorithm] = CATALOG[algorithm].load().Config
-    return config.to_json(kinds[algorithm](**given)) if algorithm in kinds else {}
+        classes[algorithm] = CATALOG[algorithm].load().Config
+    return config.to_json(classes[algorithm](**tuned)) if algorithm in classes else {}

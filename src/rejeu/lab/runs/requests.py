@@ -1,4 +1,4 @@
-"""What others ask of a run while it trains, by files in its folder: to stop, and to show its current policy.
+"""Requests to a run while it trains, by files in its folder: to stop, and to show its current policy.
 
 Files need no signals and no connection, so that it works on every system, for runs that were started anywhere.
 """
@@ -85,9 +85,9 @@ def show(agent: Any, path: Path) -> None:
 def keep_model(agent: Any, folder: Path, step: int) -> None:
     """Writes the model of a step among those of the course of training; of too many every second one is removed."""
     show(agent, folder / f"step_{step:012}.safetensors")
-    kept = models(folder)
-    for one in kept[1::2] if len(kept) > MOST_MODELS else ():
-        one.unlink(missing_ok=True)
+    paths = models(folder)
+    for path in paths[1::2] if len(paths) > MOST_MODELS else ():
+        path.unlink(missing_ok=True)
 
 
 def models(folder: Path) -> Sequence[Path]:

@@ -64,14 +64,14 @@ def train_on(
     require(config.log)
     device = arguments.device or ("cpu" if config.device == "cpu" else "auto")  # a GPU may not be here
     devices.start_with("--device", device)
-    kind = agent_of_file(config.algorithm, folder.config)
+    agent_class = agent_of_file(config.algorithm, folder.config)
     environment = environments.from_run(config, folder.path, arguments)
     ray = {"address": arguments.ray, "num_cpus": arguments.env_cpus} if config.backend == "ray" else None
     workers = WorkerOptions(restart_workers=arguments.restart_workers, ray=ray)
     with closing(environment.vector(config.n_envs, config.backend, config.seed, workers)) as env:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "resumed at step", UserWarning)  # printed below
-            agent = kind.resume(checkpoint, env, device=device, **changes(arguments, config))
+            agent = agent_class.resume(checkpoint, env, device=device, **changes(arguments, config))
         limits = choose_limits(agent, arguments, finish)
         before = config
         if arguments.hyperparameters:

@@ -1,4 +1,4 @@
-"""What ``rejeu train`` and ``rejeu resume`` share: a session of training in a run folder, and the files that it leaves."""
+"""A session of training in a run folder, of ``rejeu train`` or ``rejeu resume``, and the files that it leaves."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def installed_logs(arguments: RunConfig) -> tuple[str, ...]:
 
 
 class TrainingLimits(NamedTuple):
-    """What ends training."""
+    """Limits of training."""
 
     steps: int | None = None
     """Environment steps to take; with ``minutes`` None too, the goal that the run has already."""
@@ -70,7 +70,7 @@ class TrainingLimits(NamedTuple):
 
 
 class Learning(NamedTuple):
-    """What a session gives to ``learn``."""
+    """Callbacks and outputs of ``learn`` in a session."""
 
     evaluate: Evaluate
     callbacks: list[Any]
@@ -104,7 +104,7 @@ class Session(NamedTuple):
     more: tuple[Any, ...] = ()
     """Further callbacks."""
     label: str = ""
-    """What the lines about its evaluations begin with, where several runs are trained together."""
+    """Beginning of the lines about its evaluations, where several runs are trained together."""
 
     def in_new_folder(self, out: Path | None) -> Session:
         """Returns the session in a folder that is made: ``out``, or one under ``runs``."""
@@ -182,8 +182,8 @@ class Session(NamedTuple):
         """Returns the outputs of the rows of statistics, and the table of episodes."""
         agent, up_to = self.agent, None if self.is_new else self.agent.num_timesteps
         sinks: list[Sink] = [
-            open_log(kind, self.folder.path, run_name(agent), tracker_id(agent), self.folder.metrics.stem, up_to)
-            for kind in dict.fromkeys(("csv", *self.config.log))
+            open_log(name, self.folder.path, run_name(agent), tracker_id(agent), self.folder.metrics.stem, up_to)
+            for name in dict.fromkeys(("csv", *self.config.log))
         ]
         sinks.append(EpisodeTable(lambda: agent.history, self.folder.episodes))
         return [guarded(sink, agent.failed_writes, closes=True) for sink in sinks]
@@ -256,12 +256,12 @@ class Session(NamedTuple):
 
 
 @contextmanager
-def optional(what: str, kinds: tuple[type[Exception], ...] = (ImportError, OSError)) -> Iterator[None]:
-    """Context whose failure to write something is one line; ``kinds`` are the errors that are expected."""
+def optional(output: str, expected: tuple[type[Exception], ...] = (ImportError, OSError)) -> Iterator[None]:
+    """Context whose failure to write something is one line; ``expected`` are the errors of such a failure."""
     try:
         yield
-    except kinds as error:
-        echo(f"no {what}: {one_line(error)}")
+    except expected as error:
+        echo(f"no {output}: {one_line(error)}")
 
 
 def make_evaluation_env(config: DecidedRun, environment: Environment) -> VectorEnv:

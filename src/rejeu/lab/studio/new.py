@@ -84,18 +84,18 @@ def prefilled(request: Request) -> str | None:
 def make_field(option: Option, about: str) -> Any:
     """Returns the element in which an option is entered."""
     label = LABELS.get(option.field, option.name.removeprefix("--").replace("-", " ").lower())
-    if option.kind is bool:
+    if option.type is bool:
         made: Any = ui.switch(label)
     elif option.field == "env":
         names = sorted({preset.env_id for preset in presets.every()})
         made = ui.select(names, label="environment", with_input=True, new_value_mode="add-unique")
     elif option.field == "algorithm":
         made = ui.select(sorted(AGENTS), label="algorithm", with_input=True, clearable=True)
-    elif get_origin(option.kind) is Literal:
-        made = ui.select([*get_args(option.kind)], label=label, clearable=True)
+    elif get_origin(option.type) is Literal:
+        made = ui.select([*get_args(option.type)], label=label, clearable=True)
     else:
         made = ui.input(label, validation=lambda text: problem_of(option, text))
-    if option.kind is not bool:
+    if option.type is not bool:
         made.props("dense outlined stack-label bottom-slots hide-bottom-space").props.update(hint=in_form(about))
     return made
 
@@ -127,12 +127,12 @@ def words_of(option: Option, given: Any) -> list[str]:
     if given in (None, "", False):
         return []
     name = [] if option.shown.is_positional else [option.name]
-    if option.kind is bool:
+    if option.type is bool:
         return name
-    words = shlex.split(str(given)) if option.kind in (dict, tuple) else [str(given).strip()]
-    if option.kind not in (dict, tuple):
+    words = shlex.split(str(given)) if option.type in (dict, tuple) else [str(given).strip()]
+    if option.type not in (dict, tuple):
         parsing.read(option, words[0])
-    if option.takes_many or option.kind is dict:
+    if option.takes_many or option.type is dict:
         return [*name, *words]
     return [part for word in words for part in (*name, word)]
 
