@@ -351,7 +351,7 @@ def test_clone(spy, tmp_path):
     spy(demonstrations, "check"), spy(demonstrations, "keeping_policy")
     found = spy(models, "find_model", "model")
     spy(models, "load", agent := mock.Mock(**{"learner.algorithm.recall": None}))
-    spy(clone.environment, "recorded_id", TYPED)
+    spy(models, "recorded_id", TYPED)
     argv = ["clone", "shown", "--env", TYPED, "--algo", "SAC", "--set", "gamma=0.5", "--updates", "7", "--seed", "5"]
     argv += ["--learning-rate", "0.1", "--evaluate-episodes", "6", "--device", "cpu", "--no-report", "--no-video"]
     with mock.patch.object(clone, "Checkpoint"):
@@ -371,7 +371,7 @@ def test_clone(spy, tmp_path):
     assert taught[-1]["expert"]("obs") == "action"
     agent.predict.assert_called_with("obs", deterministic=True)
     assert len(cloned) == len(offline) == 1
-    spy(clone.environment, "recorded_id", "Acrobot-v1")
+    spy(models, "recorded_id", "Acrobot-v1")
     assert main([*argv, "--out", str(tmp_path / "c")]) == 2  # the expert plays another environment
     assert not (tmp_path / "c").exists()
 

@@ -1,1 +1,1 @@
-"""What training came to: tables, curves, evaluations, videos."""
+"""Results of training: tables, curves, evaluations, videos."""

@@ -47,6 +47,8 @@ MAX_LISTED = 500
 """Most runs and probabilities that a page lists."""
 Key = tuple[str, str]
 """Environment and label of a group."""
+Finals = Mapping[Key, tuple[np.ndarray, ...]]
+"""Final scores of the runs of each group, one array for each environment."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +62,7 @@ class Group:
     scores: tuple[np.ndarray, ...]
     """Final scores of the runs, one array for each environment."""
     run_scores: tuple[float, ...]
-    """The same, in the order of ``runs``."""
+    """Final score of each run, in the order of ``runs``."""
     score: tuple[float, float, float]
     """Interquartile mean of the final scores, and the bounds of its interval."""
     mean: float
@@ -102,7 +104,7 @@ class Improvement:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Comparison:
-    """What :func:`compare` returns. ``print`` and notebooks show it as a table."""
+    """Result of :func:`compare`. ``print`` and notebooks show it as a table."""
 
     groups: tuple[Group, ...]
     improvements: tuple[Improvement, ...]
@@ -112,11 +114,11 @@ class Comparison:
     statistic: str
     threshold: float | None
     notes: tuple[str, ...]
-    """What was left out, cut or not comparable, one line each."""
+    """Lines about runs that were left out, cut or not comparable."""
 
     @property
     def definition(self) -> str:
-        """What the final score is."""
+        """Definition of the final score."""
         if self.score == "evaluation":
             return "final score: mean return of the last evaluation"
         return f"final score: mean return of the training episodes in the last {FINAL:.0%} of what is compared"
@@ -161,9 +163,9 @@ class Comparison:
         parts = [markdown_table(head, rows), self.definition]
         if self.improvements:
             names = ["group", "better than", "environment", "probability of improvement (95 % interval)"]
-            parts.append(markdown_table(names, [one.cells for one in self.improvements]))
+            parts.append(markdown_table(names, [improvement.cells for improvement in self.improvements]))
         if self.notes:
-            parts.append("\n".join(f"- {cell(one)}" for one in self.notes))
+            parts.append("\n".join(f"- {cell(note)}" for note in self.notes))
         return "\n\n".join(parts) + "\n"
 
     def to_csv(self) -> str:
@@ -190,7 +192,7 @@ class Comparison:
                     **row,
                     "paths": [str(run.path) for run in group.runs],
                     "seeds": [run.config.seed for run in group.runs],
-                    "scores": [one.tolist() for one in group.scores],
+                    "scores": [scores.tolist() for scores in group.scores],
                     "curve": dict(zip(("x", *BOUNDS), [group.x.tolist(), *group.curve.tolist()], strict=True)),
                     "profile": dict(
                         zip(("levels", *BOUNDS), [group.levels.tolist(), *group.profile.tolist()], strict=True)
@@ -198,7 +200,7 @@ class Comparison:
                 }
                 for row, group in zip(self.table(), self.groups, strict=True)
             ],
-            "improvements": [vars(one) for one in self.improvements],
+            "improvements": [vars(improvement) for improvement in self.improvements],
             "notes": list(self.notes),
         }
 
@@ -234,7 +236,7 @@ class Comparison:
         path = Path(path)
         suffix = path.suffix.lower().removeprefix(".")
         if path.is_dir() or not suffix:
-            paths = [one for suffix in FORMATS for one in self.save(path / f"compare.{suffix}")]
+            paths = [saved for suffix in FORMATS for saved in self.save(path / f"compare.{suffix}")]
             return [*paths, atomic.write(path / "curves.csv", self.curves_csv())]
         if suffix == "png":
             self.plot(path)
@@ -248,10 +250,10 @@ class Comparison:
         lines = [
             f"{group.label} on {group.env_id or 'an unknown environment'}: {group.interval}" for group in self.groups
         ]
-        return "\n".join([*lines, self.definition, *(f"note: {one}" for one in self.notes)])
+        return "\n".join([*lines, self.definition, *(f"note: {note}" for note in self.notes)])
 
     def _repr_html_(self) -> str:
-        lines = [self.definition, *(f"note: {one}" for one in self.notes)]
+        lines = [self.definition, *(f"note: {note}" for note in self.notes)]
         return table_html(self) + "".join(f"<p>{html.escape(line)}</p>" for line in lines)
 
 
@@ -298,35 +300,35 @@ def compare(
     if threshold is not None:
         threshold = validation.number("threshold", threshold)
     samples, seed = validation.whole("samples", samples, 1), validation.whole("seed", seed, 0)
-    found, notes = read_all(runs)
-    curves = comparable(found, x, score, notes)
-    kind, labels = group_labels([one.run for one in curves], by)
-    for one, label in zip(curves, labels, strict=True):
-        one.label = label
+    summaries, notes = read_all(runs)
+    curves = comparable(summaries, x, score, notes)
+    by, labels = group_labels([curve.run for curve in curves], by)
+    for curve, label in zip(curves, labels, strict=True):
+        curve.label = label
     notes += warnings_of(curves)
-    envs = sorted({one.env for one in curves})
+    envs = sorted({curve.env for curve in curves})
     if normalize is not None:
         scale(curves, normalize)
-    elif len(envs) > 1 and kind != "env":
+    elif len(envs) > 1 and by != "env":
         notes.append(
             f"the runs are of {len(envs)} environments; each has rows of its own, because their returns cannot be averaged; "
             "normalize them (--normalize range, or --reference ENV=LOW,HIGH) to average"
         )
-    mixes = normalize is not None and kind != "env"
+    mixes = normalize is not None and by != "env"
     keyed = by_group(curves, mixes)
     if len({env for env, _ in keyed}) > 1 and mixes:
         notes.append("the groups are of different environments; only groups of the same environments are compared")
     rng = np.random.default_rng(seed)
-    finals = {key: strata(members, [one.final() for one in members]) for key, members in keyed.items()}
+    finals = {key: strata(members, [curve.final() for curve in members]) for key, members in keyed.items()}
     draws = {key: statistics.draw(scores, samples, rng) for key, scores in finals.items()}
     groups = tuple(
         make_group(key, keyed[key], finals, draws[key], threshold, statistics.STATISTICS[statistic], mixes)
         for key in sorted(keyed)
     )
-    pairs = [(one, other) for one, other in itertools.combinations(sorted(keyed), 2) if one[0] == other[0]]
+    pairs = [(first, second) for first, second in itertools.combinations(sorted(keyed), 2) if first[0] == second[0]]
     improvements = tuple(compared(*pair, finals, draws) for pair in pairs)
     notes += coverage_notes([min(map(len, group.scores)) for group in groups])
-    return Comparison(groups, improvements, kind, x, score, statistic, threshold, tuple(notes))
+    return Comparison(groups, improvements, by, x, score, statistic, threshold, tuple(notes))
 
 
 def comparable(runs: Sequence[RunSummary], axis: Axis, score: Score, notes: list[str]) -> list[Curve]:
@@ -336,12 +338,12 @@ def comparable(runs: Sequence[RunSummary], axis: Axis, score: Score, notes: list
         ValueError: if none can.
     """
     curves = [Curve.of(run, axis, score) for run in runs]
-    notes += [one.problem for one in curves if one.problem]
-    curves = [one for one in curves if not one.problem]
+    notes += [curve.problem for curve in curves if curve.problem]
+    curves = [curve for curve in curves if not curve.problem]
     cut_to_shortest(curves, axis, notes)
-    late = [one for one in curves if one.evaluation is not None and one.evaluation[0][0] > one.end]
-    notes += [f"{one.run.name} has no evaluation within what is compared and is left out" for one in late]
-    curves = [one for one in curves if one not in late]
+    late = [curve for curve in curves if curve.evaluation is not None and curve.evaluation[0][0] > curve.end]
+    notes += [f"{curve.run.name} has no evaluation within what is compared and is left out" for curve in late]
+    curves = [curve for curve in curves if curve not in late]
     if not curves:
         raise ValueError(f"there is nothing to compare; {'; '.join(notes)[:500] or 'no run was given'}")
     return curves
@@ -351,11 +353,11 @@ def warnings_of(curves: Sequence[Curve]) -> list[str]:
     """Returns notes about groups that mix settings, seeds that occur twice, and runs whose episodes are not known."""
     mixed, repeated = [], []
     for (_, label), members in by_group(curves, mixes=False).items():
-        runs = [one.run for one in members]
-        named = settings(runs)
-        mixed += [label] if len({*named}) > 1 else []
+        runs = [curve.run for curve in members]
+        texts = settings(runs)
+        mixed += [label] if len({*texts}) > 1 else []
         seeds = Counter(
-            (run.config.seed, setting) for run, setting in zip(runs, named, strict=True) if run.config.seed is not None
+            (run.config.seed, setting) for run, setting in zip(runs, texts, strict=True) if run.config.seed is not None
         )
         repeated += [label] if seeds and max(seeds.values()) > 1 else []
     notes = [
@@ -366,7 +368,7 @@ def warnings_of(curves: Sequence[Curve]) -> list[str]:
         f"{shown(label, 100)}: runs of this group have the same seed; they count as several, but are not independent"
         for label in dict.fromkeys(repeated)
     ]
-    means = sum(not (len(one.run.episodes) or one.run.config.hyperparameters.get("offline")) for one in curves)
+    means = sum(not (len(curve.run.episodes) or curve.run.config.hyperparameters.get("offline")) for curve in curves)
     if means:
         notes.append(
             f"{means} of {len(curves)} runs have no episodes on disk; the logged means of their latest episodes are used"
@@ -377,11 +379,11 @@ def warnings_of(curves: Sequence[Curve]) -> list[str]:
 def by_group(curves: Sequence[Curve], mixes: bool) -> dict[Key, list[Curve]]:
     """Returns the curves of each group by environment and label; with ``mixes`` a group is of several environments."""
     envs: dict[str, set[str]] = {}
-    for one in curves:
-        envs.setdefault(one.label, set()).add(one.env)
+    for curve in curves:
+        envs.setdefault(curve.label, set()).add(curve.env)
     keyed: dict[Key, list[Curve]] = {}
-    for one in curves:
-        keyed.setdefault((", ".join(sorted(envs[one.label])) if mixes else one.env, one.label), []).append(one)
+    for curve in curves:
+        keyed.setdefault((", ".join(sorted(envs[curve.label])) if mixes else curve.env, curve.label), []).append(curve)
     return keyed
 
 
@@ -403,16 +405,16 @@ def coverage_notes(n_runs: Sequence[int]) -> list[str]:
 
 def strata(members: Sequence[Curve], values: Sequence[Any]) -> tuple[np.ndarray, ...]:
     """Returns one value of each run as arrays, one for each environment."""
-    found: dict[str, list[Any]] = {}
-    for one, value in zip(members, values, strict=True):
-        found.setdefault(one.env, []).append(value)
-    return tuple(np.array(found[env]) for env in sorted(found))
+    by_env: dict[str, list[Any]] = {}
+    for curve, value in zip(members, values, strict=True):
+        by_env.setdefault(curve.env, []).append(value)
+    return tuple(np.array(by_env[env]) for env in sorted(by_env))
 
 
 def make_group(
     key: Key,
     members: Sequence[Curve],
-    finals: Mapping[Key, tuple[np.ndarray, ...]],
+    finals: Finals,
     draws: list[np.ndarray],
     threshold: float | None,
     statistic: statistics.Statistic,
@@ -420,12 +422,12 @@ def make_group(
 ) -> Group:
     """Returns a group with its statistics; the levels of its profile are those of all groups of the environment."""
     scores = finals[key]
-    peers = np.concatenate([one for other in finals if other[0] == key[0] for one in finals[other]])
-    least, most = peers.min(), peers.max()
-    margin = 0.0 if least < most else max(1.0, abs(least) / 10)  # equal scores are a step
-    levels = np.linspace(least - margin, most + margin, N_LEVELS)
+    peers = np.concatenate([array for peer in finals if peer[0] == key[0] for array in finals[peer]])
+    lowest, highest = peers.min(), peers.max()
+    margin = 0.0 if lowest < highest else max(1.0, abs(lowest) / 10)  # equal scores are a step
+    levels = np.linspace(lowest - margin, highest + margin, N_LEVELS)
     samples = statistics.resampled(scores, draws)
-    points = [one.points() for one in members]
+    points = [curve.points() for curve in members]
     curves = strata(members, points)
     low, high = statistics.interval(statistics.iqm(samples))
     with np.errstate(invalid="ignore"):  # points before the first episode
@@ -434,9 +436,9 @@ def make_group(
     return Group(
         label=key[1],
         env_id=key[0],
-        runs=tuple(one.run for one in members),
+        runs=tuple(curve.run for curve in members),
         scores=scores,
-        run_scores=tuple(one.final() for one in members),
+        run_scores=tuple(curve.final() for curve in members),
         score=(float(statistics.iqm(scores)), float(low), float(high)),
         mean=float(statistics.mean(scores)),
         median=float(statistics.median(scores)),
@@ -451,20 +453,20 @@ def make_group(
 def reached(members: Sequence[Curve], points: Sequence[np.ndarray], threshold: float) -> tuple[int, float]:
     """Returns how many curves reach a threshold, and the median of the steps (or seconds) until they do."""
     times = []
-    for one, values in zip(members, points, strict=True):
+    for curve, values in zip(members, points, strict=True):
         over = np.flatnonzero(values >= threshold)
-        times.append(over[0] / (N_POINTS - 1) * one.end if len(over) else np.inf)
+        times.append(over[0] / (N_POINTS - 1) * curve.end if len(over) else np.inf)
     return int(np.isfinite(times).sum()), float(np.median(times))
 
 
-def compared(one: Key, other: Key, finals: Any, draws: Any) -> Improvement:
+def compared(first: Key, second: Key, finals: Finals, draws: Mapping[Key, list[np.ndarray]]) -> Improvement:
     """Returns the probability of improvement of the better of two groups over the other, with its interval."""
-    probability = float(statistics.improvement(finals[one], finals[other]))
+    probability = float(statistics.improvement(finals[first], finals[second]))
     if probability < 0.5:
-        one, other, probability = other, one, 1 - probability
-    samples = [statistics.resampled(finals[key], draws[key]) for key in (one, other)]
+        first, second, probability = second, first, 1 - probability
+    samples = [statistics.resampled(finals[key], draws[key]) for key in (first, second)]
     low, high = statistics.interval(statistics.improvement(*samples))
-    return Improvement(one[1], other[1], one[0], probability, float(low), float(high))
+    return Improvement(first[1], second[1], first[0], probability, float(low), float(high))
 
 
 def page_of(comparison: Comparison) -> str:
@@ -478,12 +480,12 @@ def page_of(comparison: Comparison) -> str:
     envs = list(dict.fromkeys(group.env_id for group in comparison.groups))
     labels = list(dict.fromkeys(group.label for group in comparison.groups))
     charts: dict[str, Any] = {}
-    entries: dict[str, list[dict[str, str]]] = {"curve": [], "profile": []}
-    for place, env in enumerate(envs):
-        for kind in entries:
-            key = f"{kind}{place}"
-            charts[key] = group_chart(kind, comparison, env)
-            entries[kind].append({"id": key, "title": env or "unknown environment", "note": ""})
+    entries: dict[str, list[page.Entry]] = {"curve": [], "profile": []}
+    for i, env in enumerate(envs):
+        for form in entries:
+            key = f"{form}{i}"
+            charts[key] = group_chart(form, comparison, env)
+            entries[form].append(page.Entry(key, env or "unknown environment"))
     names = {"algorithm": "algorithms", "setting": "settings", "env": "environments"}
     n_runs = sum(len(group.runs) for group in comparison.groups)
     title = f"Comparison of {len(labels)} {names[comparison.by]}" if len(labels) > 1 else labels[0]
@@ -498,7 +500,7 @@ def page_of(comparison: Comparison) -> str:
         definition=f"{comparison.definition.capitalize()}. Intervals are 95 % stratified bootstrap intervals.",
         curves=entries["curve"],
         profiles=entries["profile"],
-        improvements=[one.cells for one in comparison.improvements[:MAX_LISTED]],
+        improvements=[improvement.cells for improvement in comparison.improvements[:MAX_LISTED]],
         runs=run_rows(comparison)[:MAX_LISTED],
     )
 
@@ -517,7 +519,7 @@ def table_html(comparison: Comparison) -> str:
     """Returns the table of the groups as HTML, everything escaped; needs no other package."""
     head, *rows = comparison.text_table()
     lines = [
-        "".join(f"<{tag}{' class=text' * (i < 2)}>{html.escape(one)}</{tag}>" for i, one in enumerate(cells))
+        "".join(f"<{tag}{' class=text' * (i < 2)}>{html.escape(text)}</{tag}>" for i, text in enumerate(cells))
         for tag, cells in [("th", head), *(("td", row) for row in rows)]
     ]
     body = "".join(f"<tr>{line}</tr>" for line in lines[1:])

@@ -24,7 +24,7 @@ MAX_LABEL = 200
 
 
 def group_labels(runs: Sequence[RunSummary], by: By | None) -> tuple[By, list[str]]:
-    """Returns what makes a group, and the label of the group of each run."""
+    """Returns the basis of the groups, and the label of the group of each run."""
     labels: dict[By, list[str]] = {
         "algorithm": [algorithm_label(run) for run in runs],
         "setting": settings(runs),
@@ -37,30 +37,30 @@ def group_labels(runs: Sequence[RunSummary], by: By | None) -> tuple[By, list[st
         usual = "algorithm"
     elif settings_differ:
         usual = "setting"
-    chosen = usual if by is None else by
-    return chosen, labels[chosen]
+    by = usual if by is None else by
+    return by, labels[by]
 
 
 def settings(runs: Sequence[RunSummary]) -> list[str]:
     """Returns for each run the algorithm, and the settings in which the runs of this algorithm differ."""
     values = [dict(flat(run.config.hyperparameters)) | {"n_envs": run.config.n_envs} for run in runs]
-    written = [{name: whole_text(value) for name, value in one.items()} for one in values]
+    written = [{name: whole_text(value) for name, value in setting.items()} for setting in values]
     members: dict[str, list[dict[str, str]]] = {}
-    for run, one in zip(runs, written, strict=True):
-        members.setdefault(algorithm_label(run), []).append(one)
-    differing = {algorithm: differing_names(ones) for algorithm, ones in members.items()}
+    for run, setting in zip(runs, written, strict=True):
+        members.setdefault(algorithm_label(run), []).append(setting)
+    differing = {algorithm: differing_names(group) for algorithm, group in members.items()}
     labels = []
-    for run, one in zip(runs, written, strict=True):
+    for run, setting in zip(runs, written, strict=True):
         algorithm = algorithm_label(run)
-        parts = [algorithm, *(f"{name}={one[name]}" for name in differing[algorithm] if name in one)]
+        parts = [algorithm, *(f"{name}={setting[name]}" for name in differing[algorithm] if name in setting)]
         labels.append(shortened(", ".join(parts)))
     return labels
 
 
 def differing_names(settings: Sequence[Mapping[str, str]]) -> list[str]:
     """Returns the names whose values are not all the same."""
-    names = sorted({name for one in settings for name in one})
-    return [name for name in names if len({one.get(name, "") for one in settings}) > 1]
+    names = sorted({name for setting in settings for name in setting})
+    return [name for name in names if len({setting.get(name, "") for setting in settings}) > 1]
 
 
 def algorithm_label(run: RunSummary) -> str:
@@ -123,8 +123,8 @@ class Curve:
         else:  # of a run that is in progress or crashed only the means are known
             x = run.metrics.column("step" if axis == "steps" else "time/time_elapsed")
             y = run.metrics.column("rollout/ep_rew_mean")
-        known = np.isfinite(x) & (np.abs(y) < HUGE)
-        x, y = x[known], y[known]
+        finite = np.isfinite(x) & (np.abs(y) < HUGE)
+        x, y = x[finite], y[finite]
         if not len(x) or x[-1] <= 0:
             return cls(run, x[:0], y[:0], f"{name} has no episode yet and is left out")
         if (np.diff(x) < 0).any():  # time that was set back
@@ -165,18 +165,18 @@ class Curve:
 
 def cut_to_shortest(curves: list[Curve], axis: Axis, notes: list[str]) -> None:
     """Cuts the curves of each environment to the shortest of them, and notes it if they differ by more than a tenth."""
-    for env, group in itertools.groupby(sorted(curves, key=lambda one: one.env), key=lambda one: one.env):
+    for env, group in itertools.groupby(sorted(curves, key=lambda curve: curve.env), key=lambda curve: curve.env):
         members = list(group)
-        shortest = min(members, key=lambda one: one.end)
-        longest = max(one.end for one in members)
+        shortest = min(members, key=lambda curve: curve.end)
+        longest = max(curve.end for curve in members)
         if shortest.end < (1 - FINAL) * longest:
             unit = axis if axis == "steps" else "seconds"
             notes.append(
                 f"the runs on {env or 'the environment'} have between {shortest.end:,.0f} and {longest:,.0f} {unit}; all are "
                 f"compared up to those of {shortest.run.name} ({shortest.run.state})"
             )
-        for one in members:
-            one.end = shortest.end
+        for curve in members:
+            curve.end = shortest.end
 
 
 def scale(curves: Sequence[Curve], normalize: str | Mapping[str, tuple[float, float]]) -> None:
@@ -186,23 +186,23 @@ def scale(curves: Sequence[Curve], normalize: str | Mapping[str, tuple[float, fl
         ValueError: if an environment has no reference returns, or they are equal.
     """
     finals: dict[str, list[float]] = {}
-    for one in curves:
-        finals.setdefault(one.env, []).append(one.final())
-    for one in curves:
+    for curve in curves:
+        finals.setdefault(curve.env, []).append(curve.final())
+    for curve in curves:
         if isinstance(normalize, Mapping):
-            if one.env not in normalize:
+            if curve.env not in normalize:
                 raise ValueError(
-                    f"normalize has no reference returns for {one.env!r}; add {{{one.env!r}: (low, high)}}"
+                    f"normalize has no reference returns for {curve.env!r}; add {{{curve.env!r}: (low, high)}}"
                 )
-            low, high = references(one.env, normalize[one.env])
+            low, high = references(curve.env, normalize[curve.env])
         elif normalize == "range":
-            low, high = min(finals[one.env]), max(finals[one.env])
+            low, high = min(finals[curve.env]), max(finals[curve.env])
         else:
             raise ValueError(f"normalize={normalize!r} must be 'range' or a mapping of environments to (low, high)")
         span = (high - low) or 1.0
-        one.y = (one.y - low) / span
-        if one.evaluation is not None:
-            one.evaluation = one.evaluation[0], (one.evaluation[1] - low) / span
+        curve.y = (curve.y - low) / span
+        if curve.evaluation is not None:
+            curve.evaluation = curve.evaluation[0], (curve.evaluation[1] - low) / span
 
 
 def references(env: str, pair: Any) -> tuple[float, float]:

@@ -25,7 +25,9 @@ MONITOR = re.compile(r"(.*\.)?monitor\.csv")
 EVENTS = re.compile(r"events\.out\.tfevents\..+")
 FILES = (MONITOR, EVENTS)
 ZOO_NAME = re.compile(r"(.+-v\d+)_(\d+)")
-ALGORITHMS = {key: one.name for one in CATALOG.values() for key in (one.name.lower(), one.zoo) if key} | {"her": "HER"}
+ALGORITHMS = {key: entry.name for entry in CATALOG.values() for key in (entry.name.lower(), entry.zoo) if key} | {
+    "her": "HER"
+}
 """Algorithms by the names of RL Zoo's folders."""
 MAX_FILES = 4096
 """Upper limit on the files of one run."""
@@ -48,21 +50,21 @@ def read_monitor(path: Path) -> RunSummary:
         ValueError: if no file holds the columns r, l and t.
     """
     notes: list[str] = []
-    parts, starts, env_id = [], [], ""
+    tables, starts, env_id = [], [], ""
     for file in files(path, MONITOR) if path.is_dir() else [path]:
         start, said_env = monitor_header(file)
         table = read_table(file, only=("r", "l", "t", "is_success"), skip_lines=1)
         notes += table.notes
         if {"r", "l", "t"} <= table.columns.keys():
-            parts.append(table)
+            tables.append(table)
             starts.append(start)
             env_id = env_id or said_env
-    if not parts:
+    if not tables:
         raise ValueError(f"{shown(path, 300)} is no monitor.csv of Stable-Baselines3: expected the columns r, l and t")
-    env = np.repeat(np.arange(float(len(parts))), [len(one) for one in parts])
-    began = np.repeat(np.array(starts) - min(starts), [len(one) for one in parts])
+    env = np.repeat(np.arange(float(len(tables))), [*map(len, tables)])
+    began = np.repeat(np.array(starts) - min(starts), [*map(len, tables)])
     names = ("r", "l", "is_success", "t")
-    returns, length, success, time = (np.concatenate([one.column(name) for one in parts]) for name in names)
+    returns, length, success, time = (np.concatenate([table.column(name) for table in tables]) for name in names)
     seconds = time + began
     valid = (length >= 0) & (length <= MAX_STEP)
     if not valid.all():
@@ -74,14 +76,14 @@ def read_monitor(path: Path) -> RunSummary:
     order = order[valid[order]]
     steps = np.cumsum(length[order])
     columns = {"env": env, "return": returns, "length": length, "success": success, "seconds": seconds}
-    table = ordered(Table({"step": steps, **{name: one[order] for name, one in columns.items()}}, tuple(notes)))
+    table = ordered(Table({"step": steps, **{name: column[order] for name, column in columns.items()}}, tuple(notes)))
     folder = path if path.is_dir() else path.parent
-    said = named(folder)
+    algorithm, named_env, number = named(folder)
     return RunSummary(
         path=path.resolve(),
         name=shown(folder.name, MAX_NAME),
         format="monitor",
-        config=RunConfig(env=env_id or said[1], algorithm=said[0], seed=said[2], n_envs=len(parts)),
+        config=RunConfig(env=env_id or named_env, algorithm=algorithm, seed=number, n_envs=len(tables)),
         steps=int(steps[-1]) if len(steps) else 0,
         seconds=float(table.columns["seconds"][-1]) if len(table) else float("nan"),
         episodes=table,
@@ -112,9 +114,9 @@ def named(folder: Path) -> tuple[str, str, int | None]:
     algorithm = ALGORITHMS.get(folder.parent.name.lower(), "")
     numbered = ZOO_NAME.fullmatch(folder.name)
     if numbered is None:  # as Stable-Baselines3 names its TensorBoard folders
-        kind = re.fullmatch(r"([A-Za-z0-9]+)_(\d{1,9})", folder.name)
-        if kind is not None and kind[1].lower() in ALGORITHMS:
-            return ALGORITHMS[kind[1].lower()], "", int(kind[2])
+        match = re.fullmatch(r"([A-Za-z0-9]+)_(\d{1,9})", folder.name)
+        if match is not None and match[1].lower() in ALGORITHMS:
+            return ALGORITHMS[match[1].lower()], "", int(match[2])
         return algorithm, "", None
     return algorithm, shown(numbered[1], MAX_NAME), int(numbered[2][:9])
 
@@ -164,14 +166,14 @@ def take_scalars(file: Path, values: dict[str, dict[int, tuple[float, float]]]) 
     for record in RawEventFileLoader(str(file)).Load():
         yield record
         event = Event.FromString(record)
-        for one in event.summary.value:
-            if one.HasField("simple_value"):
-                value = one.simple_value
-            elif one.metadata.plugin_data.plugin_name == "scalars" and not one.tensor.tensor_shape.dim:
-                value = float(make_ndarray(one.tensor).item())
+        for scalar in event.summary.value:
+            if scalar.HasField("simple_value"):
+                value = scalar.simple_value
+            elif scalar.metadata.plugin_data.plugin_name == "scalars" and not scalar.tensor.tensor_shape.dim:
+                value = float(make_ndarray(scalar.tensor).item())
             else:
                 continue
-            name = shown(one.tag, MAX_NAME)
+            name = shown(scalar.tag, MAX_NAME)
             if name not in values and len(values) == MAX_COLUMNS:
                 continue
             column = values.setdefault(name, {})

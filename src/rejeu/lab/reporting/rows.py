@@ -43,7 +43,7 @@ Row = dict[str, Any]
 class Known:
     """A run as it was read last. Mutable."""
 
-    stamp: Any
+    stamp: object
     row: Row
     run: RunSummary | None
     """Without its tables; None if it could not be read."""
@@ -90,12 +90,12 @@ class Rows:
 
     def summaries(self) -> Mapping[str, RunSummary]:
         """Returns the runs that could be read, without their tables, by the names of their rows."""
-        return {self.name_of(path): one.run for path, one in self._known.items() if one.run is not None}
+        return {self.name_of(path): entry.run for path, entry in self._known.items() if entry.run is not None}
 
     def _update(self, path: Path) -> None:
-        known, began = self._known.get(path), time.monotonic()
-        found = stamp(path)
-        if known is not None and (known.stamp == found or began < known.due):
+        previous, began = self._known.get(path), time.monotonic()
+        current = stamp(path)
+        if previous is not None and (previous.stamp == current or began < previous.due):
             return
         run: RunSummary | None = None
         try:
@@ -107,11 +107,11 @@ class Rows:
         except Exception as error:  # files can hold anything, and one run may not hide the others
             row = {**nothing(path, "damaged"), "notes": (shown(str(error) or repr(error), 300),)}
         now = time.monotonic()
-        self._known[path] = Known(found, row, run, now + min(SHARE * (now - began), LONGEST))
+        self._known[path] = Known(current, row, run, now + min(SHARE * (now - began), LONGEST))
 
 
-def stamp(path: Path) -> Any:
-    """Returns what changes when a run does: times and sizes of its files, and whether a process trains it."""
+def stamp(path: Path) -> object:
+    """Returns a value that changes when a run does: times and sizes of its files, and whether a process trains it."""
     process = has_process(path)
     watched = files(path) if run_list.is_ours(path) else others(path)
     return process, is_recent(path) if process is None else None, *map(time_of, watched)
@@ -126,7 +126,7 @@ def files(path: Path) -> tuple[Path, ...]:
 def others(path: Path) -> Iterator[Path]:
     """Yields a file, or the first files of a folder, of another program's run."""
     with suppress(OSError), os.scandir(path) as inside:
-        yield from (Path(one.path) for one, _ in zip(inside, range(SLICE), strict=False))
+        yield from (Path(entry.path) for entry, _ in zip(inside, range(SLICE), strict=False))
     yield path
 
 
@@ -145,20 +145,20 @@ def nothing(path: Path, state: str) -> Row:
 
 
 def describe(run: RunSummary) -> Row:
-    """Returns what is worth knowing of a run, as plain values."""
+    """Returns the row of a run, as plain values."""
     compiling = run.metrics.column("time/compile_seconds")
     seconds = run.seconds - (float(compiling[-1]) if len(compiling) and np.isfinite(compiling[-1]) else 0.0)
     rates = run.metrics.column("time/fps")
     rates = rates[np.isfinite(rates)]  # without compilation, as training measures it
     rate = float(rates[-1]) if len(rates) else run.steps / seconds if seconds > 0 else math.nan
     config = run.config
-    left = max(config.steps - run.steps, 0) / rate if config.steps and rate else math.nan
+    seconds_left = max(config.steps - run.steps, 0) / rate if config.steps and rate else math.nan
     if config.minutes is not None:
-        left = max(60 * config.minutes - seconds, 0.0)
+        seconds_left = max(60 * config.minutes - seconds, 0.0)
     returns = run.episodes.column("return")[-WINDOW:]
     means = run.metrics.column("rollout/ep_rew_mean")
     folder = RunFolder(run.path)
-    known = returns if len(returns) else means[np.isfinite(means)][-1:]
+    recent = returns if len(returns) else means[np.isfinite(means)][-1:]
     return {
         "path": run.path,
         "name": run.name,
@@ -171,9 +171,9 @@ def describe(run: RunSummary) -> Row:
         "steps_asked": config.steps,
         "seconds": run.seconds,
         "steps_per_second": rate,
-        "seconds_left": left if run.state == "running" else None,
+        "seconds_left": seconds_left if run.state == "running" else None,
         "episodes": len(run.episodes),
-        "mean_return": float(np.mean(known[np.isfinite(known)])) if np.isfinite(known).any() else math.nan,
+        "mean_return": float(np.mean(recent[np.isfinite(recent)])) if np.isfinite(recent).any() else math.nan,
         "best": best_evaluation(run),
         "evaluations": len(run.evaluations),
         "curve": curve(run),
@@ -197,17 +197,16 @@ def best_evaluation(run: RunSummary) -> dict[str, float] | None:
 def curve(run: RunSummary) -> list[float]:
     """Returns the mean returns of up to :data:`POINTS` parts of the training; of a run without episodes, its evaluations."""
     values = run.episodes.column("return") if len(run.episodes) else run.evaluations.column("mean_return")
-    known = values[charts.usable(values)]
-    return (
-        [float(f"{part.mean():.4g}") for part in np.array_split(known, min(POINTS, len(known)))] if len(known) else []
-    )
+    values = values[charts.usable(values)]
+    n = min(POINTS, len(values))
+    return [float(f"{piece.mean():.4g}") for piece in np.array_split(values, n)] if n else []
 
 
 def cells(row: Row) -> dict[str, str]:
     """Returns a row as texts, by the titles of :data:`COLUMNS`."""
     names = (row["run"], row["env"], row["algorithm"], row["state"])
-    own = (steps_text(row), best_text(row), rate_text(row), bars(row["curve"]))
-    return dict(zip(COLUMNS, (shown(text, 300) for text in (*names, *own)), strict=True))
+    numbers = (steps_text(row), best_text(row), rate_text(row), bars(row["curve"]))
+    return dict(zip(COLUMNS, (shown(text, 300) for text in (*names, *numbers)), strict=True))
 
 
 def texts(row: Row) -> list[str]:
@@ -233,9 +232,9 @@ def best_text(row: Row) -> str:
 
 def rate_text(row: Row) -> str:
     """Returns the steps a second, and the time that is left."""
-    rate, left = row["steps_per_second"], row["seconds_left"]
-    rest = f", {left:,.0f} s left" if left is not None and math.isfinite(left) else ""
-    return f"{rate:,.0f}/s{rest}" if math.isfinite(rate) else "-"
+    rate, seconds = row["steps_per_second"], row["seconds_left"]
+    remaining = f", {seconds:,.0f} s left" if seconds is not None and math.isfinite(seconds) else ""
+    return f"{rate:,.0f}/s{remaining}" if math.isfinite(rate) else "-"
 
 
 def bars(values: list[float]) -> str:

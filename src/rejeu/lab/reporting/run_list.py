@@ -56,21 +56,21 @@ def read_all(paths: str | Path | RunSummary | Iterable[str | Path | RunSummary])
         FileNotFoundError: if a path does not exist, or holds no run.
     """
     sources: dict[Any, Path | RunSummary] = {}
-    for one in [paths] if isinstance(paths, str | Path | RunSummary) else paths:
-        if isinstance(one, RunSummary):
-            sources[one] = one
+    for source in [paths] if isinstance(paths, str | Path | RunSummary) else paths:
+        if isinstance(source, RunSummary):
+            sources[source] = source
             continue
-        inside = find(Path(one))
+        inside = find(Path(source))
         if not inside:
             raise FileNotFoundError(
-                f"{shown(one, 300)} holds no run; expected a run folder of rejeu train, a monitor.csv or TensorBoard files"
+                f"{shown(source, 300)} holds no run; expected a run folder of rejeu train, a monitor.csv or TensorBoard files"
             )
         for path in inside:
             sources.setdefault(path.resolve(), path)
     with ThreadPoolExecutor(2) as pool:  # NumPy computes outside of Python's lock
         read = [*pool.map(read_or_note, sources.values())]
-    notes = [one for one in read if isinstance(one, str)]
-    runs = distinct([one for one in read if isinstance(one, RunSummary)])
+    notes = [note for note in read if isinstance(note, str)]
+    runs = distinct([run for run in read if isinstance(run, RunSummary)])
     notes += [f"{run.name}: {note}" for run in runs for note in run.notes if "damaged" in note]
     return runs, notes
 
@@ -102,15 +102,15 @@ def find(path: Path) -> list[Path]:
         return [path]
     if not path.is_dir():
         raise FileNotFoundError(f"there is no run folder {shown(path, 300)}")
-    found: list[Path] = []
-    for root, names, _ in os.walk(path, onerror=lambda error: found.append(Path(error.filename))):
+    runs: list[Path] = []
+    for root, names, _ in os.walk(path, onerror=lambda error: runs.append(Path(error.filename))):
         folder = Path(root)
         if is_run(folder) or not os.access(folder, os.X_OK):
-            found.append(folder)
+            runs.append(folder)
         depth = len(folder.relative_to(path).parts)
-        is_searched = folder not in found[-1:] and depth < MAX_DEPTH and len(found) < MAX_RUNS
+        is_searched = folder not in runs[-1:] and depth < MAX_DEPTH and len(runs) < MAX_RUNS
         names[:] = sorted(name for name in names if name not in SKIPPED and name[0] != ".") if is_searched else []
-    return sorted(found)
+    return sorted(runs)
 
 
 def is_ours(folder: Path) -> bool:
@@ -121,6 +121,6 @@ def is_ours(folder: Path) -> bool:
 def is_run(folder: Path) -> bool:
     """Returns whether a folder is a run of any known program."""
     try:
-        return is_ours(folder) or any(files(folder, kind) for kind in FILES)
+        return is_ours(folder) or any(files(folder, pattern) for pattern in FILES)
     except OSError:
         return False

@@ -16,14 +16,14 @@ from rejeu.lab.studio.state import Studio
 
 def open_form(studio: Studio, name: str, path: Path) -> None:
     """Opens the form over the page of a run; ``name`` is that of its row."""
-    steps = {step_of(one): f"{step_of(one):,}" for one in checkpoint_files(RunFolder(path).checkpoints)}
+    steps = {step_of(file): f"{step_of(file):,}" for file in checkpoint_files(RunFolder(path).checkpoints)}
     with ui.dialog(value=True) as form, ui.card().classes("w-full").style("max-width: 30rem"):
         ui.label("A new run from a checkpoint of this one").classes("text-weight-medium")
         step = ui.select(steps, label="from step", value=next(iter(steps), None)).classes("w-full")
         settings = ui.input("settings that change", placeholder="learning_rate=1e-4 gamma=0.9").classes("w-full")
         more = ui.input("train for so many more steps (empty: to the goal of this run)").classes("w-full")
         folder = ui.input("new folder", value=f"{name}-branch").classes("w-full")
-        said = ui.label().classes("text mono")
+        message = ui.label().classes("text mono")
 
         async def begin() -> None:
             button.disable()
@@ -33,9 +33,9 @@ def open_form(studio: Studio, name: str, path: Path) -> None:
                 words += ["--steps", more.value] if more.value else []
                 words += ["--set", *shlex.split(settings.value)] if settings.value else []
                 parsing.parse(words, {"branch": Branch}, {}, "")
-                said.text = await lead_to(studio, words, out)
+                message.text = await lead_to(studio, words, out)
             except (ValueError, OSError) as error:
-                said.text = str(error)
+                message.text = str(error)
             button.enable()
 
         with ui.row():
@@ -43,4 +43,4 @@ def open_form(studio: Studio, name: str, path: Path) -> None:
             ui.button("Cancel", on_click=form.delete).props("flat no-caps")
         if not steps:
             button.disable()
-            said.text = "This run has no checkpoint yet."
+            message.text = "This run has no checkpoint yet."

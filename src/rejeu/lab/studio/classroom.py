@@ -61,33 +61,33 @@ def build(studio: Studio, request: Request) -> None:
     is_large = "projector" in asked
     say = partial(said, language=language)
     ui.query("body").classes("projector" if is_large else "")
-    other: Language = "en" if language == "fr" else "fr"
+    alternative: Language = "en" if language == "fr" else "fr"
     large = {} if is_large else {"projector": "1"}
     with ui.row().classes("items-center w-full"):
         title = ui.label().classes("text-h5 title")
         ui.space()
-        ui.link(say("français"), address("/class", language=other, **({} if large else {"projector": "1"})))
+        ui.link(say("français"), address("/class", language=alternative, **({} if large else {"projector": "1"})))
         ui.link(say("projector"), address("/class", language=language, **large))
     table = ui.table(rows=[], columns=columns(leaderboard.columns(language)), row_key="name", pagination=0)
     table.classes("w-full class").props("flat bordered dense hide-pagination")
     for name, template in SLOTS.items():
         table.add_slot(f"body-cell-{name}", template)
     notes = ui.label().classes("text quiet")
-    seen: Any = None
+    previous: object = None
 
     def look() -> None:
-        nonlocal seen
+        nonlocal previous
         judging.look()
         now = judging.version, judging.now, judging.problem, studio.version
-        if now == seen:
+        if now == previous:
             return
-        seen = now
+        previous = now
         board = judging.board(language)
         title.text = say("Leaderboard: {}", board.env_id)
         table.rows = [*lines(studio, judging, board)]
         doing = say("evaluating {} ...", judging.now) if judging.now else ""
-        about = f"{say(leaderboard.EPISODES, board.episodes)}. {say(PLACES)}" if board.rows else ""
-        notes.text = "\n".join(filter(None, (doing, judging.problem, about, *leaderboard.notes(board))))
+        explanation = f"{say(leaderboard.EPISODES, board.episodes)}. {say(PLACES)}" if board.rows else ""
+        notes.text = "\n".join(filter(None, (doing, judging.problem, explanation, *leaderboard.notes(board))))
 
     look()
     ui.timer(EVERY, look)
@@ -95,8 +95,8 @@ def build(studio: Studio, request: Request) -> None:
 
 def columns(titles: list[str]) -> list[dict[str, Any]]:
     """Returns the columns of the table."""
-    named = [*zip(NAMES, titles, strict=True)]
-    named.insert(NAMES.index("interval") + 1, ("bar", ""))
+    pairs = [*zip(NAMES, titles, strict=True)]
+    pairs.insert(NAMES.index("interval") + 1, ("bar", ""))
     return [
         {
             "name": name,
@@ -106,7 +106,7 @@ def columns(titles: list[str]) -> list[dict[str, Any]]:
             "classes": LEFT_OUT.get(name, ""),
             "headerClasses": LEFT_OUT.get(name, ""),
         }
-        for name, title in named
+        for name, title in pairs
     ]
 
 
@@ -115,17 +115,17 @@ def lines(studio: Studio, judging: Judging, board: Leaderboard) -> list[dict[str
     ends = [end for row in board.rows for end in row.interval] or [0.0]
     scale = 100 / max(max(ends) - min(ends), 1e-9)
     running = {row["run"]: progress(row, board.language) for row in studio.rows if row["state"] == "running"}
-    found: list[dict[str, Any]] = []
+    ranked: list[dict[str, Any]] = []
     for row in board.rows:
         low, high = ((end - min(ends)) * scale for end in row.interval)
         path = judging.path_of(row.name)
-        found.append(
+        ranked.append(
             dict(zip(NAMES, leaderboard.cells_of(row, board.language), strict=True))
             | {"low": low, "width": high - low, "middle": (row.evaluation.mean_return - min(ends)) * scale - 1}
             | {"training": running.pop(row.name, ""), "watch": said("watch", language=board.language)}
             | {"link": path and address("/play", agent=path.as_posix(), watch="1")}
         )
-    return [*found, *({"name": name, "training": steps} for name, steps in running.items())]
+    return [*ranked, *({"name": name, "training": steps} for name, steps in running.items())]
 
 
 def progress(row: Row, language: Language) -> str:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from fastapi import Request
 from nicegui import ui
@@ -25,7 +24,7 @@ CHOICES: dict[str, dict[str | None, str]] = {
     "statistic": {"iqm": "interquartile mean", "mean": "mean", "median": "median"},
     "normalize": {None: "returns", "range": "scaled to the range"},
 }
-"""What people choose of the arguments of a comparison, the default first."""
+"""Arguments of a comparison that people choose, the default first."""
 BETTER = ("group", "better than", "environment", "probability (95 % interval)")
 
 
@@ -33,37 +32,34 @@ def build(studio: Studio, request: Request) -> None:
     """Makes the page of the runs that its address names as ``run``; of all that could be read, if it names none."""
     for theme, colors in zip((":root", ".body--dark"), zip(*GROUP_COLORS, strict=True), strict=True):
         ui.add_css(f"{theme} {{ {''.join(f'--group{i}: {color};' for i, color in enumerate(colors))} }}")
-    ui.add_css(
-        ".charts { display: grid; gap: 16px; grid-template-columns: repeat(auto-fit, minmax(min(100%, 480px), 1fr)); }"
-    )
-    named = request.query_params.getlist("run")
+    runs = request.query_params.getlist("run")
     with ui.row().classes("items-center w-full gap-2"):
         controls = {name: ui.select(names, value=next(iter(names))) for name, names in CHOICES.items()}
     status = ui.label().classes("text")
-    place = ui.column().classes("w-full gap-4")
-    seen: Any = None
+    results = ui.column().classes("w-full gap-4")
+    previous: object = None
 
     async def look() -> None:
-        nonlocal seen
+        nonlocal previous
         rows = [
-            row for row in studio.rows if row["run"] in named or (not named and row["state"] not in ("damaged", "gone"))
+            row for row in studio.rows if row["run"] in runs or (not runs and row["state"] not in ("damaged", "gone"))
         ]
         settings = {name: control.value for name, control in controls.items()}
         state = [(row["run"], row["changed"]) for row in rows], settings
-        if state == seen or not (studio.version or named):
+        if state == previous or not (studio.version or runs):
             return
-        seen = state
+        previous = state
         status.text = f"comparing {len(rows)} runs ..."
         try:
-            found = await asyncio.to_thread(compare, [Path(row["path"]) for row in rows], **settings)
+            comparison = await asyncio.to_thread(compare, [Path(row["path"]) for row in rows], **settings)
         except expected_errors() as error:
-            place.clear()
+            results.clear()
             status.text = one_line(error)
         else:
-            status.text = "\n".join(found.notes)
-            place.clear()
-            with place:
-                show(found)
+            status.text = "\n".join(comparison.notes)
+            results.clear()
+            with results:
+                show(comparison)
 
     for name, control in controls.items():
         control.props(f"dense outlined options-dense aria-label={name}")
@@ -80,13 +76,13 @@ def show(comparison: Comparison) -> None:
     )
     with ui.element("div").classes("w-full charts"):
         for env in dict.fromkeys(group.env_id for group in comparison.groups):
-            for kind, title in (("curve", "returns"), ("profile", "performance profile")):
+            for form, title in (("curve", "returns"), ("profile", "performance profile")):
                 with ui.column().classes("gap-0"):
                     ui.label(f"{env or 'unknown environment'}: {title}")
-                    Figure(group_chart(kind, comparison, env), "300px")
+                    Figure(group_chart(form, comparison, env), "300px")
     if comparison.improvements:
         ui.label("Probability that a run of the group has a higher final score than a run of the other")
-        table(BETTER, [one.cells for one in comparison.improvements[:MAX_LISTED]])
+        table(BETTER, [improvement.cells for improvement in comparison.improvements[:MAX_LISTED]])
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:

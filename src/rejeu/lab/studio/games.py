@@ -14,9 +14,8 @@ from rejeu.agents import load
 from rejeu.checkpoints.run_folder import dated, find_model
 from rejeu.core.errors import one_line
 from rejeu.core.language import said
-from rejeu.lab.runs import environment
 from rejeu.lab.runs.config import RunConfig
-from rejeu.lab.runs.environment import Environment
+from rejeu.lab.runs.environment import Environment, environment_of, from_run
 from rejeu.lab.studio.state import Studio
 from rejeu.teaching.play import Opened, opened
 from rejeu.teaching.play.game import Event, Game, Player
@@ -48,15 +47,16 @@ class Wanted(NamedTuple):
         if not self.agents and not self.by_hand:
             raise ValueError("nobody plays; choose an agent, or play yourself")
         players = {name: find_agent(studio, name) for name in self.agents}
-        made = next((one for _, one in players.values()), None)
-        if made is None:
-            made = environment.from_run(RunConfig(env=full_name(self.env)), "the address", studio.typed(self.env))
-        for name, (_, own) in players.items():
-            if own.env_id != (self.env or made.env_id):
-                raise ValueError(f"{name} plays {own.env_id}, not {self.env or made.env_id}")
+        environment = next((env for _, env in players.values()), None)
+        if environment is None:
+            environment = from_run(RunConfig(env=full_name(self.env)), "the address", studio.typed(self.env))
+        env_id = self.env or environment.env_id
+        for name, (_, env) in players.items():
+            if env.env_id != env_id:
+                raise ValueError(f"{name} plays {env.env_id}, not {env_id}")
         agents = {name: load(model, device="cpu") for name, (model, _) in players.items()}
-        folder = studio.below(f"played/{dated(made.env_id).name}") if self.record and self.by_hand else None
-        return opened(made.make, agents, self.by_hand, seed=self.seed, record=folder, has_video=False)
+        folder = studio.below(f"played/{dated(environment.env_id).name}") if self.record and self.by_hand else None
+        return opened(environment.make, agents, self.by_hand, seed=self.seed, record=folder, has_video=False)
 
 
 def find_agent(studio: Studio, name: str) -> tuple[Path, Environment]:
@@ -69,7 +69,7 @@ def find_agent(studio: Studio, name: str) -> tuple[Path, Environment]:
     if name in studio.guests:
         return studio.guests[name]
     model = find_model(studio.below(name))
-    return model, environment.environment_of(model, studio.given(name))
+    return model, environment_of(model, studio.given(name))
 
 
 class HostedGame:
@@ -84,7 +84,7 @@ class HostedGame:
         self.opened: Opened | None = None
         """None until it has begun."""
         self.said = ""
-        """What there is to say at the end: an error, or what was recorded."""
+        """Message at the end: an error, or the recording."""
         self.ended = False
         self._start, self._show = start, show
         self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
@@ -95,50 +95,45 @@ class HostedGame:
         """Passes an event to the game."""
         self._events.put(event)
 
-    def handle_all(self, kind: str, keys: Sequence[str]) -> None:
+    def handle_all(self, event_type: str, keys: Sequence[str]) -> None:
         """Passes events of the same kind of several keys."""
         for key in keys:
-            self.handle(Event(kind, key))
+            self.handle(Event(event_type, key))
 
     def _run(self) -> None:
         try:
-            with self._start() as made:
-                made.begin()
-                self.opened = made
-                self._play(made)
-                recording = made.game.players[0].recording
+            with self._start() as opened:
+                opened.begin()
+                self.opened = opened
+                self._play(opened)
+                recording = opened.game.players[0].recording
             self.said = "" if recording is None else str(recording)
         except Exception as error:  # the environment can raise anything
             self.said = one_line(error)
         finally:
             self.ended = True
 
-    def _play(self, made: Opened) -> None:
-        game, drawn, due = made.game, None, time.perf_counter()
+    def _play(self, opened: Opened) -> None:
+        game, drawn, due = opened.game, None, time.perf_counter()
         while not game.closed:
-            self._take_events(game, due, at_once=made.fps < SLOW)
+            self._take_events(game, due, at_once=opened.fps < SLOW)
             game.tick()
-            now = (
-                self._presses,
-                game.seed,
-                game.phase,
-                game.paused,
-                *((one.steps, len(one.scores)) for one in game.players),
-            )
+            progress = [(player.steps, len(player.scores)) for player in game.players]
+            now = self._presses, game.seed, game.phase, game.paused, progress
             if now != drawn:
                 drawn = now
                 pictures = [player.frame for player in game.players]
                 self._show(pictures, [caption(game, player) for player in game.players], self._presses)
             at = time.perf_counter()
-            due = max(min(due, at) + 1 / made.fps, at)  # a step that took too long is not caught up
+            due = max(min(due, at) + 1 / opened.fps, at)  # a step that took too long is not caught up
 
     def _take_events(self, game: Game, due: float, at_once: bool) -> None:
         """Handles events until the next step is due, or until a key is pressed that acts at once."""
         is_due = False
         while not is_due:
             try:
-                left = due - time.perf_counter()
-                event = self._events.get(timeout=left) if left > 0 else self._events.get_nowait()
+                timeout = due - time.perf_counter()
+                event = self._events.get(timeout=timeout) if timeout > 0 else self._events.get_nowait()
             except queue.Empty:
                 return
             game.handle(event)

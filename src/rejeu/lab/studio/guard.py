@@ -63,11 +63,11 @@ class Guard:
 
     def welcome(self, asked: HTTPConnection) -> RedirectResponse:
         """Returns the answer that sets the cookie and leads to the same page without the token in its address."""
-        rest = urlencode([pair for pair in parse_qsl(asked.url.query) if pair[0] != "token"])
+        query = urlencode([pair for pair in parse_qsl(asked.url.query) if pair[0] != "token"])
         path = "/" + asked.url.path.lstrip("/\\")  # two at the beginning would lead to another host
-        answer = RedirectResponse(path + (f"?{rest}" if rest else ""), 303)
-        answer.set_cookie(self.cookie, self.token, httponly=True, samesite="lax")
-        return answer
+        response = RedirectResponse(path + (f"?{query}" if query else ""), 303)
+        response.set_cookie(self.cookie, self.token, httponly=True, samesite="lax")
+        return response
 
 
 async def refuse(scope: Any, receive: Any, send: Any, text: str) -> None:

@@ -11,8 +11,8 @@ from typing import Any
 from rejeu.core.errors import one_line
 from rejeu.core.language import Language
 from rejeu.lab.reporting.rows import time_of
-from rejeu.lab.runs import environment
 from rejeu.lab.runs.config import RunConfig
+from rejeu.lab.runs.environment import from_run
 from rejeu.lab.studio.state import Studio
 from rejeu.teaching.courses import leaderboard
 from rejeu.teaching.courses.leaderboard import Entrant, Leaderboard, Unranked
@@ -57,7 +57,7 @@ class Judging:
     def path_of(self, name: str) -> Path | None:
         """Returns the path below the folder of a model on the leaderboard: a file, or the folder of a run."""
         paths = sorted(self._results)
-        path = next((one for one in paths if leaderboard.name_of(one, self.folder, paths) == name), None)
+        path = next((path for path in paths if leaderboard.name_of(path, self.folder, paths) == name), None)
         if path is None:
             return None
         return (path.parent if leaderboard.is_of_run(path) else path).relative_to(self.folder)
@@ -81,8 +81,8 @@ class Judging:
         if not due:
             return
         self._env_id = leaderboard.usual_env_id(paths)
-        made = environment.from_run(RunConfig(env=self._env_id), self.folder, self.studio.typed(self._env_id))
-        with closing(made.vector(EPISODES, "gymnasium", SEED)) as env:
+        environment = from_run(RunConfig(env=self._env_id), self.folder, self.studio.typed(self._env_id))
+        with closing(environment.vector(EPISODES, "gymnasium", SEED)) as env:
             for path in due:
                 if time.monotonic() >= self._until:
                     break
@@ -95,5 +95,5 @@ class Judging:
         self.now = ""
 
     def _is_due(self, path: Path) -> bool:
-        found, when = self._stamps.get(path, (None, -AGAIN))
-        return time_of(path) != found and time.monotonic() - when > AGAIN
+        stamp, when = self._stamps.get(path, (None, -AGAIN))
+        return time_of(path) != stamp and time.monotonic() - when > AGAIN

@@ -1,4 +1,4 @@
-"""What all pages share: the frame with the navigation, and elements that are refreshed.
+"""Elements of all pages: the frame with the navigation, and elements that are refreshed.
 
 Texts of runs go into ``ui.label``, ``ui.table``, ``ui.select`` and the like, which show them as text. Nothing of a run goes
 into ``ui.html``, ``ui.markdown``, ``ui.code``, the slots of a table as HTML, or a script.
@@ -82,12 +82,12 @@ def action(text: str, icon: str | None, on_click: Callable[..., object]) -> ui.b
 
 def follow(studio: Studio, show: Callable[[], object], every: float = EVERY) -> None:
     """Calls a function now, and again whenever the rows of the studio have changed, as long as the page is open."""
-    seen = -1
+    version = -1
 
     def look() -> None:
-        nonlocal seen
-        if seen != studio.version:
-            seen = studio.version
+        nonlocal version
+        if version != studio.version:
+            version = studio.version
             show()
 
     look()

@@ -39,35 +39,35 @@ LOOK = 0.5
 NAME = re.compile(r"(?!(con|prn|aux|nul|com\d|lpt\d)(\.|$))[\w(][\w .,()+=@-]*(?<![ .])", re.IGNORECASE)
 """Names of folders that every system takes."""
 Texts = Mapping[str, Any]
-"""What stands in the form: texts, and of flags whether they are set, by field."""
+"""Content of the form: texts, and of flags whether they are set, by field."""
 
 
 def build(studio: Studio, request: Request) -> None:
     """Makes the form."""
     docs, lists = field_docs(Train), {topic: [] for topic in Topic}  # type: dict[str, str], dict[Topic, list[Option]]
-    for one in options(Train):
-        if one.field not in LEFT_OUT:
-            lists[one.group].append(one)
+    for option in options(Train):
+        if option.field not in LEFT_OUT:
+            lists[option.group].append(option)
     fields: dict[str, Any] = {}
     for topic, listed in lists.items():
-        place = ui.element("div") if topic is Topic.FIRST else ui.expansion(topic.capitalize()).classes("w-full")
-        with place.classes("w-full"), ui.element("div").classes("charts w-full"):
-            fields |= {one.field: make_field(one, docs.get(one.field, one.shown.help)) for one in listed}
+        container = ui.element("div") if topic is Topic.FIRST else ui.expansion(topic.capitalize()).classes("w-full")
+        with container.classes("w-full"), ui.element("div").classes("charts w-full"):
+            fields |= {option.field: make_field(option, docs.get(option.field, option.shown.help)) for option in listed}
     fields["env"].value = prefilled(request)
     with ui.row().classes("items-center"):
         button = ui.button("Start", icon="play_arrow").props("no-caps")
         spinner = ui.spinner()
         spinner.set_visibility(False)
-    said = ui.label().classes("text mono")
+    message = ui.label().classes("text mono")
 
     async def begin() -> None:
         button.disable()
         spinner.set_visibility(True)
-        said.text, button.text = "", "Starting ..."
+        message.text, button.text = "", "Starting ..."
         try:
-            said.text = await start(studio, {name: one.value for name, one in fields.items()}, said.set_text)
+            message.text = await start(studio, {name: field.value for name, field in fields.items()}, message.set_text)
         except (ValueError, OSError) as error:
-            said.text = str(error)
+            message.text = str(error)
         button.text = "Start"
         button.enable()
         spinner.set_visibility(False)
@@ -81,32 +81,32 @@ def prefilled(request: Request) -> str | None:
     return env_id if is_plain_id(env_id) else None
 
 
-def make_field(option: Option, about: str) -> Any:
+def make_field(option: Option, doc: str) -> Any:
     """Returns the element in which an option is entered."""
     label = LABELS.get(option.field, option.name.removeprefix("--").replace("-", " ").lower())
     if option.type is bool:
-        made: Any = ui.switch(label)
+        element: Any = ui.switch(label)
     elif option.field == "env":
         names = sorted({preset.env_id for preset in presets.every()})
-        made = ui.select(names, label="environment", with_input=True, new_value_mode="add-unique")
+        element = ui.select(names, label="environment", with_input=True, new_value_mode="add-unique")
     elif option.field == "algorithm":
-        made = ui.select(sorted(AGENTS), label="algorithm", with_input=True, clearable=True)
+        element = ui.select(sorted(AGENTS), label="algorithm", with_input=True, clearable=True)
     elif get_origin(option.type) is Literal:
-        made = ui.select([*get_args(option.type)], label=label, clearable=True)
+        element = ui.select([*get_args(option.type)], label=label, clearable=True)
     else:
-        made = ui.input(label, validation=lambda text: problem_of(option, text))
+        element = ui.input(label, validation=lambda text: problem_of(option, text))
     if option.type is not bool:
-        made.props("dense outlined stack-label bottom-slots hide-bottom-space").props.update(hint=in_form(about))
-    return made
+        element.props("dense outlined stack-label bottom-slots hide-bottom-space").props.update(hint=in_form(doc))
+    return element
 
 
-def in_form(about: str) -> str:
+def in_form(doc: str) -> str:
     """Returns the help of an option in the words of the form.
 
     >>> in_form("With --backend ray: one module; repeat for several.")
     'With backend ray: one module; several with spaces between them.'
     """
-    return re.sub(r"--(?=\w)", "", about).replace("repeat for several", "several with spaces between them")
+    return re.sub(r"--(?=\w)", "", doc).replace("repeat for several", "several with spaces between them")
 
 
 def problem_of(option: Option, text: str | None) -> str | None:
@@ -118,23 +118,23 @@ def problem_of(option: Option, text: str | None) -> str | None:
     return None
 
 
-def words_of(option: Option, given: Any) -> list[str]:
+def words_of(option: Option, value: Any) -> list[str]:
     """Returns an option as words of a command line, none if nothing was entered.
 
     Raises:
         ValueError: if it is not what the option takes.
     """
-    if given in (None, "", False):
+    if value in (None, "", False):
         return []
     name = [] if option.shown.is_positional else [option.name]
     if option.type is bool:
         return name
-    words = shlex.split(str(given)) if option.type in (dict, tuple) else [str(given).strip()]
+    words = shlex.split(str(value)) if option.type in (dict, tuple) else [str(value).strip()]
     if option.type not in (dict, tuple):
         parsing.read(option, words[0])
     if option.takes_many or option.type is dict:
         return [*name, *words]
-    return [part for word in words for part in (*name, word)]
+    return [text for word in words for text in (*name, word)]
 
 
 def command(texts: Texts, studio: Studio) -> tuple[list[str], Train]:
@@ -145,33 +145,33 @@ def command(texts: Texts, studio: Studio) -> tuple[list[str], Train]:
     """
     if not texts.get("env"):
         raise ValueError("choose an environment")
-    named = str(texts.get("out") or dated(texts["env"], texts.get("algorithm")).name[-150:].lstrip("-. "))
-    given = {**texts, "out": str(new_folder(studio, named))}
-    words = [word for one in options(Train) for word in words_of(one, given.get(one.field))]
+    folder = str(texts.get("out") or dated(texts["env"], texts.get("algorithm")).name[-150:].lstrip("-. "))
+    values = {**texts, "out": str(new_folder(studio, folder))}
+    words = [word for option in options(Train) for word in words_of(option, values.get(option.field))]
     words += [word for name in studio.imports for word in ("--import", name)]
     _, arguments = parsing.parse(["train", *words], {"train": Train}, {}, "")
     check_options(arguments)
     return ["train", *words], arguments
 
 
-def new_folder(studio: Studio, named: str) -> Path:
+def new_folder(studio: Studio, name: str) -> Path:
     """Returns the path of a folder for a new run, which is then found below the folder of the studio, on every system.
 
     Raises:
         ValueError: if it exists, or no run can be there.
     """
-    path = studio.below(named)
-    parts = path.relative_to(studio.folder).parts
-    is_valid = parts and all(NAME.fullmatch(part) and len(os.fsencode(part)) <= MAX_NAME for part in parts)
-    if not is_valid or len(parts) >= MAX_DEPTH or SKIPPED & {*parts}:
+    path = studio.below(name)
+    folders = path.relative_to(studio.folder).parts
+    is_valid = folders and all(NAME.fullmatch(folder) and len(os.fsencode(folder)) <= MAX_NAME for folder in folders)
+    if not is_valid or len(folders) >= MAX_DEPTH or SKIPPED & {*folders}:
         raise ValueError(
-            f"folder {shown(named)!r} must be a name such as sac-1 or group/sac-1: letters, digits, spaces and ._-()+=@, the "
+            f"folder {shown(name)!r} must be a name such as sac-1 or group/sac-1: letters, digits, spaces and ._-()+=@, the "
             f"first one a letter or a digit, the last one no dot or space, {MAX_NAME} bytes at most, and none that Windows "
             "or runs reserve, such as con and videos"
         )
-    for one in path.parents[: len(parts)]:
-        if is_run(one) or (one.exists() and not one.is_dir()):
-            raise ValueError(f"folder {named!r} would be in {one}, which is a run or a file; name another")
+    for parent in path.parents[: len(folders)]:
+        if is_run(parent) or (parent.exists() and not parent.is_dir()):
+            raise ValueError(f"folder {name!r} would be in {parent}, which is a run or a file; name another")
     check_new(path)
     return path
 

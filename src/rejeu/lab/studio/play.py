@@ -31,25 +31,25 @@ def build(studio: Studio, request: Request) -> None:
     """
     ui.add_css(CSS)
     asked = request.query_params
-    named = asked.getlist("agent")[:MOST_AGENTS]
-    first = studio.row(named[0]) if named else None
-    chosen = asked.get("env") or (first["env"] if first is not None else None)
+    names = asked.getlist("agent")[:MOST_AGENTS]
+    first = studio.row(names[0]) if names else None
+    env_id = asked.get("env") or (first["env"] if first is not None else None)
     seed = asked.get("seed", "")
     with ui.row().classes("items-center w-full"):
         env = ui.select(
-            environments(studio, chosen),
+            environments(studio, env_id),
             label="environment",
-            value=chosen,
+            value=env_id,
             with_input=True,
             new_value_mode="add-unique",
         ).classes("w-64")
-        agents = ui.select(offered(studio, chosen, named), label="agents", value=named, multiple=True).classes("w-64")
+        agents = ui.select(offered(studio, env_id, names), label="agents", value=names, multiple=True).classes("w-64")
         agents.props(f"use-chips max-values={MOST_AGENTS}")
         by_hand = ui.switch("I play", value="watch" not in asked)
         record = ui.switch("record").bind_enabled_from(by_hand, "value")
         number = ui.number("seed", value=int(seed) if seed.isdecimal() else None, min=0, precision=0).classes("w-20")
         start = ui.button("Start", icon="play_arrow").props("no-caps")
-    place = ui.column().classes("w-full")
+    stage = ui.column().classes("w-full")
 
     def start_anew() -> None:
         seed = "" if number.value is None else str(int(number.value))
@@ -60,8 +60,8 @@ def build(studio: Studio, request: Request) -> None:
     def begin() -> None:
         from_seed = None if number.value is None else int(number.value)
         wanted = Wanted(env.value or "", tuple(agents.value), bool(by_hand.value), from_seed, bool(record.value))
-        place.clear()  # the screen of an earlier game ends it
-        with place:
+        stage.clear()  # the screen of an earlier game ends it
+        with stage:
             show(studio, wanted, offer)
 
     def offer(env_id: str | None = None) -> None:
@@ -76,20 +76,20 @@ def build(studio: Studio, request: Request) -> None:
     env.on_value_change(lambda: offer())
     follow(studio, offer)
     start.on_click(start_anew)
-    if chosen or named:
+    if env_id or names:
         begin()
 
 
-def environments(studio: Studio, chosen: str | None) -> list[str]:
+def environments(studio: Studio, selected: str | None) -> list[str]:
     """Returns the ids of environments with presets, with keys, and of the runs, and the one that is chosen."""
-    own = [*(one.env_id for one in presets.every()), *(row["env"] for row in studio.rows), chosen]
-    return sorted({*KNOWN, *filter(None, own)})
+    ids = [*(preset.env_id for preset in presets.every()), *(row["env"] for row in studio.rows), selected]
+    return sorted({*KNOWN, *filter(None, ids)})
 
 
-def offered(studio: Studio, env_id: str | None, chosen: list[str]) -> list[str]:
+def offered(studio: Studio, env_id: str | None, selected: list[str]) -> list[str]:
     """Returns the names of the agents that play an environment, and of those that are chosen."""
     runs = [row["run"] for row in studio.rows if row["env"] == env_id]
-    return [*dict.fromkeys([*chosen, *studio.guests, *runs])]
+    return [*dict.fromkeys([*selected, *studio.guests, *runs])]
 
 
 def show(studio: Studio, wanted: Wanted, begun: Callable[[str], object]) -> None:
@@ -120,8 +120,8 @@ def show_keys(playing: HostedGame, keys: KeyMap | None) -> None:
     for entry in entries:
         for text, _ in entry.keys:
             button = ui.button(text).props(CHIP).style("touch-action: none")
-            for name, kind in (("pointerdown", "press"), ("pointerup", "release"), ("pointerleave", "release")):
-                button.on(name, partial(playing.handle_all, kind, text.split("+")))
+            for name, event_type in (("pointerdown", "press"), ("pointerup", "release"), ("pointerleave", "release")):
+                button.on(name, partial(playing.handle_all, event_type, text.split("+")))
         ui.label(entry.label).classes("q-mr-sm text-caption")
     for key, label in HELP:
         ui.button(key, on_click=partial(playing.handle_all, "press", [key])).props(CHIP)

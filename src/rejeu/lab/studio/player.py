@@ -73,12 +73,12 @@ class LivePlayer:
 
     Args:
         folder: of the run.
-        given: what the command line says of environments.
+        options: of the command line, about environments.
         show: called with the pictures and captions of each step.
     """
 
-    def __init__(self, folder: Path, given: RunOptions, show: Callable[..., object]) -> None:
-        self.folder, self.given, self.show = RunFolder(folder), given, show
+    def __init__(self, folder: Path, options: RunOptions, show: Callable[..., object]) -> None:
+        self.folder, self.options, self.show = RunFolder(folder), options, show
         self.episode: LiveEpisode | None = None
         """The episode that is played, or was played last."""
         self.complete: LiveEpisode | None = None
@@ -112,8 +112,8 @@ class LivePlayer:
         while not self._closed.is_set():
             self._changed.clear()
             try:
-                made = from_run(read_folder(self.folder), self.folder.path, self.given)
-                with closing(made.rendering()) as env:
+                environment = from_run(read_folder(self.folder), self.folder.path, self.options)
+                with closing(environment.rendering()) as env:
                     self._act(env)
             except Exception as error:  # the environment can raise anything
                 self.problem = one_line(error)
@@ -187,10 +187,10 @@ class LivePlayer:
             FileNotFoundError: if there is none yet.
         """
         folder = self.folder
-        kept = requests.models(folder.models)
-        named = [path for path in kept if path.stem == self.model]
-        chosen = {CURRENT: (folder.live, folder.agent, *kept[-1:], folder.best), BEST: (folder.best, folder.agent)}
-        for path in chosen.get(self.model, named):
+        models = requests.models(folder.models)
+        matching = [path for path in models if path.stem == self.model]
+        files = {CURRENT: (folder.live, folder.agent, *models[-1:], folder.best), BEST: (folder.best, folder.agent)}
+        for path in files.get(self.model, matching):
             if path.is_file():
                 return path
         if has_process(folder.path) is False or not is_recent(folder.path):

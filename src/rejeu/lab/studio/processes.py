@@ -32,7 +32,7 @@ def start(words: Sequence[str], run: Path) -> subprocess.Popen[bytes]:
         ValueError: if the same command is under way.
     """
     key = words[0].replace("branch", "train"), os.path.normcase(run)
-    if (known := STARTED.get(key)) is not None and known.poll() is None:
+    if (running := STARTED.get(key)) is not None and running.poll() is None:
         raise ValueError(f"rejeu {words[0]} is under way for {run.name}; wait until it has ended")
     log = log_of(run)
     atomic.check_no_link(log.parent)

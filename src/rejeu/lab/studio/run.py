@@ -51,13 +51,13 @@ def build(studio: Studio, request: Request) -> None:
     name = request.query_params.get("run", "")
     row = studio.row(name)
     if row is None or row["state"] == "unread":
-        said = ui.label().classes("text")
+        message = ui.label().classes("text")
 
         def look() -> None:
             row = studio.row(name)
             is_missing = studio.version and row is None
             text = "there is no run of this name below the folder" if is_missing else "reading the folder"
-            said.text = f"{text}: {name}"
+            message.text = f"{text}: {name}"
             if row is not None and row["state"] != "unread":
                 ui.navigate.reload()
 
@@ -74,8 +74,8 @@ class RunPage:
     def __init__(self, studio: Studio, name: str, path: Path) -> None:
         self.studio, self.name, self.path = studio, name, path
         self.figures: dict[str, Figure] = {}
-        self.places: dict[str, Any] = {}
-        self.seen: Row | None = None
+        self.grids: dict[str, ui.element] = {}
+        self.row: Row | None = None
         self.due = 0.0
         self.is_ours = name in studio.summaries and is_file(RunFolder(path).config)
         self.head = Head(self)
@@ -99,9 +99,9 @@ class RunPage:
     async def look(self) -> None:
         """Shows the run again if it has changed."""
         row = self.studio.row(self.name)
-        if row is None or row == self.seen or time.monotonic() < self.due:
+        if row is None or row == self.row or time.monotonic() < self.due:
             return
-        began, self.seen = time.monotonic(), row
+        began, self.row = time.monotonic(), row
         parts = None
         try:
             if self.name in self.studio.summaries:  # else its row says why it cannot be read
@@ -113,37 +113,35 @@ class RunPage:
 
     def show(self, row: Row, parts: sections.Parts | None) -> None:
         """Shows what was read."""
-        about = parts.runs[0] if parts is not None else {"warnings": row["warnings"], "notes": row["notes"]}
-        self.head.show(row, about)
+        self.head.show(row, None if parts is None else parts.runs[0])
         if parts is None:
             return
+        section = parts.runs[0]
         self.tiles.clear()
         with self.tiles:
-            for tile in about["tiles"]:
+            for tile in section.tiles:
                 show_tile(tile)
-        self.show_charts(about["groups"], parts.data["charts"])
+        self.show_charts(section.groups, parts.data["charts"])
         histograms = parts.data["histograms"]
-        self.episodes.show(
-            histograms.get("run0-replays"), histograms.get("run0-episodes"), bool(about["replay_command"])
-        )
+        has_model = bool(section.replay_command)
+        self.episodes.show(histograms.get("run0-replays"), histograms.get("run0-episodes"), has_model)
         if not self.settings.default_slot.children:
             with self.settings:
-                show_settings(about)
+                show_settings(section)
         self.show_log()
 
-    def show_charts(self, groups: list[dict[str, Any]], data: dict[str, Any]) -> None:
+    def show_charts(self, groups: list[sections.ChartGroup], data: dict[str, charts.Chart]) -> None:
         """Draws charts, and adds those that are new."""
-        for group in groups:
-            new = [one for one in group["charts"] if one["id"] not in self.figures]
-            if new and group["title"] not in self.places:
-                with self.groups, ui.expansion(group["title"], value=group["title"] in FIRST).classes("w-full"):
-                    self.places[group["title"]] = ui.element("div").classes("charts w-full")
-            for one in new:
-                with self.places[group["title"]], ui.card().classes("card").props("flat bordered"):
-                    ui.label(one["title"]).classes("text-weight-medium text")
-                    self.figures[one["id"]] = Figure()
-            for one in group["charts"]:
-                self.figures[one["id"]].show(data[one["id"]], axis=self.axis.value)
+        for title, entries in groups:
+            if title not in self.grids:
+                with self.groups, ui.expansion(title, value=title in FIRST).classes("w-full"):
+                    self.grids[title] = ui.element("div").classes("charts w-full")
+            for entry in entries:
+                if entry.id not in self.figures:
+                    with self.grids[title], ui.card().classes("card").props("flat bordered"):
+                        ui.label(entry.title).classes("text-weight-medium text")
+                        self.figures[entry.id] = Figure()
+                self.figures[entry.id].show(data[entry.id], axis=self.axis.value)
 
     def turn(self) -> None:
         """Draws all charts over another axis."""
@@ -226,23 +224,23 @@ def show_tile(tile: sections.Tile) -> None:
             ui.label(text).classes("text-caption quiet")
 
 
-def show_settings(about: dict[str, Any]) -> None:
+def show_settings(section: sections.RunSection) -> None:
     """Shows the settings, first those that differ from the defaults."""
-    changed = [{**one, "default": f"default {one['default']}"} for one in about["changed"]]
-    usual = [{"name": name, "value": value, "default": ""} for name, value in about["settings"]]
-    for title, rows in (("Different from the defaults", changed), ("Run", usual), ("Others", about["unchanged"])):
+    names = ("name", "value", "default")
+    columns = [{"name": name, "label": "", "field": name, "align": "left"} for name in names]
+    changed = [(name, value, f"default {default}") for name, value, default in section.changed]
+    usual = [(name, value, "") for name, value in section.settings]
+    for title, rows in (("Different from the defaults", changed), ("Run", usual), ("Others", section.unchanged)):
         if rows:
             ui.label(title).classes("text-weight-medium")
-            columns = [
-                {"name": one, "label": "", "field": one, "align": "left"} for one in ("name", "value", "default")
-            ]
-            ui.table(rows=rows, columns=columns).props("flat dense hide-header wrap-cells").classes("w-full text")
-    if about["command"]:
-        ui.label(about["command"]).classes("text mono quiet")
+            cells = [dict(zip(names, row, strict=True)) for row in rows]
+            ui.table(rows=cells, columns=columns).props("flat dense hide-header wrap-cells").classes("w-full text")
+    if section.command:
+        ui.label(section.command).classes("text mono quiet")
 
 
 class Head:
-    """What the run is, what may be done with it, and what is wrong with it. Mutable."""
+    """Environment and state of the run, buttons, and its warnings and notes. Mutable."""
 
     def __init__(self, page: RunPage) -> None:
         self.page = page
@@ -255,17 +253,18 @@ class Head:
         self.facts = ui.label().classes("quiet text")
         self.notes = ui.column().classes("w-full gap-1")
 
-    def show(self, row: Row, about: dict[str, Any]) -> None:
-        """Shows the row of the run, and what the report says about it. Buttons stay while the state does."""
+    def show(self, row: Row, section: sections.RunSection | None) -> None:
+        """Shows the row of a run, and its section of the report if it could be read. Buttons stay while the state does."""
         self.env.text, self.algorithm.text = row["env"] or row["name"], row["algorithm"]
-        self.facts.text = " · ".join([row["run"], *about.get("facts", ())])
+        self.facts.text = " · ".join([row["run"], *(() if section is None else section.facts)])
         if row["state"] != self.state:
             self.state = self.badge.text = row["state"]
             self.badge.props(f"color={COLORS.get(self.state, 'grey-7')}")
             self.actions.clear()
             with self.actions:
                 show_actions(self.page, row)
-        if (problems := (*about["warnings"], *about["notes"])) != self.problems:
+        problems = (*row["warnings"], *row["notes"]) if section is None else (*section.warnings, *section.notes)
+        if problems != self.problems:
             self.problems = problems
             self.notes.clear()
             with self.notes:
@@ -292,12 +291,12 @@ class LiveView:
 
     def look(self) -> None:
         """Offers policies that are new, and shows what the critic expected."""
-        kept = [path.stem for path in requests.models(RunFolder(self.page.path).models)]
-        steps = [*kept, CURRENT]
+        models = [path.stem for path in requests.models(RunFolder(self.page.path).models)]
+        steps = [*models, CURRENT]
         if steps != self.steps:
-            value = steps.index(self.steps[self.slider.value]) if self.steps[self.slider.value] in steps else len(kept)
-            self.steps = steps
-            self.slider.props(f"max={len(kept)}")
+            current = self.steps[self.slider.value]
+            self.steps, value = steps, steps.index(current) if current in steps else len(models)
+            self.slider.props(f"max={len(models)}")
             self.slider.value = value
         self.name()
         self.status.text = self.player.problem
@@ -307,8 +306,8 @@ class LiveView:
     def name(self) -> None:
         """Says which policy the slider is at."""
         model = self.player.model
-        known = {CURRENT: "current policy", BEST: "best policy"}
-        self.label.text = known.get(model) or f"at {int(model.removeprefix('step_')):,} steps"
+        names = {CURRENT: "current policy", BEST: "best policy"}
+        self.label.text = names.get(model) or f"at {int(model.removeprefix('step_')):,} steps"
 
     def chosen(self) -> None:
         """Lets the policy at the slider act."""
@@ -322,7 +321,7 @@ class LiveView:
 
 
 class Values:
-    """What the critic expected along an episode, and what followed. Mutable."""
+    """Values that the critic gave to the steps of an episode, and the returns to go. Mutable."""
 
     def __init__(self) -> None:
         with ui.card().classes("card w-full").props("flat bordered"):

@@ -103,9 +103,9 @@ def build(studio: Studio, request: Request) -> None:
 
 def chosen(rows: Iterable[Row], words: str) -> list[Row]:
     """Returns the rows that contain all words in their name, environment, algorithm or state."""
-    parts = words.lower().split()
+    terms = words.lower().split()
     texts = ((" ".join(str(row[name]) for name in ("run", "env", "algorithm", "state")).lower(), row) for row in rows)
-    return [row for text, row in texts if all(part in text for part in parts)]
+    return [row for text, row in texts if all(term in text for term in terms)]
 
 
 def labels_of(rows: Sequence[Row], runs: Mapping[str, RunSummary], grouping: str) -> list[str]:
@@ -114,9 +114,9 @@ def labels_of(rows: Sequence[Row], runs: Mapping[str, RunSummary], grouping: str
         return [row["run"].rpartition("/")[0] for row in rows]
     if grouping == "none":
         return [""] * len(rows)
-    known = [row["run"] for row in rows if row["run"] in runs]
-    found = dict(zip(known, group_labels([runs[name] for name in known], "setting")[1], strict=True))
-    return [f"{row['env']}: {found[row['run']]}" if row["run"] in found else "" for row in rows]
+    names = [row["run"] for row in rows if row["run"] in runs]
+    labels = dict(zip(names, group_labels([runs[name] for name in names], "setting")[1], strict=True))
+    return [f"{row['env']}: {labels[row['run']]}" if row["run"] in labels else "" for row in rows]
 
 
 def lines(rows: Sequence[Row], labels: Sequence[str], opened: set[str]) -> Iterable[dict[str, Any]]:
@@ -165,14 +165,14 @@ def group_line(label: str, rows: Sequence[Row], is_open: bool) -> dict[str, Any]
         best = {"mean_return": bests.mean(), "low": float(low), "high": float(high), "success_rate": math.nan}
     rates = [row["steps_per_second"] for row in rows if row["state"] == "running"]
     curves = [row["curve"] for row in rows if len(row["curve"]) > 1]
-    even = [np.interp(np.linspace(0, 1, POINTS), np.linspace(0, 1, len(one)), one) for one in curves]
-    kinds = (", ".join(sorted({row[name] for row in rows} - {""})[:3]) for name in ("env", "algorithm"))
+    even = [np.interp(np.linspace(0, 1, POINTS), np.linspace(0, 1, len(curve)), curve) for curve in curves]
+    facts = (", ".join(sorted({row[name] for row in rows} - {""})[:3]) for name in ("env", "algorithm"))
     return {
         "key": label,
         "group": True,
         "open": is_open,
         "name": f"{label} ({len(rows)})",
-        "about": " · ".join(filter(None, kinds)),
+        "about": " · ".join(filter(None, facts)),
         "state": ", ".join(f"{n} {state}" for state, n in states.items()),
         "color": COLORS.get(max(states, key=lambda state: (state == "running", states[state])), "grey-7"),
         "steps": f"{sum(row['steps'] for row in rows):,}",

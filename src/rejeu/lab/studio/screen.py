@@ -82,11 +82,11 @@ class Screen(Element, component="screen.js"):
         sending = asyncio.create_task(self._send(socket, drawn))
         try:
             while True:
-                kind, name = await socket.receive_json()
-                if kind == "shown":
+                event_type, name = await socket.receive_json()
+                if event_type == "shown":
                     drawn.set()
-                elif self._key is not None and kind in ("press", "release", "leave"):
-                    self._key(Event(kind, key_name(str(name))))
+                elif self._key is not None and event_type in ("press", "release", "leave"):
+                    self._key(Event(event_type, key_name(str(name))))
         except (WebSocketDisconnect, ValueError, TypeError):
             return
         finally:

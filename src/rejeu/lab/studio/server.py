@@ -68,11 +68,11 @@ def serve(
         own_port = listening.getsockname()[1]
         token = secrets.token_urlsafe(24)
         server = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
-        links = [(one.path, one.title) for one in PAGES if one.is_listed]
+        links = [(entry.path, entry.title) for entry in PAGES if entry.is_listed]
         figures.serve_scripts()
         add_files(studio)
-        for one in PAGES:
-            add(one, studio, links)
+        for entry in PAGES:
+            add(entry, studio, links)
         ui.run_with(server, title="rejeu studio", dark=None, show_welcome_message=False, reconnect_timeout=RECONNECT)
         config = uvicorn.Config(
             Guard(server, token, own_port, hosts), log_level="warning", ws_max_size=2**24, lifespan="on"
@@ -108,12 +108,12 @@ def bound(port: int) -> socket.socket:
     Raises:
         OSError: if none of them is free.
     """
-    for one in range(port, min(port + PORTS, 65536)):
-        made = socket.socket()
+    for number in range(port, min(port + PORTS, 65536)):
+        listener = socket.socket()
         try:
-            made.bind((HOST, one))
-            made.listen()
-            return made
+            listener.bind((HOST, number))
+            listener.listen()
+            return listener
         except OSError:
-            made.close()
+            listener.close()
     raise OSError(f"no port from {port} on is free on {HOST}; give another with --port, or 0 for any")

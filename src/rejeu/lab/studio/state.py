@@ -1,4 +1,4 @@
-"""What all pages show: the runs below a folder, read again while they change."""
+"""The runs below a folder, read again while they change; all pages show them."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import threading
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path, PurePath
-from types import TracebackType
 
 from rejeu.envs.registry import are_plain, is_plain_id
 from rejeu.lab.reporting.rows import Row, Rows
@@ -20,7 +19,7 @@ EVERY = 1.0
 
 Guests = Mapping[str, tuple[Path, Environment]]
 NOTHING = RunConfig(env="")
-"""What the command line names if it names no environment and no module."""
+"""Description of a run for which nobody has named an environment or a module."""
 
 
 def is_below(path: PurePath) -> bool:
@@ -50,7 +49,7 @@ class Studio:
         self._thread.start()
         return self
 
-    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(self, *error: object) -> None:
         self._ended.set()
 
     def below(self, name: str) -> Path:
@@ -76,22 +75,22 @@ class Studio:
         All that makes the environment of a run gets this: threads that show it, and commands, by :meth:`words`. The numbers
         and words that the environment takes are those of the run.
         """
-        config = NOTHING if (known := self.summaries.get(run)) is None else known.config
+        config = NOTHING if (summary := self.summaries.get(run)) is None else summary.config
         closest = sorted(self._trusted, key=lambda typed: written(typed.env_kwargs) != written(config.env_kwargs))
         options = (allowed(typed, config) for typed in closest)
         return self._with_imports(next(filter(None, options), RunOptions()))
 
     def words(self, run: str) -> list[str]:
-        """Returns the same as words of a command line."""
-        given = self.given(run)
-        return given.as_words(*(() if given.env is None else ("--env", given.env)))
+        """Returns the options of :meth:`given` as words of a command line."""
+        options = self.given(run)
+        return options.as_words(*(() if options.env is None else ("--env", options.env)))
 
     def typed(self, env: str) -> RunOptions:
         """Returns what people have typed about an environment that they named like this, or on the command line by its id."""
         options = (
-            RunOptions(env=one.typed, env_kwargs=one.env_kwargs, wrappers=one.wrappers, imports=one.imports)
-            for i, one in enumerate(self._trusted)  # the first is of the command line
-            if env and env in (one.env, one.typed) and (i == 0 or not is_plain_id(env))
+            RunOptions(env=run.typed, env_kwargs=run.env_kwargs, wrappers=run.wrappers, imports=run.imports)
+            for i, run in enumerate(self._trusted)  # the first is of the command line
+            if env and env in (run.env, run.typed) and (i == 0 or not is_plain_id(env))
         )
         return self._with_imports(next(options, RunOptions()))
 

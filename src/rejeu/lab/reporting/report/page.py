@@ -8,7 +8,7 @@ import zlib
 from functools import cache
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rejeu.core.errors import MissingExtra, requires
 
@@ -16,6 +16,15 @@ if TYPE_CHECKING:
     from jinja2 import Environment
 
 TEMPLATES = Path(__file__).parent / "templates"
+
+
+class Entry(NamedTuple):
+    """A chart on a page."""
+
+    id: str
+    """Key of its data."""
+    title: str
+    note: str = ""
 
 
 def render(template: str, data: Any, **context: Any) -> str:
@@ -38,8 +47,8 @@ def render(template: str, data: Any, **context: Any) -> str:
         f"default-src 'none'; script-src 'nonce-{nonce}'; style-src 'unsafe-inline'; img-src data:; media-src data:; "
         "connect-src 'none'; base-uri 'none'; form-action 'none'"
     )
-    own = ("charts.css", "page.css", "charts.js", "page.js")
-    charts_style, style, charts, script = (Markup((TEMPLATES / name).read_text(encoding="utf-8")) for name in own)
+    files = ("charts.css", "page.css", "charts.js", "page.js")
+    charts_style, style, charts, script = (Markup((TEMPLATES / name).read_text(encoding="utf-8")) for name in files)
     return page.render(
         nonce=nonce,
         policy=policy,

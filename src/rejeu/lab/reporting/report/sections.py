@@ -13,6 +13,7 @@ import numpy as np
 
 from rejeu.checkpoints.run_folder import RunFolder
 from rejeu.core.records import shown
+from rejeu.lab.reporting.report.page import Entry
 from rejeu.lab.reporting.report.videos import BUDGET, Video, collect
 from rejeu.lab.runs.config import RunConfig
 from rejeu.lab.runs.read import MAX_WORD, RunSummary, best_row
@@ -41,11 +42,58 @@ class Tile(NamedTuple):
     more: str = ""
 
 
+class ChartGroup(NamedTuple):
+    """The charts below a heading."""
+
+    title: str
+    charts: list[Entry]
+
+
+class Hyperparameter(NamedTuple):
+    """A hyperparameter of a run, as texts."""
+
+    name: str
+    value: str
+    default: str
+    """That of the algorithm, where the value differs from it."""
+
+
+class RunSection(NamedTuple):
+    """The content of a page on one run, as the template shows it."""
+
+    id: str
+    name: str
+    env: str
+    algorithm: str
+    state: str
+    state_text: str
+    tiles: list[Tile]
+    facts: list[str]
+    groups: list[ChartGroup]
+    videos: list[Video]
+    other_videos: int
+    """Number of further videos in the run folder."""
+    histograms: set[str]
+    """Those that exist: ``"episodes"`` of training, ``"replays"`` of the trained agent."""
+    evaluations: list[dict[str, Any]]
+    has_success: bool
+    evaluations_note: str
+    settings: list[tuple[str, str]]
+    changed: list[Hyperparameter]
+    """Hyperparameters that differ from the defaults."""
+    unchanged: list[Hyperparameter]
+    versions: list[tuple[str, str]]
+    warnings: Sequence[str]
+    notes: Sequence[str]
+    command: str
+    replay_command: str
+    """Command that plays episodes of the trained agent; empty without a model."""
+
+
 class Parts(NamedTuple):
     """The content of a page."""
 
-    runs: list[dict[str, Any]]
-    """For the template."""
+    runs: list[RunSection]
     data: dict[str, Any]
     """For the script."""
 
@@ -60,21 +108,22 @@ def title_of(runs: Sequence[RunSummary]) -> str:
 @np.errstate(all="ignore")  # files may hold any number
 def build(runs: Sequence[RunSummary], folder: Path | None) -> Parts:
     """Returns the content of a report; ``folder`` as for :func:`rejeu.lab.reporting.report.render`."""
-    parts, budget = [], BUDGET
+    sections, budget = [], BUDGET
     charts: dict[str, Any] = {}
     histograms: dict[str, Any] = {}
     for i, run in enumerate(runs):
         own_charts, groups = charts_of(run, f"run{i}")
         charts |= own_charts
-        own = {"episodes": histogram_of(run), "replays": replays_of(run)}
-        histograms |= {f"run{i}-{name}": one for name, one in own.items() if one is not None}
+        bars = {"episodes": histogram_of(run), "replays": replays_of(run)}
+        histograms |= {f"run{i}-{name}": histogram for name, histogram in bars.items() if histogram is not None}
         clips, notes, spent = collect(run, folder, budget)
         budget -= spent
-        parts.append(describe(run, f"run{i}", groups, clips, notes, {name for name, one in own.items() if one}))
-    return Parts(parts, {"charts": charts, "histograms": histograms})
+        keys = {name for name, histogram in bars.items() if histogram is not None}
+        sections.append(describe(run, f"run{i}", groups, clips, notes, keys))
+    return Parts(sections, {"charts": charts, "histograms": histograms})
 
 
-def charts_of(run: RunSummary, prefix: str) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+def charts_of(run: RunSummary, prefix: str) -> tuple[dict[str, Any], list[ChartGroup]]:
     """Returns the charts of a run by id, and groups of their ids and titles for the template."""
     curves: list[tuple[str, str, str, Any]] = [
         (CURVES, column, title, chart_data.episode_chart(run.episodes, run.evaluations, column))
@@ -85,19 +134,18 @@ def charts_of(run: RunSummary, prefix: str) -> tuple[dict[str, Any], list[dict[s
     curves.append((GOALS, "goals", "Goals of the trained agent", chart_data.goal_chart(run.replays)))
     curves.append((TIME, "time", "Shares of the time", chart_data.time_chart(run.metrics)))
     charts: dict[str, Any] = {}
-    groups: dict[str, list[dict[str, str]]] = {heading: [] for heading in (CURVES, GOALS, *chart_data.GROUPS, TIME)}
+    groups: dict[str, list[Entry]] = {heading: [] for heading in (CURVES, GOALS, *chart_data.GROUPS, TIME)}
     for heading, key, title, chart in curves:
         if chart is not None:
             charts[f"{prefix}-{key}"] = chart
-            groups[heading].append({"id": f"{prefix}-{key}", "title": title, "note": chart["note"]})
-    return charts, [{"title": heading, "charts": entries} for heading, entries in groups.items() if entries]
+            groups[heading].append(Entry(f"{prefix}-{key}", title, chart["note"]))
+    return charts, [ChartGroup(heading, entries) for heading, entries in groups.items() if entries]
 
 
 def histogram_of(run: RunSummary) -> dict[str, Any] | None:
     """Returns the histogram of the training episodes."""
-    own = {name: run.episodes.column(name) for name in ("step", "env", "return", "length", "success")}
-    columns = {"episode": np.arange(1, len(run.episodes) + 1), **own}
-    return chart_data.histogram(own["return"], columns)
+    columns = {name: run.episodes.column(name) for name in ("step", "env", "return", "length", "success")}
+    return chart_data.histogram(columns["return"], {"episode": np.arange(1, len(run.episodes) + 1), **columns})
 
 
 def replays_of(run: RunSummary) -> dict[str, Any] | None:
@@ -107,37 +155,37 @@ def replays_of(run: RunSummary) -> dict[str, Any] | None:
 
 
 def describe(
-    run: RunSummary, key: str, groups: list[dict[str, Any]], found: list[Video], notes: list[str], histograms: set[str]
-) -> dict[str, Any]:
-    """Returns what the template shows of a run."""
-    rows = hyperparameters(run)
-    return {
-        "id": key,
-        "name": run.name,
-        "env": run.config.env or "unknown environment",
-        "algorithm": run.config.algorithm or "unknown algorithm",
-        "state": run.state,
-        "state_text": "state unknown" if run.state == "unknown" else run.state,
-        "tiles": tiles(run),
-        "facts": facts(run),
-        "groups": groups,
-        "videos": found,
-        "other_videos": max(len(run.videos) - len(found), 0),
-        "histograms": histograms,
-        "evaluations": evaluation_rows(run),
-        "has_success": bool(np.isfinite(run.evaluations.column("success_rate")).any()),
-        "evaluations_note": evaluations_note(run),
-        "settings": settings(run),
-        "changed": [row for row in rows if row["changed"]],
-        "unchanged": [row for row in rows if not row["changed"]],
-        "versions": [(shown(name), shown(value)) for name, value in run.versions.items()],
-        "warnings": [*run.warnings],
-        "notes": [*run.notes, *notes],
-        "command": run.command,
-        "replay_command": f"rejeu report {path_word(run.path)} --replay 100{env_options(run)}"
+    run: RunSummary, key: str, groups: list[ChartGroup], videos: list[Video], notes: list[str], histograms: set[str]
+) -> RunSection:
+    """Returns the section of a run."""
+    changed, unchanged = hyperparameters(run)
+    return RunSection(
+        id=key,
+        name=run.name,
+        env=run.config.env or "unknown environment",
+        algorithm=run.config.algorithm or "unknown algorithm",
+        state=run.state,
+        state_text="state unknown" if run.state == "unknown" else run.state,
+        tiles=tiles(run),
+        facts=facts(run),
+        groups=groups,
+        videos=videos,
+        other_videos=max(len(run.videos) - len(videos), 0),
+        histograms=histograms,
+        evaluations=evaluation_rows(run),
+        has_success=bool(np.isfinite(run.evaluations.column("success_rate")).any()),
+        evaluations_note=evaluations_note(run),
+        settings=settings(run),
+        changed=changed,
+        unchanged=unchanged,
+        versions=[(shown(name), shown(value)) for name, value in run.versions.items()],
+        warnings=run.warnings,
+        notes=[*run.notes, *notes],
+        command=run.command,
+        replay_command=f"rejeu report {path_word(run.path)} --replay 100{env_options(run)}"
         if run.format == "rejeu" and run.models
         else "",
-    }
+    )
 
 
 def number(value: float, digits: int = 2) -> str:
@@ -172,9 +220,9 @@ def duration(seconds: float) -> str:
         return "\N{EN DASH}"
     if seconds < 60:
         return f"{seconds:.1f} s"
-    minutes, rest = divmod(round(seconds), 60)
+    minutes, seconds = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
-    return f"{hours:,} h {minutes} min" if hours else f"{minutes} min {rest} s"
+    return f"{hours:,} h {minutes} min" if hours else f"{minutes} min {seconds} s"
 
 
 def tiles(run: RunSummary) -> list[Tile]:
@@ -204,8 +252,8 @@ def evaluation_tiles(run: RunSummary, title: str, row: int) -> list[Tile]:
     low, high = (end[row] for end in chart_data.interval(table, "return"))
     interval = between(low, high)
     if math.isfinite(rate):
-        least, most = (end[row] for end in chart_data.interval(table, "success"))
-        note = f"success, 95 % interval {between(least, most, percent)}" if math.isfinite(least) else "success"
+        low, high = (end[row] for end in chart_data.interval(table, "success"))
+        note = f"success, 95 % interval {between(low, high, percent)}" if math.isfinite(low) else "success"
         more = f"return {number(mean)}" + (f" ({interval})" if interval else "")
         return [Tile(f"{title}, {at}", percent(rate), note, more)]
     note = f"return, 95 % interval {interval}" if interval else "return"
@@ -236,13 +284,13 @@ def facts(run: RunSummary) -> list[str]:
 def evaluation_rows(run: RunSummary) -> list[dict[str, Any]]:
     """Returns the table of evaluations; of many rows the best and others, evenly spaced."""
     table = run.evaluations
-    (low, high), (least, most) = chart_data.interval(table, "return"), chart_data.interval(table, "success")
+    (low, high), (rate_low, rate_high) = chart_data.interval(table, "return"), chart_data.interval(table, "success")
     best = best_row(table)
     return [
         {
             "step": number(table.column("step")[row], 0),
             "success": percent(table.column("success_rate")[row]),
-            "success_interval": between(least[row], most[row], percent),
+            "success_interval": between(rate_low[row], rate_high[row], percent),
             "return": number(table.column("mean_return")[row]),
             "return_interval": between(low[row], high[row]),
             "deviation": number(table.column("std_return")[row]),
@@ -267,27 +315,23 @@ def value_text(value: Any) -> str:
     >>> value_text({"schedule": "linear", "start": 0.2, "end": 0.0, "fraction": 1.0}), value_text(None)
     ('linear: start 0.2, end 0.0, fraction 1.0', 'None')
     """
-    if isinstance(value, dict) and isinstance(kind := value.get("schedule", value.get("noise")), str):
-        rest = ", ".join(
-            f"{name} {value_text(part)}" for name, part in value.items() if name not in ("schedule", "noise")
+    if isinstance(value, dict) and isinstance(label := value.get("schedule", value.get("noise")), str):
+        parameters = ", ".join(
+            f"{name} {value_text(entry)}" for name, entry in value.items() if name not in ("schedule", "noise")
         )
-        return shown(f"{kind}: {rest}", 200)
+        return shown(f"{label}: {parameters}", 200)
     if value is None or isinstance(value, bool):
         return str(value)
     return shown(value if isinstance(value, str) else json.dumps(value), 200)
 
 
-def hyperparameters(run: RunSummary) -> list[dict[str, Any]]:
-    """Returns all hyperparameters, and which differ from the default."""
-    return [
-        {
-            "name": shown(name),
-            "value": value_text(value),
-            "changed": name in run.changed,
-            "default": value_text(run.changed[name][1]) if name in run.changed else "",
-        }
-        for name, value in list(flat(run.config.hyperparameters))[:MAX_SETTINGS]
-    ]
+def hyperparameters(run: RunSummary) -> tuple[list[Hyperparameter], list[Hyperparameter]]:
+    """Returns the hyperparameters that differ from the defaults, and the others."""
+    changed, unchanged = [], []  # type: list[Hyperparameter], list[Hyperparameter]
+    for name, value in list(flat(run.config.hyperparameters))[:MAX_SETTINGS]:
+        default = value_text(run.changed[name][1]) if name in run.changed else ""
+        (changed if name in run.changed else unchanged).append(Hyperparameter(shown(name), value_text(value), default))
+    return changed, unchanged
 
 
 def settings(run: RunSummary) -> list[tuple[str, str]]:
@@ -304,12 +348,12 @@ def replay_command(run: RunSummary) -> str:
     """Returns the command that shows episodes of the trained agent; empty if there is no model."""
     if run.format != "rejeu" or not run.models:
         return ""
-    which = "" if RunFolder(run.path).best in run.models else " --which last"
-    return f"rejeu watch {path_word(run.path)}{which} --seed N --episodes 1{env_options(run)}"
+    option = "" if RunFolder(run.path).best in run.models else " --which last"
+    return f"rejeu watch {path_word(run.path)}{option} --seed N --episodes 1{env_options(run)}"
 
 
 def env_options(run: RunSummary) -> str:
-    """Returns what commands about the run need to make its environment again, and to import; empty if its id is enough."""
+    """Returns the options with which commands about the run make its environment again; empty if its id is enough."""
     return "".join(f" {quoted(shown(word, MAX_WORD))}" for word in run.environment_words())
 
 

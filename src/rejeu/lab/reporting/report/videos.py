@@ -40,10 +40,10 @@ def collect(run: RunSummary, folder: Path | None, budget: int) -> tuple[list[Vid
     """
     best = RunFolder(run.path).video
     during = [path for path in run.videos if path != best]
-    chosen = {path: "Best model" for path in run.videos if path == best}  # first, as the budget may not be enough
-    chosen |= dict.fromkeys(during[-1:], "Last") | dict.fromkeys(during[:-1][:1], "First")
+    titles = {path: "Best model" for path in run.videos if path == best}  # first, as the budget may not be enough
+    titles |= dict.fromkeys(during[-1:], "Last") | dict.fromkeys(during[:-1][:1], "First")
     videos, notes, spent = [], [], 0
-    for path, title in chosen.items():
+    for path, title in titles.items():
         try:
             size = path.stat().st_size
             content = read_bytes(path, min(size, budget - spent + 1))
