@@ -18,12 +18,12 @@ MAX_NAMED = 4
 
 
 @contextmanager
-def shown(scheduler: Scheduler, about: Callable[[], str], progress: bool = True) -> Iterator[Callable[[], None]]:
+def shown(scheduler: Scheduler, summary: Callable[[], str], progress: bool = True) -> Iterator[Callable[[], None]]:
     """Context in which the runs that train are shown; returns a function to call often.
 
     Args:
         scheduler: of the runs.
-        about: returns how far all of them are, as a line.
+        summary: returns how far all of them are, as a line.
         progress: whether anything is shown.
     """
     from rich.console import Group
@@ -40,9 +40,9 @@ def shown(scheduler: Scheduler, about: Callable[[], str], progress: bool = True)
         due = time.monotonic() + (LINES if table is None else REFRESH)
         rows = rows_of(scheduler, reader)
         if table is None:
-            print("; ".join([*line(rows), about()]), flush=True)
+            print("; ".join([*line(rows), summary()]), flush=True)
         else:
-            table.update(Group(table_of(COLUMNS, map(texts, rows), N_TEXT), about()), refresh=True)
+            table.update(Group(table_of(COLUMNS, map(texts, rows), N_TEXT), summary()), refresh=True)
 
     with nullcontext() if table is None else table:
         yield watch
@@ -50,8 +50,8 @@ def shown(scheduler: Scheduler, about: Callable[[], str], progress: bool = True)
 
 def rows_of(scheduler: Scheduler, reader: Rows) -> list[Row]:
     """Returns the rows of the runs that train."""
-    works = [attempt.task for attempt in scheduler.running]
-    return [{**reader.row(one.path), "run": one.name, "state": "running"} for one in works]
+    works = [attempt.work for attempt in scheduler.running]
+    return [{**reader.row(work.path), "run": work.name, "state": "running"} for work in works]
 
 
 def line(rows: Sequence[Row]) -> list[str]:

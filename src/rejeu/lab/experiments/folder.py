@@ -45,7 +45,7 @@ UNITS = {"": 1, "B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
 
 @dataclass(frozen=True, kw_only=True)
 class Resources:
-    """What one run needs on a node of a Ray cluster; Ray starts no more runs on a node than fit."""
+    """Resources of one run on a node of a Ray cluster; Ray starts no more runs on a node than fit."""
 
     cpus: Annotated[float, Meta(gt=0, le=10_000)] = 1
     """Processor cores."""
@@ -69,10 +69,10 @@ def memory_bytes(value: Any) -> int:
     >>> memory_bytes("1.5 GB"), memory_bytes(1000)
     (1500000000, 1000)
     """
-    found = re.fullmatch(r"(\d{1,15}(?:\.\d{1,6})?) ?([KMGT]?B)?", str(value))
-    if isinstance(value, bool) or found is None or float(found[1]) <= 0:
+    match = re.fullmatch(r"(\d{1,15}(?:\.\d{1,6})?) ?([KMGT]?B)?", str(value))
+    if isinstance(value, bool) or match is None or float(match[1]) <= 0:
         raise ValueError(f"memory={value!r} must be a number of bytes, or a text such as '4 GB'")
-    return int(float(found[1]) * UNITS[found[2] or ""])
+    return int(float(match[1]) * UNITS[match[2] or ""])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -131,11 +131,11 @@ def open_folder(path: Path, plan: Plan, text: str | None, typed: RunConfig) -> S
 
 
 def difference(there: Plan, plan: Plan) -> str:
-    """Returns what is other in the jobs of two plans, as text; empty if they are the same."""
+    """Returns the difference between the jobs of two plans, as text; empty if they are the same."""
     if there.jobs == plan.jobs:
         return ""
-    known, new = ({job.name: job for job in one.jobs} for one in (there, plan))
-    differing = next((name for name in [*new, *known] if new.get(name) != known.get(name)), "their order")
+    old, new = ({job.name: job for job in jobs} for jobs in (there.jobs, plan.jobs))
+    differing = next((name for name in [*new, *old] if new.get(name) != old.get(name)), "their order")
     return f"the sweep of another plan: {differing} differs"
 
 
@@ -170,7 +170,7 @@ def begin(path: Path, name: str, plan: P, read: Callable[[Path], P], difference:
         FileExistsError: if the path is a file, or a folder with other things.
         ValueError: if it is the folder of another plan.
     """
-    inside = {one.name for one in path.iterdir()} if path.is_dir() else {HIDDEN}
+    inside = {entry.name for entry in path.iterdir()} if path.is_dir() else {HIDDEN}
     if name not in inside and (inside - {HIDDEN} or path.is_file()):
         raise FileExistsError(
             f"{path} exists and holds something else than {name}; name another folder, or remove it first"
@@ -188,13 +188,13 @@ def begin(path: Path, name: str, plan: P, read: Callable[[Path], P], difference:
     return there
 
 
-def read(path: Path, kind: type[P], most: int = MAX_BYTES, check: Callable[[P], object] = lambda plan: None) -> P:
+def read(path: Path, schema: type[P], limit: int = MAX_BYTES, check: Callable[[P], object] = lambda plan: None) -> P:
     """Returns the plan in a file, which is untrusted.
 
     Args:
         path: the file.
-        kind: class of the plan.
-        most: upper limit on its size in bytes.
+        schema: class of the plan.
+        limit: of its size, in bytes.
         check: raises ``ValueError`` or ``TypeError`` for an invalid plan.
 
     Raises:
@@ -204,7 +204,7 @@ def read(path: Path, kind: type[P], most: int = MAX_BYTES, check: Callable[[P], 
     if not path.is_file():
         raise FileNotFoundError(f"{path.parent} is no folder of an experiment: it holds no {path.name}")
     try:
-        plan = convert(read_json(path, most), kind)
+        plan = convert(read_json(path, limit), schema)
         check(plan)
         return plan
     except (ValueError, TypeError) as error:

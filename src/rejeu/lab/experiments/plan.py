@@ -33,7 +33,9 @@ MAX_BYTES = 2**16
 """Upper limit on the size of a plan."""
 OWN_OF_JOBS = ("env", "env_kwargs", "wrappers", "imports", "algorithm", "seed", "hyperparameters")
 """Fields of a run that a plan names in another way, or not at all."""
-OF_RUNS = {one.shown.name or one.field: one.field for one in options(RunConfig) if one.field not in OWN_OF_JOBS}
+OF_RUNS = {
+    option.shown.name or option.field: option.field for option in options(RunConfig) if option.field not in OWN_OF_JOBS
+}
 """Fields of a run by the names of their options, which are those of ``rejeu train``."""
 OPTIONS = (*OF_RUNS, *FILES)
 """All options of the runs of a plan."""
@@ -48,7 +50,7 @@ class PlanError(ValueError):
 
 @dataclass(frozen=True, kw_only=True)
 class Environments:
-    """What a plan says of one environment, or of all, besides the options of their runs."""
+    """Entries of a plan about one environment, or about all, besides the options of their runs."""
 
     id: str | None = None
     algorithms: Algorithms | None = None
@@ -57,7 +59,7 @@ class Environments:
 
 @dataclass(frozen=True, kw_only=True)
 class Content:
-    """What a plan holds besides the options of its runs."""
+    """Entries of a plan besides the options of its runs."""
 
     environments: Algorithms | dict[str, Kwargs]
     """Ids, or tables of :class:`Environments` and options."""
@@ -76,7 +78,7 @@ class Environment(NamedTuple):
 
     label: str
     run: RunConfig
-    """What its runs have in common."""
+    """Description that its runs have in common."""
     files: dict[str, bool]
     """Options about the files of the runs."""
     algorithms: tuple[str | None, ...]
@@ -85,14 +87,14 @@ class Environment(NamedTuple):
 
 
 @contextmanager
-def at(plan: object, *place: str) -> Iterator[None]:
-    """Context in which an invalid value becomes a :class:`PlanError` with its place, such as ``plan.toml, settings.fast``."""
+def at(plan: object, *keys: str) -> Iterator[None]:
+    """Context in which an invalid value becomes a :class:`PlanError` with its keys, such as ``plan.toml, settings.fast``."""
     try:
         yield
     except PlanError:
         raise
     except (ValueError, TypeError, ArithmeticError, ImportError, OSError, gym.error.Error, AssertionError) as error:
-        where = f"{plan}, {'.'.join(place)}" if place else plan
+        where = f"{plan}, {'.'.join(keys)}" if keys else plan
         problem = " ".join(str(error or type(error).__name__).split())
         raise PlanError(f"{where}: {shown(problem, 1000)}") from None
 
@@ -140,26 +142,26 @@ def parse(content: Mapping[str, Any], plan: str) -> Plan:
         check_names(content, (*field_names(Content), *OPTIONS), "a plan")
         if not content.get("environments"):
             raise ValueError("a plan needs environments = ['Pendulum-v1', ...]")
-        found = convert({key: value for key, value in content.items() if key not in OPTIONS}, Content)
+        entries = convert({key: value for key, value in content.items() if key not in OPTIONS}, Content)
         common = {key: value for key, value in content.items() if key in OPTIONS}
-        seeds = seeds_of(found)
+        seeds = seeds_of(entries)
         read_run("", {}, common)
     with at(plan, "resources"):
-        check_names(found.resources, field_names(Resources), "resources")
-        resources = convert(found.resources, Resources)
-    environments = list(read_environments(found, common, plan))
-    count = sum(len(one.algorithms) for one in environments) * len(found.settings) * len(seeds)
+        check_names(entries.resources, field_names(Resources), "resources")
+        resources = convert(entries.resources, Resources)
+    environments = list(read_environments(entries, common, plan))
+    count = sum(len(environment.algorithms) for environment in environments) * len(entries.settings) * len(seeds)
     with at(plan):
         if count > MAX_JOBS:
             raise ValueError(f"there are {count:,} runs, expected up to {MAX_JOBS:,}")
         jobs: dict[str, Job] = {}
-        for job in expanded(environments, found.settings, seeds, plan):
+        for job in expanded(environments, entries.settings, seeds, plan):
             if jobs.setdefault(job.name.lower(), job) is not job:
                 raise ValueError(f"two runs would be called {job.name}; give settings and environments other names")
         if not jobs:
             raise ValueError("there is nothing to train; does every setting exclude every algorithm?")
         require({log: None for job in jobs.values() for log in job.run.log})
-    return Plan(jobs=tuple(jobs.values()), threads=found.threads, resources=resources)
+    return Plan(jobs=tuple(jobs.values()), threads=entries.threads, resources=resources)
 
 
 def expanded(
@@ -172,39 +174,39 @@ def expanded(
     checked = []
     for environment in environments:
         for algorithm, (name, setting) in itertools.product(environment.algorithms, settings.items()):
-            place = ("settings", name) if setting else ("environments", environment.label)
-            with at(plan, *place):
+            keys = ("settings", name) if setting else ("environments", environment.label)
+            with at(plan, *keys):
                 if "algorithms" in setting and algorithm not in read_algorithms(setting["algorithms"]):
                     continue
-                own = convert(setting.get(str(algorithm), {}), Kwargs)
+                of_algorithm = convert(setting.get(str(algorithm), {}), Kwargs)
                 path = None if environment.run.preset is None else str(environment.run.preset)
                 preset = find_preset(environment.run.env, algorithm, path)
                 is_long = environment.run.is_long and not any(settings.values())
-                chosen = algorithm or choose_algorithm(
+                algorithm_name = algorithm or choose_algorithm(
                     preset, environment.run.env, environment.observation, environment.action, is_long
                 )
                 common = {key: value for key, value in setting.items() if key != "algorithms" and key not in AGENTS}
-                base = preset or presets.default(environment.run.env, chosen)
-                config = read_hyperparameters(chosen, base.hyperparameters, {**common, **own})
-            checked.append((environment, place, name, config, {**common, **own}))
-    for environment, place, name, config, given in checked:
-        with at(plan, *place):
+                base = preset or presets.default(environment.run.env, algorithm_name)
+                config = read_hyperparameters(algorithm_name, base.hyperparameters, {**common, **of_algorithm})
+            checked.append((environment, keys, name, config, {**common, **of_algorithm}))
+    for environment, keys, name, config, values in checked:
+        with at(plan, *keys):
             check_spaces(environment, config)
-        run = replace(environment.run, algorithm=config.name, hyperparameters=dict(flat(given)))
+        run = replace(environment.run, algorithm=config.name, hyperparameters=dict(flat(values)))
         for seed in seeds:
             job = job_name(environment.label, config.name, name, seed)
             yield Job(name=job, run=replace(run, seed=seed), setting=name, **environment.files)
 
 
-def read_run(env_id: str, kwargs: Kwargs, given: Kwargs) -> tuple[RunConfig, dict[str, bool]]:
+def read_run(env_id: str, kwargs: Kwargs, options: Kwargs) -> tuple[RunConfig, dict[str, bool]]:
     """Returns a run with options, whole numbers of which may be written as 1e6, and the options about its files.
 
     Raises:
         ValueError, TypeError: for an invalid value.
     """
     values: Kwargs = {
-        OF_RUNS.get(key, key): int(one) if isinstance(one, float) and one.is_integer() else one
-        for key, one in given.items()
+        OF_RUNS.get(key, key): int(value) if isinstance(value, float) and value.is_integer() else value
+        for key, value in options.items()
     }
     if isinstance(values.get("log"), str | tuple | list):
         values["log"] = check_logs("log", values["log"])
@@ -224,11 +226,11 @@ def read_algorithms(value: Any) -> tuple[str, ...]:
         ValueError: for an unknown one, with the nearest, or one that is named twice.
     """
     names: Any = convert(value, Algorithms)  # type: ignore[arg-type]
-    given = (names,) if isinstance(names, str) else names
-    found = tuple(find_agent(one, is_typed=False).algorithm.Config.name for one in given)
-    if len({*found}) < len(found):
-        raise ValueError(f"algorithms={shown(found)} names one twice")
-    return found
+    names = (names,) if isinstance(names, str) else names
+    algorithms = tuple(find_agent(name, is_typed=False).algorithm.Config.name for name in names)
+    if len({*algorithms}) < len(algorithms):
+        raise ValueError(f"algorithms={shown(algorithms)} names one twice")
+    return algorithms
 
 
 def read_environments(content: Content, common: Kwargs, plan: str) -> Iterator[Environment]:
@@ -241,27 +243,27 @@ def read_environments(content: Content, common: Kwargs, plan: str) -> Iterator[E
             ids = (tables,) if isinstance(tables, str) else tables
             if len({*ids}) < len(ids):
                 raise ValueError(f"environments={shown(ids)} names one twice")
-            tables = {one: {} for one in ids}
+            tables = {env_id: {} for env_id in ids}
     for label, table in tables.items():
         with at(plan, "environments", label):
             check_names(table, (*field_names(Environments), *OPTIONS), f"the environment {label}")
-            own = {key: value for key, value in table.items() if key in OPTIONS}
-            about = convert({key: value for key, value in table.items() if key not in own}, Environments)
-            env_id = about.id or label
+            table_options = {key: value for key, value in table.items() if key in OPTIONS}
+            entries = convert({key: value for key, value in table.items() if key not in table_options}, Environments)
+            env_id = entries.id or label
             if not is_plain_id(env_id):
                 raise ValueError(
                     f"{shown(env_id)} is not the id of an environment, and no file may name a module; import it on the "
                     "command line, rejeu sweep PLAN --import MODULE, and write its id here"
                 )
-            kwargs = {**content.env_kwargs, **about.env_kwargs}
+            kwargs = {**content.env_kwargs, **entries.env_kwargs}
             for key, value in kwargs.items():
                 if not are_plain({key: value}):
                     raise ValueError(f"{key}={shown(value)} must be a number up to a million, a word, true or false")
-            dropped = ("steps", "minutes") if own.keys() & {"steps", "minutes"} else ()
-            given = {key: value for key, value in common.items() if key not in dropped} | own
-            run, files = read_run(env_id, kwargs, given)
-            chosen = algorithms if about.algorithms is None else read_algorithms(about.algorithms)
-            yield Environment(label, run, files, chosen, *find_spaces(run))
+            dropped = ("steps", "minutes") if table_options.keys() & {"steps", "minutes"} else ()
+            options = {key: value for key, value in common.items() if key not in dropped} | table_options
+            run, files = read_run(env_id, kwargs, options)
+            env_algorithms = algorithms if entries.algorithms is None else read_algorithms(entries.algorithms)
+            yield Environment(label, run, files, env_algorithms, *find_spaces(run))
 
 
 def seeds_of(content: Content) -> list[int]:
@@ -289,15 +291,15 @@ def find_spaces(run: RunConfig) -> tuple[gym.Space, gym.Space]:
         env.close()
 
 
-def read_hyperparameters(algorithm: str, base: Mapping[str, Any], given: Mapping[str, Any]) -> Any:
-    """Returns the configuration of an algorithm from ``base`` and the given values, as ``rejeu train`` would.
+def read_hyperparameters(algorithm: str, base: Mapping[str, Any], values: Mapping[str, Any]) -> Any:
+    """Returns the configuration of an algorithm from ``base`` and ``values``, as ``rejeu train`` would.
 
     Raises:
         ValueError, TypeError: for an unknown or invalid hyperparameter.
     """
     config = AGENTS[algorithm].algorithm.Config
-    check_names(given, field_names(config), algorithm)
-    return build(config, merged(dict(flat(given)), base))
+    check_names(values, field_names(config), algorithm)
+    return build(config, merged(dict(flat(values)), base))
 
 
 def check_spaces(environment: Environment, config: Any) -> None:
@@ -306,9 +308,9 @@ def check_spaces(environment: Environment, config: Any) -> None:
     Raises:
         ValueError, TypeError: if it does not take such spaces.
     """
-    kind = AGENTS[config.name]
+    agent_class = AGENTS[config.name]
     nested = isinstance(environment.observation, gym.spaces.Dict | gym.spaces.Tuple)
-    agent = kind.__new__(kind)
+    agent = agent_class.__new__(agent_class)
     agent.configure("MultiInputPolicy" if nested else "MlpPolicy", config, seed=0)
     agent.build(environment.observation, environment.action)
     if getattr(config, "hindsight", None) is not None:

@@ -72,8 +72,8 @@ def last_line(log: Path) -> str:
             lines = file.read().decode("utf-8", "replace").split("\n")
     except OSError:
         return "there is no log"
-    found = next((line.strip() for line in reversed(lines) if line.strip()), "it printed nothing")
-    return found.removeprefix("rejeu: error: ")
+    text = next((line.strip() for line in reversed(lines) if line.strip()), "it printed nothing")
+    return text.removeprefix("rejeu: error: ")
 
 
 def default_workers() -> int:
@@ -88,8 +88,7 @@ def threads_of(workers: int) -> int:
 
 def environment(threads: int) -> dict[str, str]:
     """Returns the environment variables of a process that uses so many threads."""
-    found = {**os.environ, **{name: os.environ.get(name, str(threads)) for name in THREADS}}
-    return {**found, hardware.CORES: str(threads)}
+    return {**dict.fromkeys(THREADS, str(threads)), **os.environ, hardware.CORES: str(threads)}
 
 
 class LocalLauncher:

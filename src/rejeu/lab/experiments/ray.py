@@ -189,8 +189,8 @@ class RayLauncher:
 
     def start(self, task: Path, log: Path, lock: Path) -> RayRun:
         """Starts a run."""
-        given = read_task(task)
-        write_task(task, replace(given, folder=str(Path(given.folder).resolve())))
+        description = read_task(task)
+        write_task(task, replace(description, folder=str(Path(description.folder).resolve())))
         stop = lock.with_suffix(".stop")
         stop.unlink(missing_ok=True)
         spec = Spec(
@@ -210,7 +210,7 @@ class RayLauncher:
         """Waits a little for runs that were asked to stop, and disconnects; what still runs then stops by itself."""
         until = time.monotonic() + END
         with suppress(Exception):
-            while any(one.poll() is None for one in self._handles) and time.monotonic() < until:
+            while any(handle.poll() is None for handle in self._handles) and time.monotonic() < until:
                 time.sleep(0.2)
         with suppress(OSError):
             Path(self._marker).unlink()
@@ -226,7 +226,7 @@ class RayLauncher:
         from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
         nodes = [node for node in ray.nodes() if node["Alive"]]
-        answers = [
+        references = [
             ray.remote(look)
             .options(
                 num_cpus=0,
@@ -237,10 +237,10 @@ class RayLauncher:
             for node in nodes
         ]
         lost = ray.exceptions.NodeDiedError, ray.exceptions.TaskUnschedulableError, ray.exceptions.WorkerCrashedError
-        for node, answer in zip(nodes, answers, strict=True):
+        for node, reference in zip(nodes, references, strict=True):
             where = f"the node {node['NodeManagerHostname']}"
             try:
-                there, is_seen = ray.get(answer, timeout=ANSWER)
+                there, is_seen = ray.get(reference, timeout=ANSWER)
             except ray.exceptions.GetTimeoutError:
                 raise ClusterError(f"{where} has not answered for {ANSWER:g} s; look at its raylet") from None
             except lost:
@@ -262,16 +262,16 @@ def write_marker(folder: Path) -> str:
 
 def requested(resources: Resources) -> dict[str, Any]:
     """Returns resources as Ray's options."""
-    found: dict[str, Any] = {"num_cpus": resources.cpus, "num_gpus": resources.gpus}
-    found |= {} if resources.memory is None else {"memory": resources.memory}
-    return {**found, "resources": resources.custom} if resources.custom else found
+    options: dict[str, Any] = {"num_cpus": resources.cpus, "num_gpus": resources.gpus}
+    options |= {} if resources.memory is None else {"memory": resources.memory}
+    return {**options, "resources": resources.custom} if resources.custom else options
 
 
 def wanted(resources: Resources) -> dict[str, float]:
     """Returns resources by Ray's names, those of which there are none left out."""
     memory = float(resources.memory or 0)
-    found = {"CPU": resources.cpus, "GPU": resources.gpus, "memory": memory, **resources.custom}
-    return {name: value for name, value in found.items() if value}
+    amounts = {"CPU": resources.cpus, "GPU": resources.gpus, "memory": memory, **resources.custom}
+    return {name: value for name, value in amounts.items() if value}
 
 
 def places(there: Mapping[str, float], resources: Resources) -> int:

@@ -54,7 +54,7 @@ class Handle(Protocol):
 
 
 class Launcher(Protocol):
-    """What starts runs: processes of this machine, or tasks on a cluster."""
+    """Starts runs, as processes of this machine or as tasks on a cluster."""
 
     @property
     def capacity(self) -> int:
@@ -69,9 +69,9 @@ class Launcher(Protocol):
 
 @dataclass(eq=False)
 class Attempt:
-    """A task whose process runs. Mutable."""
+    """A run with its process. Mutable."""
 
-    task: Work
+    work: Work
     claim: FileLock
     handle: Handle
     first_step: int
@@ -81,7 +81,7 @@ class Attempt:
 
 
 class Scheduler:
-    """Works through tasks until none is left that this process may take. Mutable."""
+    """Works through runs until none is left that this process may take. Mutable."""
 
     def __init__(self, launcher: Launcher, stop: Interrupt, say: Say = lambda text: None, waits: bool = False) -> None:
         """Starts nothing yet.
@@ -90,19 +90,19 @@ class Scheduler:
             launcher: what starts runs.
             stop: a requested stop ends all runs, with checkpoints.
             say: called with a line for each event.
-            waits: whether to wait for tasks that other processes have claimed, rather than to leave them to these.
+            waits: whether to wait for runs that other processes have claimed, rather than to leave them to these.
         """
         self.launcher, self.stop, self.say, self.waits = launcher, stop, say, waits
         self.works: list[Work] = []
         """All that were added."""
         self.waiting: deque[Work] = deque()
-        """Tasks that this process may still take."""
+        """Runs that this process may still take."""
         self.running: list[Attempt] = []
         self._lost: dict[Work, int] = {}
-        """How often in a row a task was lost without a new checkpoint."""
+        """How often in a row a run was lost without a new checkpoint."""
         self._rescan_at = 0.0
         self._passes = 0
-        """How often in a row every waiting task was held by another process."""
+        """How often in a row every waiting run was held by another process."""
 
     def add(self, works: Iterable[Work]) -> None:
         """Adds runs, in this order."""
@@ -119,7 +119,10 @@ class Scheduler:
     def run(self, watch: Callable[[], object] = lambda: None, policy: Policy = lambda: False) -> None:
         """Works until nothing is left; ``watch`` and ``policy`` are called several times a second."""
         try:
-            while policy() | self.turn():
+            while True:
+                may_add = policy()  # asked in every turn
+                if not self.turn() and not may_add:
+                    break
                 watch()
                 time.sleep(POLL)
             watch()
@@ -140,115 +143,115 @@ class Scheduler:
             if status is not None:
                 self._end(attempt, status)
         if self.stop.requested:
-            self.ask_to_stop(*self.waiting, *(attempt.task for attempt in self.running))
+            self.ask_to_stop(*self.waiting, *(attempt.work for attempt in self.running))
         if self.waiting and len(self.running) < self.launcher.capacity and time.monotonic() >= self._rescan_at:
             self._start_some()
         return bool(self.running or self.waiting)
 
-    def ask_to_stop(self, *tasks: Work) -> None:
+    def ask_to_stop(self, *works: Work) -> None:
         """Asks runs to stop with a checkpoint, and forgets those that wait."""
-        for task in tasks:
-            if task in self.waiting:
-                self.waiting.remove(task)
-                task.ending = "stopped"
+        for work in works:
+            if work in self.waiting:
+                self.waiting.remove(work)
+                work.ending = "stopped"
         for attempt in self.running:
-            if attempt.task in tasks and not attempt.asked:
+            if attempt.work in works and not attempt.asked:
                 attempt.asked = True
                 attempt.handle.stop()
 
     def _start_some(self) -> None:
-        """Starts tasks until there is no capacity left, or no task that nobody else holds."""
+        """Starts runs until there is no capacity left, or none that nobody else holds."""
         held: list[Work] = []
         while self.waiting and len(self.running) < self.launcher.capacity:
-            task = self.waiting.popleft()
+            work = self.waiting.popleft()
             try:
-                claim = claimed(task)
+                claim = claimed(work)
             except OSError as error:
-                self._leave(task, error)
+                self._leave(work, error)
                 continue
             if claim is None:
-                held.append(task)
-            elif self._is_open(task):  # no other process has trained it meanwhile
-                self._start(task, claim)
+                held.append(work)
+            elif self._is_open(work):  # no other process has trained it meanwhile
+                self._start(work, claim)
             else:
                 claim.release()
         self.waiting.extendleft(reversed(held))
         if held:
             self._rescan_at = time.monotonic() + RESCAN
         self._passes = self._passes + 1 if held and not self.running else 0
-        if self._passes > 1 and not self.waits and all(is_locked(task.claim) for task in held):
-            self.waiting.clear()  # two looks found every task claimed elsewhere, and not only trained by one that is ending
+        if self._passes > 1 and not self.waits and all(is_locked(work.claim) for work in held):
+            self.waiting.clear()  # two looks found every run claimed elsewhere, and not only trained by one that is ending
 
-    def _is_open(self, task: Work) -> bool:
+    def _is_open(self, work: Work) -> bool:
         """Returns whether a run is to be trained, else notes how it has ended."""
-        if task.is_open():
+        if work.is_open():
             return True
-        task.ending = "failed" if task.exit_status() else "done"
+        work.ending = "failed" if work.exit_status() else "done"
         return False
 
-    def _start(self, task: Work, claim: FileLock) -> None:
+    def _start(self, work: Work, claim: FileLock) -> None:
         """Starts a run, from its newest checkpoint if there is one."""
         try:
-            first = newest_step(task.files.checkpoints)
-            file = task.lock.with_suffix(".task")
-            write_task(file, task.task())
-            handle = self.launcher.start(file, task.log, task.lock)
+            first = newest_step(work.files.checkpoints)
+            file = work.lock.with_suffix(".task")
+            write_task(file, work.task())
+            handle = self.launcher.start(file, work.log, work.lock)
         except OSError as error:
             claim.release()
-            self._leave(task, error)
+            self._leave(work, error)
             return
-        self.running.append(Attempt(task, claim, handle, first))
+        self.running.append(Attempt(work, claim, handle, first))
 
-    def _leave(self, task: Work, error: OSError) -> None:
+    def _leave(self, work: Work, error: OSError) -> None:
         """Leaves a run that cannot be started to a later process, which may be one of another machine."""
-        task.ending, task.reason = "left", f"could not be started: {' '.join(str(error).split())}"
-        self.say(f"{task.name} {task.reason}")
+        work.ending, work.reason = "left", f"could not be started: {' '.join(str(error).split())}"
+        self.say(f"{work.name} {work.reason}")
 
     def _end(self, attempt: Attempt, status: int) -> None:
         """Applies the rule to a run whose process ended."""
-        task = attempt.task
+        work = attempt.work
         self.running.remove(attempt)
-        task.status = status
+        work.status = status
         try:
-            if status == 0 and task.has_result():
-                self._note(task, "done", "")
+            if status == 0 and work.has_result():
+                self._note(work, "done", "")
             elif status == 0:
-                self._note(task, "failed", f"ended without a result: {last_line(task.log)}")
+                self._note(work, "failed", f"ended without a result: {last_line(work.log)}")
             elif attempt.asked and (status < 0 or status in STOPPED):
-                self._note(task, "stopped", "")
+                self._note(work, "stopped", "")
             elif status < 0 or status in (*STOPPED, TAKEN):
                 self._go_on_later(attempt, status)
             else:
-                self._note(task, "failed", f"failed with exit status {status}: {last_line(task.log)}")
+                self._note(work, "failed", f"failed with exit status {status}: {last_line(work.log)}")
         finally:
             attempt.claim.release()
 
     def _go_on_later(self, attempt: Attempt, status: int) -> None:
         """Puts a lost run back, unless it was lost too often."""
-        task, step = attempt.task, newest_step(attempt.task.files.checkpoints)
-        self._lost[task] = 0 if step > attempt.first_step else self._lost.get(task, 0) + 1
-        if self._lost[task] >= MAX_LOST:
+        work, step = attempt.work, newest_step(attempt.work.files.checkpoints)
+        self._lost[work] = 0 if step > attempt.first_step else self._lost.get(work, 0) + 1
+        if self._lost[work] >= MAX_LOST:
             text = f"was lost {MAX_LOST} times in a row without a new checkpoint (exit status {status})"
-            self._note(task, "failed", text)
+            self._note(work, "failed", text)
             return
         how = f"continues from step {step:,}" if step >= 0 else "starts from the beginning"
-        self.say(f"{task.name} was lost (exit status {status}); it {how}")
-        self.waiting.appendleft(task)
+        self.say(f"{work.name} was lost (exit status {status}); it {how}")
+        self.waiting.appendleft(work)
 
-    def _note(self, task: Work, ending: Ending, reason: str) -> None:
+    def _note(self, work: Work, ending: Ending, reason: str) -> None:
         """Records how a run ended, and says so."""
-        task.ending, task.reason = ending, reason
-        self.say(f"{task.name} {reason} (log {task.log})" if reason else f"{task.name}: {ending}")
+        work.ending, work.reason = ending, reason
+        self.say(f"{work.name} {reason} (log {work.log})" if reason else f"{work.name}: {ending}")
         try:
-            task.ended()
+            work.ended()
         except OSError as error:
-            self.say(f"{task.name} ended with exit status {task.status}, but {error}")
+            self.say(f"{work.name} ended with exit status {work.status}, but {error}")
 
 
-def claimed(task: Work) -> FileLock | None:
-    """Returns the claim of a task, held by this process; None if another process claims or trains it."""
-    claim = hold(task.claim)
-    if claim is not None and task.is_training():
+def claimed(work: Work) -> FileLock | None:
+    """Returns the claim of a run, held by this process; None if another process claims or trains it."""
+    claim = hold(work.claim)
+    if claim is not None and work.is_training():
         claim.release()
         return None
     return claim

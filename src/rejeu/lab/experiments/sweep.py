@@ -30,7 +30,7 @@ echo = partial(print, flush=True)
 
 
 def imports_of(folder: SweepFolder, typed: RunConfig) -> tuple[str, ...]:
-    """Returns what each run of a folder imports: what the command line named, with what offers the algorithms.
+    """Returns the modules that each run of a folder imports: those that the command line named, or that offer its algorithms.
 
     Raises:
         ValueError: if the processes of the runs could not find an algorithm.
@@ -51,7 +51,7 @@ def count(states: Iterable[str]) -> dict[str, int]:
 
 @dataclass(frozen=True)
 class SweepResult:
-    """What :func:`sweep` returns. ``rejeu.compare(result.path)`` compares its runs."""
+    """Result of :func:`sweep`. ``rejeu.compare(result.path)`` compares its runs."""
 
     path: Path
     """Folder of the sweep."""
@@ -61,32 +61,32 @@ class SweepResult:
     @property
     def runs(self) -> list[Path]:
         """Folders of the runs that are done."""
-        return [one.path for one in self.outcomes if one.state == "done"]
+        return [work.path for work in self.outcomes if work.state == "done"]
 
     @property
     def failed(self) -> list[Work]:
         """The jobs that failed; the log of each says why."""
-        return [one for one in self.outcomes if one.state == "failed"]
+        return [work for work in self.outcomes if work.state == "failed"]
 
     @property
     def is_complete(self) -> bool:
         """Whether all jobs are done."""
-        return all(one.state == "done" for one in self.outcomes)
+        return all(work.state == "done" for work in self.outcomes)
 
     def counts(self) -> dict[str, int]:
         """Returns how many jobs are in each state."""
-        return count(one.state for one in self.outcomes)
+        return count(work.state for work in self.outcomes)
 
     def table(self) -> list[dict[str, Any]]:
         """Returns one row for each job, ready for ``pandas.DataFrame``."""
         return [
             {
-                **{"name": one.job.name, "setting": one.job.setting},
-                **{key: getattr(one.job.run, key) for key in ("env", "algorithm", "seed")},
-                **{"state": one.state, "exit_status": one.exit_status() if one.status is None else one.status},
-                **{"path": one.path, "log": one.log},
+                **{"name": work.job.name, "setting": work.job.setting},
+                **{key: getattr(work.job.run, key) for key in ("env", "algorithm", "seed")},
+                **{"state": work.state, "exit_status": work.exit_status() if work.status is None else work.status},
+                **{"path": work.path, "log": work.log},
             }
-            for one in self.outcomes
+            for work in self.outcomes
         ]
 
 
@@ -110,15 +110,15 @@ def prepare(
         PlanError: for a mistake in the plan, with its line.
         ValueError, FileExistsError: if the folder belongs to something else.
     """
-    found, text = read_plan(plan)
-    at_once = min(workers or default_workers(), len(found.jobs))
-    share = threads_of(at_once) if ray is None else max(int(found.resources.cpus), 1)
+    checked, text = read_plan(plan)
+    at_once = min(workers or default_workers(), len(checked.jobs))
+    share = threads_of(at_once) if ray is None else max(int(checked.resources.cpus), 1)
     path = Path(folder or dated("sweep" if isinstance(plan, Mapping) else Path(plan).stem))
-    return open_folder(path, dataclasses.replace(found, threads=found.threads or share), text, typed)
+    return open_folder(path, dataclasses.replace(checked, threads=checked.threads or share), text, typed)
 
 
 def make_launcher(folder: SweepFolder, workers: int | None, ray: str | None) -> Launcher:
-    """Returns what starts runs: processes on this machine, or tasks on a Ray cluster.
+    """Returns the launcher of runs: of processes on this machine, or of tasks on a Ray cluster.
 
     Raises:
         MissingExtra: if Ray is needed and not installed.
@@ -166,12 +166,12 @@ def sweep(
     """
     typed = RunConfig(env="", imports=tuple(imports))
     is_folder = not isinstance(plan, Mapping) and Path(plan).is_dir()
-    found = read_folder(Path(plan), typed) if is_folder else prepare(plan, folder, workers, typed, ray)  # type: ignore[arg-type]
+    prepared = read_folder(Path(plan), typed) if is_folder else prepare(plan, folder, workers, typed, ray)  # type: ignore[arg-type]
     with Interrupt() as stop:
-        imports = imports_of(found, typed)
-        scheduler = train(found, make_launcher(found, workers, ray), stop, imports, retry, progress)
+        imports = imports_of(prepared, typed)
+        scheduler = train(prepared, make_launcher(prepared, workers, ray), stop, imports, retry, progress)
         stop.check()
-    return SweepResult(found.path, tuple(scheduler.works))
+    return SweepResult(prepared.path, tuple(scheduler.works))
 
 
 def train(
@@ -201,5 +201,5 @@ def train(
 
 def states_text(works: Iterable[Work]) -> str:
     """Returns how many runs are in each state, such as ``2 running, 3 done``."""
-    found = count(one.state for one in works)
-    return ", ".join(f"{number} {state}" for state, number in found.items() if number)
+    counts = count(work.state for work in works)
+    return ", ".join(f"{number} {state}" for state, number in counts.items() if number)

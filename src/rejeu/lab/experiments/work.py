@@ -75,13 +75,13 @@ class Job:
         return f"seed {self.seed}" if self.name == f"seed_{self.seed}" else self.name
 
     def task(self, folder: Path, resume: bool, imports: tuple[str, ...]) -> Task:
-        """Returns what a process is asked to do: to begin the run in a folder, or to continue it there."""
+        """Returns the task of a process: to begin the run in a folder, or to continue it there."""
         run = replace(self.run, imports=imports)
         return Task(folder=str(folder), run=run, resume=resume, no_report=self.no_report, no_video=self.no_video)
 
     def check_code(self, typed: RunConfig, where: object) -> None:
         """Raises ``CheckpointError`` if the job imports something that the command line does not name."""
-        kwargs, of_line = ({key: written(one) for key, one in run.env_kwargs.items()} for run in (self.run, typed))
+        kwargs, of_line = ({key: written(value) for key, value in run.env_kwargs.items()} for run in (self.run, typed))
         is_named = self.run.env == typed.env and self.run.wrappers == typed.wrappers and kwargs == (of_line or kwargs)
         if not self.run.names_code or (is_named and (of_line or are_plain(self.run.env_kwargs))):
             return
@@ -111,7 +111,7 @@ def job_name(*parts: object) -> str:
     'ALE-Pong-v5-DQN-seed3'
     """
     *labels, seed = parts
-    text = "-".join(str(one) for one in labels if one)
+    text = "-".join(str(label) for label in labels if label)
     return f"{re.sub(r'[^A-Za-z0-9_.]+', '-', text).strip('-.')[: MAX_NAME - 20]}-seed{seed}"
 
 
@@ -187,7 +187,7 @@ class Work:
         return self.is_retried or not (status or (status == 0 and self.has_result()))
 
     def task(self) -> Task:
-        """Returns what trains it on: from its newest checkpoint, else from the start.
+        """Returns the task that trains it on: from its newest checkpoint, else from the start.
 
         A run folder without a checkpoint is moved aside first.
         """

@@ -137,8 +137,8 @@ class HostedGame:
             except queue.Empty:
                 return
             game.handle(event)
-            self._presses += event.kind == "press"
-            is_due = game.closed or (at_once and event.kind == "press")
+            self._presses += event.type == "press"
+            is_due = game.closed or (at_once and event.type == "press")
 
 
 def caption(game: Game, player: Player) -> dict[str, Any]:

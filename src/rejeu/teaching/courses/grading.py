@@ -34,7 +34,7 @@ MAX_BYTES = 64 * 2**20
 
 
 class Grade(NamedTuple):
-    """What the checks of a notebook found."""
+    """Results of the checks of a notebook."""
 
     path: Path
     found: dict[str, str | None]
@@ -47,7 +47,7 @@ class Grade(NamedTuple):
     @property
     def n_passed(self) -> int:
         """The number of checks that passed."""
-        return sum(found == "" for found in self.found.values())
+        return sum(problem == "" for problem in self.found.values())
 
 
 def grade(path: Path, seconds: float = SECONDS) -> Grade:
@@ -70,7 +70,7 @@ def grade(path: Path, seconds: float = SECONDS) -> Grade:
     language = chosen(spoken and spoken[1])
     command = interrupt.program("-c", "from rejeu.teaching.courses.grading import main; main()")
     quiet = {"MPLBACKEND": "agg", "PYTHONIOENCODING": "utf-8"}
-    say, found, why = partial(said, language=language), {}, ""
+    say, problems, why = partial(said, language=language), {}, ""
     try:
         done = subprocess.run(
             command,
@@ -81,12 +81,12 @@ def grade(path: Path, seconds: float = SECONDS) -> Grade:
             env=os.environ | quiet,
             check=False,
         )
-        found = json.loads(done.stdout.splitlines()[-1])
+        problems = json.loads(done.stdout.splitlines()[-1])
     except subprocess.TimeoutExpired:
         why = say("it took longer than {:g} seconds", seconds)
     except (IndexError, ValueError):
         why = say("its process ended ({})", checks.short(done.stderr[-160:]))
-    return Grade(path, {name: found.get(name) for name in names}, why, language)
+    return Grade(path, {name: problems.get(name) for name in names}, why, language)
 
 
 def main() -> None:

@@ -96,7 +96,7 @@ COLUMNS = ("place", "model", "algorithm", "steps", "seed", "mean return", "95 % 
 
 def columns(language: Language) -> list[str]:
     """Returns the titles of the columns."""
-    return [said(one, language=language) for one in COLUMNS]
+    return [said(title, language=language) for title in COLUMNS]
 
 
 def models(folder: Path) -> list[Path]:
@@ -111,11 +111,11 @@ def models(folder: Path) -> list[Path]:
         raise FileNotFoundError(f"there is no folder {folder}")
     suffixes = (checkpoint.SUFFIX, ".zip")
     every = (Path(root, name) for root, _, names in os.walk(folder) for name in names)  # also if some cannot be read
-    files = (one for one in every if one.suffix in suffixes and os.path.isfile(one) and not one.is_symlink())
-    found = {find_model(one.parent) if is_of_run(one) else one for one in files if not is_passing(one)}
-    if not found:
+    files = (path for path in every if path.suffix in suffixes and os.path.isfile(path) and not path.is_symlink())
+    paths = {find_model(file.parent) if is_of_run(file) else file for file in files if not is_passing(file)}
+    if not paths:
         raise FileNotFoundError(f"{folder} holds no {' or '.join(suffixes)} files; agent.save(name) writes them")
-    return sorted(found)
+    return sorted(paths)
 
 
 def is_passing(path: Path) -> bool:
@@ -134,7 +134,7 @@ def is_of_run(path: Path) -> bool:
 def name_of(path: Path, folder: Path, paths: Sequence[Path]) -> str:
     """Returns the name of a model among others: its path in the folder, of a run that of the run."""
     bare = path.parent if is_of_run(path) else path.with_suffix("")
-    is_alone = sum(other.with_suffix("") == bare for other in paths) <= 1
+    is_alone = sum(peer.with_suffix("") == bare for peer in paths) <= 1
     return shown((bare if is_alone else path).relative_to(folder).as_posix().replace(".", folder.name, bare == folder))
 
 
@@ -213,11 +213,11 @@ def build(
     with closing(make_vector(episodes)) as env:
         for path in paths:
             name = name_of(path, folder, paths)
-            found = results[path] = result_of(path, name, env_id, env, episodes, seed, seconds, success_threshold)
-            if isinstance(found, Unranked):
-                text = found.said(language)
+            result = results[path] = result_of(path, name, env_id, env, episodes, seed, seconds, success_threshold)
+            if isinstance(result, Unranked):
+                text = result.said(language)
             else:
-                cells = cells_of(found, language)
+                cells = cells_of(result, language)
                 text = f"{titles[5]} {cells[5]} ({titles[6]} {cells[6]})"
             report(said("{}: {}", name, text, language=language))
     return board_of(folder, paths, env_id, episodes, results, language)
@@ -232,9 +232,11 @@ def board_of(
     language: Language,
 ) -> Leaderboard:
     """Returns the leaderboard of the models that have a result; the other arguments are those of :func:`build`."""
-    problems = [(name_of(path, folder, paths), found) for path, found in results.items() if isinstance(found, Unranked)]
+    problems = [
+        (name_of(path, folder, paths), result) for path, result in results.items() if isinstance(result, Unranked)
+    ]
     equal = tuple(tuple(name_of(path, folder, paths) for path in group) for group in equal_files(paths))
-    rows = ranked(found for found in results.values() if isinstance(found, Entrant))
+    rows = ranked(result for result in results.values() if isinstance(result, Entrant))
     return Leaderboard(env_id, episodes, rows, tuple(problems), language, equal)
 
 
@@ -289,11 +291,11 @@ def evaluated(
 
 def ranked(models: Iterable[Entrant]) -> tuple[Entrant, ...]:
     """Returns the models by mean return, with the places that their intervals allow."""
-    done = sorted(models, key=lambda one: (-one.evaluation.mean_return, one.name))
-    lows, highs = np.array([one.interval for one in done]).reshape(-1, 2).T
+    done = sorted(models, key=lambda model: (-model.evaluation.mean_return, model.name))
+    lows, highs = np.array([model.interval for model in done]).reshape(-1, 2).T
     return tuple(
-        replace(one, first=1 + int(np.sum(lows > one.interval[1])), last=int(np.sum(highs >= one.interval[0])))
-        for one in done
+        replace(model, first=1 + int(np.sum(lows > model.interval[1])), last=int(np.sum(highs >= model.interval[0])))
+        for model in done
     )
 
 
@@ -339,16 +341,16 @@ def markdown(board: Leaderboard) -> str:
 
 def notes(board: Leaderboard) -> list[str]:
     """Returns a line for each model without a place, and for each group of equal files."""
-    said_of = ((name, reason.said(board.language)) for name, reason in board.problems)
-    lines = [said("{}: {}", *one, language=board.language) for one in said_of]
-    return lines + [said("The same file: {}", ", ".join(names), language=board.language) for names in board.equal]
+    say = partial(said, language=board.language)
+    lines = [say("{}: {}", name, reason.said(board.language)) for name, reason in board.problems]
+    return lines + [say("The same file: {}", ", ".join(names)) for names in board.equal]
 
 
 def cells_of(row: Entrant, language: Language) -> list[str]:
     """Returns the cells of a row, in the order of the columns."""
     to, result = partial(said, "{} to {}", language=language), row.evaluation
     low, high = row.interval
-    place = f"{row.first}" if row.first == row.last else to(row.first, row.last)
+    places = f"{row.first}" if row.first == row.last else to(row.first, row.last)
     numbers = [
         f"{row.steps:,}",
         f"{row.seed}",
@@ -357,7 +359,7 @@ def cells_of(row: Entrant, language: Language) -> list[str]:
         "" if math.isnan(result.success_rate) else f"{result.success_rate:.0%}",
         f"{result.mean_length:,.0f}",
     ]
-    return [place, row.name, row.algorithm, *(written(one, language) for one in numbers)]
+    return [places, row.name, row.algorithm, *(written(number, language) for number in numbers)]
 
 
 def written(number: str, language: Language) -> str:

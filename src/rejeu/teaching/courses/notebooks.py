@@ -47,7 +47,7 @@ from rejeu.core.language import LANGUAGES, Language
 Version = Literal["exercise", "solution"]
 
 ANSWER: dict[Language, str] = {"en": "*Your answer:* ...", "fr": "*Votre réponse :* ..."}
-"""What stands in an exercise in place of an answer."""
+"""Text of an exercise in place of an answer."""
 SPEED = "REJEU_COURSE_SPEED"
 """Environment variable that divides the numbers of steps, for a quick look at a whole notebook."""
 KERNEL = {"display_name": "Python 3", "language": "python", "name": "python3"}
@@ -99,11 +99,11 @@ def write(language: Language, folder: Path) -> Iterator[tuple[Path, bool]]:
     for source in sources():
         content = source.read_text(encoding="utf-8")
         for version, parent in folders.items():
-            made = notebook(content, language, version)
+            document = notebook(content, language, version)
             make_folder(parent)
             for ending, form in ((".py", "py:percent"), (".ipynb", "ipynb")):
                 path = parent / f"{source.name.removesuffix('.md')}{ending}"
-                yield path, _write_new(path, jupytext().writes(made, form))
+                yield path, _write_new(path, jupytext().writes(document, form))
 
 
 def jupytext() -> Any:
@@ -167,12 +167,12 @@ def _code(lines: list[str], language: Language, version: Version) -> Iterator[st
         if (begin and where != "outside") or (end and where == "outside"):
             raise ValueError(f"{whole.strip()!r} is not expected here, after {lines[0]!r}")
         if begin is not None:
-            where, left = "hints", begin["indent"] + (begin["left"] or "...")
+            where, placeholder = "hints", begin["indent"] + (begin["left"] or "...")
             continue
         if where == "hints" and not whole.lstrip().startswith("# ["):
             where = "inside"
             if version == "exercise":
-                yield left
+                yield placeholder
         if end is not None:
             where = "outside"
             continue
@@ -207,7 +207,7 @@ def _with_french_spaces(text: str) -> str:
     'Pourquoi\xa0? `a ? b`'
     """
     parts = CODE_OR_MATH.split(text)
-    parts[::2] = [re.sub(r" (?=[:;?!»%](?![-\w]))|(?<=«) ", "\N{NO-BREAK SPACE}", part) for part in parts[::2]]
+    parts[::2] = [re.sub(r" (?=[:;?!»%](?![-\w]))|(?<=«) ", "\N{NO-BREAK SPACE}", prose) for prose in parts[::2]]
     return "".join(parts)
 
 

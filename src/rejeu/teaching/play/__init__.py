@@ -60,9 +60,9 @@ def play(
         OSError: if there is no display.
     """
     opponents = {} if against is None else {_name(against): against}
-    with opened(env, opponents, keys=keys, seed=seed, fps=fps, episodes=episodes, record=record) as made:
-        _run(Window(f"rejeu play {made.env_id}"), made)
-    return made.game
+    with opened(env, opponents, keys=keys, seed=seed, fps=fps, episodes=episodes, record=record) as opened_game:
+        _run(Window(f"rejeu play {opened_game.env_id}"), opened_game)
+    return opened_game.game
 
 
 def watch(
@@ -87,13 +87,13 @@ def watch(
         ValueError: for an unknown environment or one that does not render.
         OSError: if there is no display.
     """
-    with opened(env, {_name(agent): agent}, by_hand=False, seed=seed, fps=fps, episodes=episodes) as made:
-        _run(Window(f"rejeu watch {made.env_id}"), made)
-    return made.game
+    with opened(env, {_name(agent): agent}, by_hand=False, seed=seed, fps=fps, episodes=episodes) as opened_game:
+        _run(Window(f"rejeu watch {opened_game.env_id}"), opened_game)
+    return opened_game.game
 
 
 class Opened(NamedTuple):
-    """A game, and what shows it needs of it."""
+    """A game, with its environment's id, keys and speed."""
 
     game: Game
     env_id: str
@@ -129,24 +129,24 @@ def opened(
     seed, episodes = _check(seed, fps, episodes)
     with ExitStack() as stack:
 
-        def made(agent: Any = None) -> gym.Env:
-            one = rendering(env) if agent is None else for_agent(agent, rendering(env))
-            stack.callback(one.close)
-            return one
+        def make(agent: Any = None) -> gym.Env:
+            player_env = rendering(env) if agent is None else for_agent(agent, rendering(env))
+            stack.callback(player_env.close)
+            return player_env
 
         players, bound = [], None
         if by_hand:
-            own = made()
-            bound = keys_for(id_of(own), own.action_space, keys)
-            players.append(Player("you", own, _hand(bound)))
-        players += [Player(name, made(agent), _policy(agent)) for name, agent in agents.items()]
+            hand_env = make()
+            bound = keys_for(id_of(hand_env), hand_env.action_space, keys)
+            players.append(Player("you", hand_env, _hand(bound)))
+        players += [Player(name, make(agent), _policy(agent)) for name, agent in agents.items()]
         first = players[0]
         fps = natural_fps(first.env) if fps is None else fps
         if record is not None:
             first.recording = Recording(record, first.env, fps if has_video else None)
             stack.callback(first.recording.close)
         names = frozenset() if bound is None else bound.names
-        game = Game(players, seed, names, episodes, rest=round(REST_SECONDS * fps))
+        game = Game(players, seed, names, episodes, ticks_over=round(REST_SECONDS * fps))
         yield Opened(game, id_of(first.env), bound, fps)
 
 
@@ -171,14 +171,14 @@ def rendering(env: str | Callable[..., gym.Env]) -> gym.Env:
     return make_rendering_env(partial(make_env, env_id), env_id)
 
 
-def _run(window: Window, made: Opened) -> None:
+def _run(window: Window, opened_game: Opened) -> None:
     with window, Interrupt() as stop:
-        made.begin()
-        window.open(made.game, made.keys)
-        while not made.game.closed:
+        opened_game.begin()
+        window.open(opened_game.game, opened_game.keys)
+        while not opened_game.game.closed:
             stop.check()
-            turn(window, made.game)
-            window.wait(made.fps)
+            turn(window, opened_game.game)
+            window.wait(opened_game.fps)
 
 
 def _check(seed: int | None, fps: float | None, episodes: int | None) -> tuple[int, int | None]:

@@ -59,7 +59,7 @@ class Expert:
             self.window.open(self.game, self.keys)
         while not self.game.closed and interrupt.requested() is None:
             for event in self.window.events():
-                if event.kind != "press" or event.key in self.keys.names or CONTROLS.get(event.key) != "restart":
+                if event.type != "press" or event.key in self.keys.names or CONTROLS.get(event.key) != "restart":
                     self.game.handle(event)
             if self.game.closed:
                 self.close()

@@ -22,7 +22,7 @@ Act = Callable[[Any, frozenset[str], int], Any]
 class Event(NamedTuple):
     """An event of the keyboard or the window."""
 
-    kind: str
+    type: str
     """``press``, ``release``, ``leave`` (the window lost the keyboard focus) or ``close``."""
     key: str = ""
     """SDL's name of the key in lower case."""
@@ -98,7 +98,7 @@ class Game:
     """Keys with actions; empty if nobody plays by hand."""
     episodes: int | None = None
     """Rounds after which the game closes, None for no limit."""
-    rest: int = 45
+    ticks_over: int = 45
     """Ticks for which the end of a round is shown."""
     phase: Literal["ready", "running", "over"] = "ready"
     paused: bool = False
@@ -121,11 +121,11 @@ class Game:
 
     def handle(self, event: Event) -> None:
         """Handles an event."""
-        if event.kind == "press":
+        if event.type == "press":
             self.press(event.key)
-        elif event.kind == "release":
+        elif event.type == "release":
             self.held.discard(event.key)
-        elif event.kind == "leave":
+        elif event.type == "leave":
             self.held.clear()
         else:
             self.closed = True
@@ -170,7 +170,7 @@ class Game:
         for player, action in zip(playing, actions, strict=True):
             player.step(action)
         if all(player.over for player in self.players):
-            self.phase, self.resting = "over", self.rest
+            self.phase, self.resting = "over", self.ticks_over
             self.rounds += 1
 
     def _next(self) -> None:

@@ -89,8 +89,8 @@ class KeyMap:
         for pair in OPPOSITES:
             if pressed.issuperset(pair) and not any(binding.keys.issuperset(pair) for binding in self.bindings):
                 pressed -= set(pair)
-        chosen = [binding.action for binding in _active(pressed, self.bindings)] or self.idle
-        return np.int64(chosen[step % len(chosen)]) if chosen else None
+        actions = [binding.action for binding in _active(pressed, self.bindings)] or self.idle
+        return np.int64(actions[step % len(actions)]) if actions else None
 
 
 def bind(space: gym.Space, actions: Mapping[str, Any], labels: Iterable[tuple[Any, str]] = ()) -> KeyMap:
@@ -120,8 +120,8 @@ def bind(space: gym.Space, actions: Mapping[str, Any], labels: Iterable[tuple[An
             by_keys[held] = Binding(held, converted, label)
     bindings = tuple(by_keys.values())
     if isinstance(space, gym.spaces.Box):
-        rest = _resting(space) if NONE not in actions else _box(space, NONE, actions[NONE])
-        return KeyMap(space, bindings, rest)
+        resting = _resting(space) if NONE not in actions else _box(space, NONE, actions[NONE])
+        return KeyMap(space, bindings, resting)
     idle = actions.get(NONE, WAIT)
     turns = [] if idle == WAIT else idle if isinstance(idle, list | tuple) else [idle]
     return KeyMap(space, bindings, tuple(_discrete(space, NONE, action) for action in turns))
@@ -148,25 +148,25 @@ def default_keys(space: gym.Space) -> dict[str, tuple[Any, str]]:
         return {key: (first + i, "") for key, i in (numbers | letters).items()}
     if not isinstance(space, gym.spaces.Box):
         return {}
-    rest = _resting(space)
-    if len(rest) > len(AXIS_KEYS):
-        example = ",".join(["1"] + ["0"] * (len(rest) - 1))
+    resting = _resting(space)
+    if len(resting) > len(AXIS_KEYS):
+        example = ",".join(["1"] + ["0"] * (len(resting) - 1))
         raise ValueError(
-            f"there are default keys for {len(AXIS_KEYS)} components, but the actions have {len(rest)}; bind keys with --keys "
-            f"a=[{example}] ..."
+            f"there are default keys for {len(AXIS_KEYS)} components, but the actions have {len(resting)}; bind keys with "
+            f"--keys a=[{example}] ..."
         )
-    found: dict[str, tuple[Any, str]] = {}
-    for i, keys in enumerate(AXIS_KEYS[: len(rest)]):
+    entries: dict[str, tuple[Any, str]] = {}
+    for i, keys in enumerate(AXIS_KEYS[: len(resting)]):
         for key, bounds, step, side in zip(keys, (space.low, space.high), (-1.0, 1.0), ("down", "up"), strict=True):
             bound = float(bounds.reshape(-1)[i])
-            action = [*rest[:i], bound if math.isfinite(bound) else rest[i] + step, *rest[i + 1 :]]
-            found[key] = action, f"number {i + 1} {side}"
-    return found
+            action = [*resting[:i], bound if math.isfinite(bound) else resting[i] + step, *resting[i + 1 :]]
+            entries[key] = action, f"number {i + 1} {side}"
+    return entries
 
 
 def equivalent_keys(binding: Binding, bindings: tuple[Binding, ...]) -> frozenset[str]:
     """Returns the keys of a binding and the equivalent arrow keys."""
-    bound = {key for other in bindings for key in other.keys}
+    bound = {key for peer in bindings for key in peer.keys}
     return binding.keys | {arrow for arrow, key in ARROWS.items() if key in binding.keys and arrow not in bound}
 
 
@@ -179,7 +179,7 @@ def _canonical(held: Iterable[str], bindings: tuple[Binding, ...]) -> set[str]:
 def _active(pressed: set[str], bindings: tuple[Binding, ...]) -> list[Binding]:
     """Returns the active bindings. A binding of several keys overrides those of some of its keys."""
     fitting = [binding for binding in bindings if binding.keys <= pressed]
-    return [one for one in fitting if not any(one.keys < other.keys for other in fitting)]
+    return [binding for binding in fitting if not any(binding.keys < larger.keys for larger in fitting)]
 
 
 def _keys(name: str) -> frozenset[str]:
@@ -210,8 +210,8 @@ def _box(space: gym.spaces.Box, name: str, action: Any) -> tuple[float, ...]:
     low, high = space.low.reshape(-1).tolist(), space.high.reshape(-1).tolist()
     if any(isinstance(x, bool) or not isinstance(x, int | float) for x in numbers) or len(numbers) != len(low):
         raise ValueError(f"{name}={_text(action)} must be {len(low)} number{'s' if len(low) > 1 else ''}, as in [0.5]")
-    for x, least, most in zip(numbers, low, high, strict=True):
-        if not (math.isfinite(x) and least <= x <= most):
+    for x, lower, upper in zip(numbers, low, high, strict=True):
+        if not (math.isfinite(x) and lower <= x <= upper):
             raise ValueError(f"{name}={_text(action)} is outside the action space, which is from {low} to {high}")
     return tuple(map(float, numbers))
 
@@ -282,11 +282,11 @@ def fits(space: gym.Space, actions: Mapping[str, Any]) -> bool:
     return True
 
 
-def keys_for(env_id: str, space: gym.Space, own: Mapping[str, Any] | None = None) -> KeyMap:
-    """Returns the key map of an environment: its default keys, or those of its action space, updated by ``own``.
+def keys_for(env_id: str, space: gym.Space, custom: Mapping[str, Any] | None = None) -> KeyMap:
+    """Returns the key map of an environment: its default keys, or those of its action space, updated by ``custom``.
 
     Raises:
-        ValueError: if the action space has no keys, or ``own`` does not match it.
+        ValueError: if the action space has no keys, or ``custom`` does not match it.
 
     >>> [binding.label for binding in keys_for("MountainCar-v0", gym.spaces.Discrete(3)).bindings]
     ['left', 'right']
@@ -294,6 +294,6 @@ def keys_for(env_id: str, space: gym.Space, own: Mapping[str, Any] | None = None
     entries = known_keys(env_id, space)
     if entries is None:
         is_wide = isinstance(space, gym.spaces.Box) and space.low.size > len(AXIS_KEYS)
-        entries = {} if own and is_wide else default_keys(space)
+        entries = {} if custom and is_wide else default_keys(space)
     labels = [(action, label) for key, (action, label) in entries.items() if label and key != NONE]
-    return bind(space, {**{key: action for key, (action, _) in entries.items()}, **(own or {})}, labels)
+    return bind(space, {**{key: action for key, (action, _) in entries.items()}, **(custom or {})}, labels)

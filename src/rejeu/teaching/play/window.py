@@ -99,29 +99,29 @@ class Window:
     def events(self) -> list[Event]:
         """Returns the events since the last call, oldest first."""
         pygame = self.pygame
-        found = []
+        new_events = []
         for event in pygame.event.get():
             if event.type in (pygame.KEYDOWN, pygame.KEYUP):
-                kind = "press" if event.type == pygame.KEYDOWN else "release"
-                found.append(Event(kind, pygame.key.name(event.key).lower()))
+                event_type = "press" if event.type == pygame.KEYDOWN else "release"
+                new_events.append(Event(event_type, pygame.key.name(event.key).lower()))
             elif event.type == pygame.WINDOWFOCUSLOST:
-                found.append(Event("leave"))
+                new_events.append(Event("leave"))
             elif event.type == pygame.QUIT:
-                found.append(Event("close"))
-        return found
+                new_events.append(Event("close"))
+        return new_events
 
     def draw(self, game: Game) -> None:
         """Draws the game."""
         self.canvas.fill(PAPER)
-        left = MARGIN
+        x = MARGIN
         for player, size in zip(game.players, self._sizes, strict=True):
-            self._draw_header(player, left, size[0], by_hand=bool(game.bound))
-            self._draw_picture(player.frame, (left, HEADER), size)
+            self._draw_header(player, x, size[0], by_hand=bool(game.bound))
+            self._draw_picture(player.frame, (x, HEADER), size)
             text = message(game, player)
             if text:
-                middle = left + size[0] / 2, HEADER + size[1] + MESSAGE_ROW / 2
+                middle = x + size[0] / 2, HEADER + size[1] + MESSAGE_ROW / 2
                 self._draw_message(text, middle, GREEN if player.success == 1.0 else INK)
-            left += size[0] + MARGIN
+            x += size[0] + MARGIN
         self._draw_legend(game)
         self._present()
 
@@ -152,11 +152,11 @@ class Window:
             self._screen.blit(self.pygame.transform.smoothscale(self.canvas, size), corner)
         self.pygame.display.flip()
 
-    def _draw_header(self, player: Player, left: int, width: int, by_hand: bool) -> None:
-        self._write(said(player.name), (left, 12), 24, INK)
-        self._write(score_summary(player, by_hand), (left + width, 14), 22, FAINT, right=True)
-        self._write(said("score {}", number(player.score)), (left, 37), 24, BLUE)
-        self._write(said("step {}", player.steps), (left + width, 38), 22, FAINT, right=True)
+    def _draw_header(self, player: Player, x: int, width: int, by_hand: bool) -> None:
+        self._write(said(player.name), (x, 12), 24, INK)
+        self._write(score_summary(player, by_hand), (x + width, 14), 22, FAINT, right=True)
+        self._write(said("score {}", number(player.score)), (x, 37), 24, BLUE)
+        self._write(said("step {}", player.steps), (x + width, 38), 22, FAINT, right=True)
 
     def _draw_picture(self, frame: np.ndarray, corner: tuple[int, int], size: tuple[int, int]) -> None:
         height, width = frame.shape[:2]
@@ -178,14 +178,14 @@ class Window:
         """Returns the rows of the legend, each entry with its left edge; the window's keys come last."""
         entries = [*self._legend, *(LegendEntry([(key, frozenset())], said(label)) for key, label in HELP)]
         rows: list[list[tuple[LegendEntry, int]]] = [[]]
-        left = MARGIN
+        x = MARGIN
         for entry in entries:
             wide = sum(self._key_width(text) + 4 for text, _ in entry.keys) + self._fonts[20].size(entry.label)[0] + 16
-            if left + wide > width and rows[-1]:
+            if x + wide > width and rows[-1]:
                 rows.append([])
-                left = MARGIN
-            rows[-1].append((entry, left))
-            left += wide
+                x = MARGIN
+            rows[-1].append((entry, x))
+            x += wide
         return rows
 
     def _key_width(self, text: str) -> int:
@@ -195,15 +195,15 @@ class Window:
         top = self.canvas.get_height() - LEGEND_ROW * len(self._rows) - 2
         for row, entries in enumerate(self._rows):
             y = top + LEGEND_ROW * row
-            for entry, left in entries:
+            for entry, x in entries:
                 for text, names in entry.keys:
-                    plate = (left, y, self._key_width(text), LEGEND_ROW - 6)
+                    plate = (x, y, self._key_width(text), LEGEND_ROW - 6)
                     down = bool(names & game.held)
                     self.pygame.draw.rect(self.canvas, BLUE if down else WHITE, plate, border_radius=4)
                     self.pygame.draw.rect(self.canvas, BLUE if down else LINE, plate, 1, border_radius=4)
-                    self._write(text, (left + 6, y + 3), 22, WHITE if down else INK)
-                    left += self._key_width(text) + 4
-                self._write(entry.label, (left + 2, y + 4), 20, FAINT)
+                    self._write(text, (x + 6, y + 3), 22, WHITE if down else INK)
+                    x += self._key_width(text) + 4
+                self._write(entry.label, (x + 2, y + 4), 20, FAINT)
 
     def _write(self, text: str, corner: tuple[int, int], size: int, color: Color, right: bool = False) -> None:
         drawn = self._fonts[size].render(text, True, color)

@@ -86,7 +86,7 @@ class NotebookState:
 
     def __init__(self) -> None:
         self.found: dict[str, str] = {}
-        """What each check found, by its name: nothing if the answer is right, else the message."""
+        """Result of each check, by its name: nothing if the answer is right, else the message."""
 
     def say(self, key: str, course: str = "base", exercise: str = "shared", **values: Any) -> str:
         """Returns a message in the language of the notebook.
@@ -138,14 +138,14 @@ def exercise(check: Callable[..., None]) -> Callable[..., Verdict]:
         try:
             check(*args, **kwargs)
         except Wrong as error:
-            found = SESSION.say(error.key, course, name, **error.values)
+            message = SESSION.say(error.key, course, name, **error.values)
         except Exception as error:
-            found = SESSION.say("unusable", what=f"{type(error).__name__}: {short(error)}")
+            message = SESSION.say("unusable", what=f"{type(error).__name__}: {short(error)}")
         else:
-            found = ""
-        SESSION.found[name] = found
-        print(SESSION.say("not_yet", name=name, found=found) if found else f"OK - {name}")
-        return Verdict(not found)
+            message = ""
+        SESSION.found[name] = message
+        print(SESSION.say("not_yet", name=name, found=message) if message else f"OK - {name}")
+        return Verdict(not message)
 
     return checked
 
@@ -163,25 +163,25 @@ def of_table(
     name: str, module: str, section: Mapping[str, Any], functions: Mapping[str, Any]
 ) -> Callable[..., Verdict]:
     """Returns the check of a section of a table."""
-    each, is_compiled, named = section.get("each", ()), section.get("compiles", False), section["case"]
-    case = {key: functions[one] if isinstance(one, str) else one for key, one in named.items()}
-    case = {key: np.asarray(one) if isinstance(one, list) else one for key, one in case.items()}
-    rows = zip(*(case[one] for one in each), strict=True)
+    each, is_compiled = section.get("each", ()), section.get("compiles", False)
+    case = {key: functions[value] if isinstance(value, str) else value for key, value in section["case"].items()}
+    case = {key: np.asarray(value) if isinstance(value, list) else value for key, value in case.items()}
+    rows = zip(*(case[key] for key in each), strict=True)
     cases = [{**case, **dict(zip(each, row, strict=True))} for row in rows] if each else [case]
-    wrong = {key: one["result"] for key, one in section.items() if isinstance(one, dict) and "result" in one}
+    wrong = {key: entry["result"] for key, entry in section.items() if isinstance(entry, dict) and "result" in entry}
 
     def check(student: Any) -> None:
-        convert = lambda one: jnp.asarray(one) if is_compiled and hasattr(one, "dtype") else one  # noqa: E731
-        given = [[*map(convert, one.values())] for one in cases]
+        convert = lambda value: jnp.asarray(value) if is_compiled and hasattr(value, "dtype") else value  # noqa: E731
+        inputs = [[*map(convert, case.values())] for case in cases]
         right = np.asarray(section["right"])
-        results = [call(student, *arguments) for arguments in given]
-        mistakes(**{key: np.shape(results[0]) == np.shape(one) != right.shape for key, one in wrong.items()})
-        found = [numbers(result, right.shape[1:] if each else right.shape) for result in results]
-        diagnose(np.stack(found) if each else found[0], right, **wrong)
+        results = [call(student, *arguments) for arguments in inputs]
+        mistakes(**{key: np.shape(results[0]) == np.shape(mistake) != right.shape for key, mistake in wrong.items()})
+        outputs = [numbers(result, right.shape[1:] if each else right.shape) for result in results]
+        diagnose(np.stack(outputs) if each else outputs[0], right, **wrong)
         if is_compiled:
-            compiles(student, *given[0])
+            compiles(student, *inputs[0])
         if section.get("gradient"):
-            gradient = jax.tree.leaves(call(jax.grad(student), *given[0]))
+            gradient = jax.tree.leaves(call(jax.grad(student), *inputs[0]))
             mistakes(no_gradient=all(close(leaf, np.zeros(leaf.shape)) for leaf in gradient))
 
     check.__name__, check.__module__ = name, module
@@ -219,13 +219,13 @@ def call(student: Any, *args: Any, may_return_none: bool = False, copies: bool =
     """
     if not callable(student):
         raise Wrong("not_a_function", what=short(student))
-    given = copy.deepcopy(args) if copies else args
+    arguments = copy.deepcopy(args) if copies else args
     try:
-        result = student(*given)
+        result = student(*arguments)
     except (Exception, SystemExit) as error:
-        what, line = f"{type(error).__name__}: {short(error)}", line_of(error)
-        raise Wrong("raises_in_line" if line else "raises", what=what, line=line) from None
-    if not _same(args, given):
+        problem, line = f"{type(error).__name__}: {short(error)}", line_of(error)
+        raise Wrong("raises_in_line" if line else "raises", what=problem, line=line) from None
+    if not _same(args, arguments):
         raise Wrong("changes_arguments")
     if (result is None and not may_return_none) or result is ...:
         raise Wrong("returns_nothing", what=short(result))
@@ -282,13 +282,13 @@ def diagnose(result: np.ndarray, right: Any, /, **wrong: Any) -> None:
     raise Wrong("by_hand", seen=_rounded(result), right=_rounded(right))
 
 
-def mistakes(**seen: Any) -> None:
+def mistakes(**occurred: Any) -> None:
     """Raises :class:`Wrong` with the message of the first mistake that was seen.
 
     Args:
-        seen: whether each mistake was seen, by the name of its message.
+        occurred: whether each mistake was seen, by the name of its message.
     """
-    for key, is_seen in seen.items():
+    for key, is_seen in occurred.items():
         if is_seen:
             raise Wrong(key)
 

@@ -85,11 +85,11 @@ def repel(student: Any) -> None:
 
     result = call(student, action, x, strength, low, high)
     mistakes(two_values=not isinstance(result, tuple | list) or len(result) != 2)
-    taken, after = numbers(result[0], (4,)), numbers(result[1], (4,))
+    new_action, after = numbers(result[0], (4,)), numbers(result[1], (4,))
     right = np.clip(u - push(u), low, high)
-    mistakes(swapped=close(taken, x - push(u)) and close(after, right))
+    mistakes(swapped=close(new_action, x - push(u)) and close(after, right))
     diagnose(
-        taken,
+        new_action,
         right,
         pushed_out=np.clip(u + push(u), low, high),
         not_clipped=u - push(u),

@@ -37,15 +37,15 @@ def replay_memory(student: Any) -> None:
     for i in range(1, 4):
         call(memory.push, np.full(2, i), i, 10.0 * i, np.full(2, i + 0.5), 0.1 * i, may_return_none=True)
     _check_length(memory, 3)
-    seen = _sampled(memory)
-    mistakes(writes_nothing=seen == {0}, never_filled=0 in seen)
+    stored = _sampled(memory)
+    mistakes(writes_nothing=stored == {0}, never_filled=0 in stored)
     for i in range(4, 7):
         call(memory.push, np.full(2, i), i, 10.0 * i, np.full(2, i + 0.5), 0.1 * i, may_return_none=True)
     _check_length(memory, 4)
-    seen = _sampled(memory)
-    mistakes(newest_missing={5, 6} - seen)
-    if seen != {3, 4, 5, 6}:
-        raise Wrong("other_transitions", seen=sorted(seen))
+    stored = _sampled(memory)
+    mistakes(newest_missing={5, 6} - stored)
+    if stored != {3, 4, 5, 6}:
+        raise Wrong("other_transitions", seen=sorted(stored))
 
 
 def _check_length(memory: Any, expected: int) -> None:
@@ -60,7 +60,7 @@ def _sampled(memory: Any) -> set[int]:
     Raises:
         Wrong: if batches have wrong shapes, mix transitions or are all the same.
     """
-    rng, found = np.random.default_rng(0), []
+    rng, sampled = np.random.default_rng(0), []
     for _ in range(60):
         batch = call(memory.sample, 2, rng, copies=False)
         mistakes(five_arrays=not isinstance(batch, tuple | list) or len(batch) != 5)
@@ -68,11 +68,11 @@ def _sampled(memory: Any) -> set[int]:
         obs, action, reward, next_obs, discount = (numbers(x, s) for x, s in zip(batch, shapes, strict=True))
         rows = np.stack([obs[:, 0], action, reward / 10, next_obs[:, 0] - 0.5 * (obs[:, 0] > 0), discount * 10])
         mistakes(mixed=not close(rows, np.tile(rows[0], (5, 1))))
-        found.append(np.round(rows[0]).astype(int))
+        sampled.append(np.round(rows[0]).astype(int))
     again = [call(memory.sample, 2, np.random.default_rng(1), copies=False)[0] for _ in range(8)]
     mistakes(ignores_rng=len(np.unique(numbers(np.stack(again), (8, 2, 2)), axis=0)) > 1)
-    mistakes(always_the_same=found[0].any() and all((one == found[0]).all() for one in found))
-    return set(np.concatenate(found).tolist())
+    mistakes(always_the_same=sampled[0].any() and all((row == sampled[0]).all() for row in sampled))
+    return set(np.concatenate(sampled).tolist())
 
 
 @exercise
@@ -85,14 +85,14 @@ def choose(student: Any) -> None:
         raise Wrong("value_as_action", value=result[~np.isin(result, (0, 1, 2))][0])
     shares = np.bincount(result.astype(int), minlength=3) / n
     random, greedy = share / 3, 1 - share
-    seen = np.round(shares, 2)
-    about = lambda *expected: np.allclose(shares, expected, atol=0.015)  # noqa: E731
-    if about(random, greedy + random, random):
+    rounded = np.round(shares, 2)
+    are_close = lambda *expected: np.allclose(shares, expected, atol=0.015)  # noqa: E731
+    if are_close(random, greedy + random, random):
         return compiles(student, q, share, jax.random.PRNGKey(0))
-    if about((1 - share) / 3, share + (1 - share) / 3, (1 - share) / 3):
+    if are_close((1 - share) / 3, share + (1 - share) / 3, (1 - share) / 3):
         raise Wrong("exchanged", share=share, others=1 - share)
-    mistakes(worst_action=about(greedy + random, random, random), one_draw=(shares > 0.999).any())
-    raise Wrong("other_shares", share=share, seen=seen, expected=np.round([random, greedy + random, random], 2))
+    mistakes(worst_action=are_close(greedy + random, random, random), one_draw=(shares > 0.999).any())
+    raise Wrong("other_shares", share=share, seen=rounded, expected=np.round([random, greedy + random, random], 2))
 
 
 class _Corridor:
@@ -135,12 +135,12 @@ class _Notes(list):
 def loop(student: Any) -> None:
     """Checks ``loop(env, memory, act, learn, n_episodes, batch_size, gamma, rng)`` with an environment that takes notes."""
     env, memory = _Corridor(), _Notes()
-    seen: list[tuple[np.ndarray, float]] = []
+    calls: list[tuple[np.ndarray, float]] = []
     batches: list[Any] = []
 
     def act(obs: np.ndarray, progress: float) -> int:
-        seen.append((obs, progress))
-        return 10 + len(seen)
+        calls.append((obs, progress))
+        return 10 + len(calls)
 
     returns = call(student, env, memory, act, batches.append, 4, 5, 0.9, np.random.default_rng(0), copies=False)
     mistakes(no_step=not env.n_steps)
@@ -150,11 +150,11 @@ def loop(student: Any) -> None:
         raise Wrong("too_few_steps", n=env.n_steps)
     mistakes(other_actions=env.actions != [*range(11, 23)])
     states = [np.array([episode, time], np.float32) for episode in range(4) for time in range(4)]
-    before, after = (np.stack([s for i, s in enumerate(states) if i % 4 != left]) for left in (3, 0))
-    mistakes(old_obs=not close([obs for obs, _ in seen], before), no_push=not memory)
+    before, after = (np.stack([s for i, s in enumerate(states) if i % 4 != omitted]) for omitted in (3, 0))
+    mistakes(old_obs=not close([obs for obs, _ in calls], before), no_push=not memory)
     if len(memory) != 12 or any(len(transition) != 5 for transition in memory):
         raise Wrong("pushes", n=len(memory))
-    obs, action, reward, next_obs, discount = (np.array([one[i] for one in memory], float) for i in range(5))
+    obs, action, reward, next_obs, discount = (np.array([step[i] for step in memory], float) for i in range(5))
     mistakes(obs_too_early=close(obs, after) and close(next_obs, after))
     if not (
         close(obs, before) and close(next_obs, after) and close(action, env.actions) and close(reward, after[:, 1])

@@ -27,7 +27,7 @@ class GoalStep(NamedTuple):
     action: Any
     reward: float
     next_obs: dict[str, np.ndarray]
-    """The same after the step."""
+    """Those after the step."""
     terminated: bool
 
 
@@ -74,10 +74,10 @@ def _one_relabeling(result: Any, step: GoalStep, goal: np.ndarray, achieved: boo
     """Checks a relabeled step; ``achieved``: whether the step reaches its new goal."""
     mistakes(not_a_step=getattr(result, "_fields", None) != GoalStep._fields)
     for name in ("obs", "next_obs"):
-        seen, before = getattr(result, name), getattr(step, name)
-        if not isinstance(seen, dict) or seen.keys() != before.keys() or not np.array_equal(seen["desired_goal"], goal):
+        new, before = getattr(result, name), getattr(step, name)
+        if not isinstance(new, dict) or new.keys() != before.keys() or not np.array_equal(new["desired_goal"], goal):
             raise Wrong(f"{name}_without_goal")
-        if any(not np.array_equal(seen[key], before[key]) for key in ("observation", "achieved_goal")):
+        if any(not np.array_equal(new[key], before[key]) for key in ("observation", "achieved_goal")):
             raise Wrong("more_changed", name=name)
     reward, right = numbers(result.reward, ()), 0.0 if achieved else -1.0
     of_before = 0.0 if np.array_equal(step.obs["achieved_goal"], goal) else -1.0
@@ -112,17 +112,17 @@ def hindsight(student: Any) -> None:
             drawn.append((time, int(new @ (1 << np.arange(4)))))
     if len(drawn) != 240:
         raise Wrong("how_many_relabeled", n=len(drawn))
-    _check_times(np.array([time for time, _ in drawn]), np.array([chosen for _, chosen in drawn]), last=6)
+    _check_times(np.array([time for time, _ in drawn]), np.array([number for _, number in drawn]), last=6)
 
 
-def _check_times(time: np.ndarray, chosen: np.ndarray, last: np.ndarray | int) -> None:
+def _check_times(time: np.ndarray, drawn: np.ndarray, last: np.ndarray | int) -> None:
     """Checks that the times of the new goals are from ``time + 1`` to ``last``, and that both occur."""
-    mistakes(other_episode=(chosen > last).any(), past=(chosen < time).any(), achieved_before=(chosen == time).any())
+    mistakes(other_episode=(drawn > last).any(), past=(drawn < time).any(), achieved_before=(drawn == time).any())
     inner = time < np.asarray(last) - 1
     mistakes(
-        last_never=not (chosen == last)[inner].any(),
-        always_last=(chosen == last).all(),
-        next_never=not (chosen == time + 1)[inner].any() or (chosen == time + 1).all(),
+        last_never=not (drawn == last)[inner].any(),
+        always_last=(drawn == last).all(),
+        next_never=not (drawn == time + 1)[inner].any() or (drawn == time + 1).all(),
     )
 
 
@@ -135,25 +135,25 @@ def _draw(student: Callable[..., Any]) -> tuple[np.ndarray, ...]:
     result = call(student, rng, time, first, last)
     if np.shape(result) != (N,):
         raise Wrong("how_many_times", n=N, shape=np.shape(result))
-    chosen = np.asarray(result)
-    if chosen.dtype.kind not in "iu":
-        raise Wrong("not_whole", dtype=chosen.dtype)
-    return time, first, last, chosen
+    drawn = np.asarray(result)
+    if drawn.dtype.kind not in "iu":
+        raise Wrong("not_whole", dtype=drawn.dtype)
+    return time, first, last, drawn
 
 
 @exercise
 def future(student: Any) -> None:
     """Checks ``future(rng, time, first, last)``."""
-    time, _, last, chosen = _draw(student)
-    _check_times(time, chosen, last)
+    time, _, last, drawn = _draw(student)
+    _check_times(time, drawn, last)
 
 
 @exercise
 def final(student: Any) -> None:
     """Checks ``final(rng, time, first, last)``."""
-    time, first, last, chosen = _draw(student)
+    time, first, last, drawn = _draw(student)
     diagnose(
-        chosen - last,
+        drawn - last,
         0 * last,
         own_time=time - last,
         first_time=first - last,
@@ -164,12 +164,12 @@ def final(student: Any) -> None:
 @exercise
 def episode(student: Any) -> None:
     """Checks ``episode(rng, time, first, last)``."""
-    time, first, last, chosen = _draw(student)
+    time, first, last, drawn = _draw(student)
     mistakes(
-        outside=(chosen < first).any() or (chosen > last).any(),
-        only_later=(chosen > time).all(),
-        last_never=not (chosen == last).any(),
-        first_never=not (chosen == first).any(),
+        outside=(drawn < first).any() or (drawn > last).any(),
+        only_later=(drawn > time).all(),
+        last_never=not (drawn == last).any(),
+        first_never=not (drawn == first).any(),
     )
 
 
@@ -185,17 +185,17 @@ def saving(save_all: Any, load_all: Any, agent: Any = None, env: Any = "Pendulum
         if type(loaded) is not type(agent):
             raise Wrong("other_class", loaded=type(loaded).__name__, agent=type(agent).__name__)
         mistakes(same_agent=loaded is agent)
-        actions = [one.predict(observations, deterministic=True)[0] for one in (agent, loaded)]
+        actions = [model.predict(observations, deterministic=True)[0] for model in (agent, loaded)]
         mistakes(acts_differently=not np.array_equal(*actions))
-        expected, n = (one.replay_buffer.size() for one in (agent, loaded))
+        expected, n = (model.replay_buffer.size() for model in (agent, loaded))
         if n != expected:
             raise Wrong("buffer", n=n, expected=expected)
 
 
 @exercise
-def steps_needed(answer: Any) -> None:
+def steps_needed(estimate: Any) -> None:
     """Checks the mean number of episodes until a random agent of 12 bits stands on its goal in the end, about 4,096."""
-    number = float(numbers(answer, ()))
+    number = float(numbers(estimate, ()))
     diagnose(
         np.asarray(math.log2(max(number, 1e-9))),
         12.0,
