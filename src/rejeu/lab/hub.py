@@ -172,14 +172,13 @@ def card(agent: Agent, repo: str, source: Path, names: set[str]) -> str:
     """
     env_id = agent.trained_on[0] if agent.trained_on is not None else "an unknown environment"
     evaluation = evaluated(source)
-    tags = ["reinforcement-learning", "rejeu", agent.name, env_id]
-    metadata: dict[str, Any] = {"library_name": "rejeu", "tags": tags}
+    header: dict[str, Any] = {"library_name": "rejeu", "tags": ["reinforcement-learning", "rejeu", agent.name, env_id]}
     if evaluation is not None:
         metric = {"type": "mean_reward", "name": "mean return", "value": evaluation[1]}
         task, dataset = {"type": "reinforcement-learning"}, {"name": env_id, "type": env_id}
         results = [{"task": task, "dataset": dataset, "metrics": [metric]}]
-        metadata["model-index"] = [{"name": agent.name, "results": results}]
-    lines = ["---", *(f"{key}: {json.dumps(value)}" for key, value in metadata.items()), "---", ""]  # JSON is YAML
+        header["model-index"] = [{"name": agent.name, "results": results}]
+    lines = ["---", *(f"{key}: {json.dumps(value)}" for key, value in header.items()), "---", ""]  # JSON is YAML
     lines += [f"# {agent.name} on {env_id}", "", f"Trained for {counted(agent.num_timesteps, 'step')} with rejeu.", ""]
     lines += [evaluation[0], ""] if evaluation is not None else []
     lines += ["```", f"rejeu pull {repo}", f"rejeu evaluate {repo.rpartition('/')[2]}/{MODEL}", "```", ""]

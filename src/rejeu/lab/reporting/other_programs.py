@@ -25,9 +25,8 @@ MONITOR = re.compile(r"(.*\.)?monitor\.csv")
 EVENTS = re.compile(r"events\.out\.tfevents\..+")
 FILES = (MONITOR, EVENTS)
 ZOO_NAME = re.compile(r"(.+-v\d+)_(\d+)")
-ALGORITHMS = {key: entry.name for entry in CATALOG.values() for key in (entry.name.lower(), entry.zoo) if key} | {
-    "her": "HER"
-}
+ALGORITHMS = {key: entry.name for entry in CATALOG.values() for key in (entry.name.lower(), entry.zoo) if key}
+ALGORITHMS["her"] = "HER"
 """Algorithms by the names of RL Zoo's folders."""
 MAX_FILES = 4096
 """Upper limit on the files of one run."""

@@ -371,8 +371,8 @@ def options(schema: type) -> Iterator[Option]:
     A :class:`Topic` next to it is the list of the help that it is in.
     """
     hints = get_type_hints(schema, include_extras=True)
-    for argument in dataclasses.fields(schema):
-        hint, marks = unmarked(hints[argument.name])
+    for entry in dataclasses.fields(schema):
+        hint, marks = unmarked(hints[entry.name])
         shown_as = next((mark for mark in marks if isinstance(mark, Shown)), Shown() if hint is bool else None)
         if shown_as is None:
             continue
@@ -381,19 +381,17 @@ def options(schema: type) -> Iterator[Option]:
             marks = [*marks, *inner]
         value_type = get_origin(hint) if get_origin(hint) in (tuple, dict) else hint
         numbers = [(key, getattr(mark, key)) for mark in marks if isinstance(mark, Meta) for key in ("ge", "gt", "le")]
-        has_default = argument.default is not dataclasses.MISSING
+        has_default = entry.default is not dataclasses.MISSING
         yield Option(
-            field=argument.name,
-            name=shown_as.metavar
-            if shown_as.is_positional
-            else f"--{(shown_as.name or argument.name).replace('_', '-')}",
+            field=entry.name,
+            name=shown_as.metavar if shown_as.is_positional else f"--{(shown_as.name or entry.name).replace('_', '-')}",
             shown=shown_as,
             type=value_type,
             item=unmarked(get_args(hint)[0])[0] if value_type is tuple else hint,
             group=next((mark for mark in marks if isinstance(mark, Topic)), Topic.FIRST),
             limits={key: limit for key, limit in numbers if limit is not None},
-            default=argument.default if has_default else None,
-            is_required=not has_default and argument.default_factory is dataclasses.MISSING,
+            default=entry.default if has_default else None,
+            is_required=not has_default and entry.default_factory is dataclasses.MISSING,
         )
 
 

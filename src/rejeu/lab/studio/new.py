@@ -110,7 +110,7 @@ def in_form(doc: str) -> str:
 
 
 def problem_of(option: Option, text: str | None) -> str | None:
-    """Returns what is wrong with a text, None if nothing is."""
+    """Returns the mistake in a text, None if there is none."""
     try:
         words_of(option, text)
     except ValueError as error:

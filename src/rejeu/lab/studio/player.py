@@ -56,7 +56,7 @@ class LiveEpisode:
     """Of the training, at which the policy was saved."""
     rewards: list[float] = field(default_factory=list)
     values: list[float] = field(default_factory=list)
-    """What the critic expects at each step; empty without a critic."""
+    """The critic's value of each step; empty without a critic."""
     success: float = math.nan
     is_over: bool = False
 

@@ -74,9 +74,8 @@ def serve(
         for entry in PAGES:
             add(entry, studio, links)
         ui.run_with(server, title="rejeu studio", dark=None, show_welcome_message=False, reconnect_timeout=RECONNECT)
-        config = uvicorn.Config(
-            Guard(server, token, own_port, hosts), log_level="warning", ws_max_size=2**24, lifespan="on"
-        )
+        guard = Guard(server, token, own_port, hosts)
+        config = uvicorn.Config(guard, log_level="warning", ws_max_size=2**24, lifespan="on")
         path, query = page
         ready(f"http://{HOST}:{own_port}{path}?{urlencode([*query, ('token', token)])}")
         uvicorn.Server(config).run(sockets=[listening])

@@ -86,7 +86,7 @@ class Studio:
         return options.as_words(*(() if options.env is None else ("--env", options.env)))
 
     def typed(self, env: str) -> RunOptions:
-        """Returns what people have typed about an environment that they named like this, or on the command line by its id."""
+        """Returns the options typed for an environment that people named like this, or on the command line by its id."""
         options = (
             RunOptions(env=run.typed, env_kwargs=run.env_kwargs, wrappers=run.wrappers, imports=run.imports)
             for i, run in enumerate(self._trusted)  # the first is of the command line
@@ -103,8 +103,7 @@ class Studio:
 
     def holds(self, run: str) -> bool:
         """Returns whether a run has begun, by its path below the folder."""
-        there = [row["run"] for row in self.rows if row["state"] != "gone"]
-        return any(name == run or name.startswith(f"{run}/") for name in there)
+        return any(f"{row['run']}/".startswith(f"{run}/") for row in self.rows if row["state"] != "gone")
 
     def file(self, run: str, name: str) -> Path | None:
         """Returns a regular file in the folder of a run; None if there is none, or it is a symbolic link."""
@@ -123,13 +122,10 @@ class Studio:
 
 def allowed(typed: RunConfig, run: RunConfig) -> RunOptions | None:
     """Returns how the environment of a run is made, None unless somebody has typed all of it that no file may name."""
-    is_same = run.env and (
-        run.typed == typed.typed or run.env == typed.env or (not typed.env and is_plain_id(run.typed))
-    )
+    fits = run.env and (run.typed == typed.typed or run.env == typed.env or (not typed.env and is_plain_id(run.typed)))
     plain = {name: value for name, value in run.env_kwargs.items() if are_plain({name: value})}
     kwargs = {name: plain.get(name, typed.env_kwargs.get(name)) for name in run.env_kwargs}
     is_typed = {*run.wrappers} <= {*typed.wrappers} and run.env_kwargs.keys() - plain.keys() <= typed.env_kwargs.keys()
-    if not (is_same and is_typed and are_plain(plain)):
+    if not (fits and is_typed and are_plain(plain)):
         return None
-    env = typed.typed or run.typed
-    return RunOptions(env=env, env_kwargs=kwargs, wrappers=run.wrappers, imports=typed.imports)
+    return RunOptions(env=typed.typed or run.typed, env_kwargs=kwargs, wrappers=run.wrappers, imports=typed.imports)

@@ -232,9 +232,7 @@ def board_of(
     language: Language,
 ) -> Leaderboard:
     """Returns the leaderboard of the models that have a result; the other arguments are those of :func:`build`."""
-    problems = [
-        (name_of(path, folder, paths), result) for path, result in results.items() if isinstance(result, Unranked)
-    ]
+    problems = [(name_of(path, folder, paths), entry) for path, entry in results.items() if isinstance(entry, Unranked)]
     equal = tuple(tuple(name_of(path, folder, paths) for path in group) for group in equal_files(paths))
     rows = ranked(result for result in results.values() if isinstance(result, Entrant))
     return Leaderboard(env_id, episodes, rows, tuple(problems), language, equal)

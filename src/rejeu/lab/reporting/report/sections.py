@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -205,7 +205,7 @@ def percent(value: float) -> str:
     return f"{number(100 * value, 1)} %" if math.isfinite(value) else "\N{EN DASH}"
 
 
-def between(low: float, high: float, as_text: Any = number) -> str:
+def between(low: float, high: float, as_text: Callable[[float], str] = number) -> str:
     """Returns an interval, empty if it is unknown."""
     return f"{as_text(low)} to {as_text(high)}" if math.isfinite(low) and math.isfinite(high) else ""
 
