@@ -99,7 +99,7 @@ class Rows:
             return
         run: RunSummary | None = None
         try:
-            if utf8(inner := str(path.relative_to(self.folder))) != inner:
+            if utf8(inner := str(path).removeprefix(str(self.folder))) != inner:
                 raise ValueError("its name is not UTF-8; rename the folder")
             run = run_list.read(path, table_only=True)
             row = describe(run)
