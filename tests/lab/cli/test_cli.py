@@ -294,7 +294,7 @@ def test_help_of_train_begins_with_what_people_need_first_and_has_five_groups(ca
     assert lists["options"] == ["--help", "--algo", "--steps", "--minutes", "--envs", "--seed", "--set", "--out"]
     assert [*lists] == ["options", "environment", "training", "evaluation", "output"]
     assert max(map(len, lists.values())) == 8
-    assert sum(map(len, lists.values())) == 34
+    assert sum(map(len, lists.values())) == 33
     assert [*help_of(capsys, "compare")] == ["positional arguments", "options"]
 
 

@@ -123,7 +123,7 @@ def test_it_listens_on_this_computer_only_and_takes_the_next_port(tmp_path, serv
 
 
 def test_without_the_extra_there_is_one_line(tmp_path):
-    (tmp_path / "nicegui.py").write_text("raise ImportError", encoding="utf-8")
+    (tmp_path / "nicegui.py").write_text("raise ModuleNotFoundError", encoding="utf-8")
     path = os.pathsep.join([str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])])
     ended = subprocess.run(
         [sys.executable, "-m", "rejeu", "studio", str(tmp_path)],
