@@ -26,7 +26,7 @@ from rejeu.core.algorithm import PyTree, Transition
 from rejeu.core.prng import below
 from rejeu.replay import device_priorities
 from rejeu.replay.device_priorities import DevicePriorities
-from rejeu.replay.hindsight import GoalStrategy, HindsightSteps, MixedStrategies, mixed
+from rejeu.replay.hindsight import GoalStrategy, HindsightSteps, MixedStrategies
 from rejeu.replay.prioritized import PriorityConfig
 from rejeu.replay.ring import LAST, STEP, TERMINATED, Ring, episode_counters
 from rejeu.replay.uniform import NewGoals, discounts_of, outcome, replaced
@@ -230,8 +230,9 @@ class DeviceReplay:
             assert reward is not None
             n = self.n_relabeled
             goal_rows = self.goal_positions(ring, goals_key, jax.tree.map(lambda x: x[:n], rows))
-            leaves = (ring.obs[leaf].__getitem__ for leaf in (self.achieved, self.desired))
-            goal = mixed(self.strategy).goals(goal_rows, *leaves)
+            goal = ring.obs[self.achieved][goal_rows]
+            if isinstance(self.strategy, MixedStrategies):
+                goal = self.strategy.goals(goal, goal_rows, ring.obs[self.desired].__getitem__)
             goals = NewGoals(slice(n), goal, (self.achieved, self.desired), reward, terminated)
         return self.batch(ring, rows, goals)._replace(weight=weight), rows
 
@@ -255,20 +256,14 @@ class DeviceReplay:
         discount = jnp.asarray(discounts_of(self.gamma, self.n_steps))[2 * steps + ends]
         return Transition(tree(obs), action, rewards, tree(next_obs), discount, None, each)
 
-    def goal_positions(self, ring: DeviceRing, key: Array, rows: DeviceRows) -> Array:
+    def goal_positions(self, ring: DeviceRing, key: Array, rows: DeviceRows, strategy: Any = None) -> Array:
         """Returns the positions of the rows whose goals become the new goals of ``rows``; see :class:`HerReplayBuffer`."""
-        assert self.strategy is not None
-        strategies = mixed(self.strategy)
-
-        def choose(strategy: str | GoalStrategy, number: int, turn: Any) -> Array:
-            own_key = key if len(strategies.shares) == 1 else jax.random.fold_in(key, number)
-            return self.positions_by(strategy, ring, own_key, jax.tree.map(lambda leaf: leaf[turn], rows))
-
-        positions: Array = strategies.joined(jnp, len(rows.time), choose)
-        return positions
-
-    def positions_by(self, strategy: str | GoalStrategy, ring: DeviceRing, key: Array, rows: DeviceRows) -> Array:
-        """Returns the positions that one strategy chooses."""
+        strategy = strategy or self.strategy
+        if isinstance(strategy, MixedStrategies):
+            choose = lambda i, env, time, place, name: self.goal_positions(  # noqa: E731
+                ring, jax.random.fold_in(key, i), DeviceRows(env, time, place), name
+            )
+            return jnp.asarray(strategy.joined(jnp, choose, *rows))
         newest, numbers = ring.head[rows.env], count()
 
         def episode(times: Array) -> Array:
@@ -287,7 +282,7 @@ class DeviceReplay:
             lambda times: jnp.maximum(ring.begins[episode(times)], steps.oldest),
             lambda times: jnp.minimum(ring.ends[episode(times)], newest),
             integers,
-            lambda: self.draw_rows(ring, key, len(rows.time))[:2],
+            lambda: self.draw_rows(ring, key, len(rows.time)),
             self.positions,
             (ring.obs[self.achieved].__getitem__, ring.obs[self.desired].__getitem__),
         )

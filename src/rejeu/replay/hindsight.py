@@ -25,7 +25,7 @@ crash, ends there with any goal. Each strategy is one definition for host and de
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
 from enum import Enum
@@ -71,11 +71,11 @@ class HindsightSteps:
     """``end(times)`` returns the times of the last observations of these episodes, or the newest."""
     integers: Callable[[Any, Any], Any]
     """``integers(low, high)`` returns random whole numbers from ``low`` to ``high - 1``, arrays ``(n,)`` or ``(n, k)``."""
-    drawn: Callable[[], tuple[Any, Any]]
-    """``drawn()`` returns environments and times of steps drawn from all that are stored."""
+    drawn: Callable[[], tuple[Any, ...]]
+    """``drawn()[:2]`` are environments and times of steps drawn from all that are stored."""
     index: Callable[[Any, Any], Any]
     """Returns positions in the ring, given environments and times."""
-    goals_at: tuple[Callable[[Any], Any], Callable[[Any], Any]]
+    goals_at: Sequence[Callable[[Any], Any]]
     """Return the achieved and the desired goals at positions."""
 
     @cached_property
@@ -104,7 +104,7 @@ class HindsightSteps:
     def chosen_by(self, strategy: str | GoalStrategy) -> Any:
         """Returns the positions of the new goals that a strategy, or the one of this name, chooses."""
         if strategy in ANY_STEP:
-            env, time = self.drawn()
+            env, time = self.drawn()[:2]
             return self.index(env, time + (strategy == "random"))
         times = (STRATEGIES[strategy] if isinstance(strategy, str) else strategy)(self)
         return self.index(self.env, times if strategy in BUILT_IN else stored(self, times))
@@ -206,21 +206,19 @@ class MixedStrategies(NamedTuple):
     shares: tuple[tuple[str | GoalStrategy, int], ...]
     """Strategies and shares, such as ``(("future", 2), ("desired", 2))`` for half of the transitions each."""
 
-    def joined(self, xp: Any, n: int, choose: Callable[[str | GoalStrategy, int, Any], Any]) -> Any:
-        """Returns ``choose(strategy, number, rows)`` of all strategies, in the order of ``n`` transitions."""
-        if len(self.shares) == 1:
-            return choose(self.shares[0][0], 0, slice(None))
-        rows, order = rows_of_shares(tuple(share for _, share in self.shares), n)
-        return xp.concatenate([choose(self.shares[i][0], i, rows[i]) for i in range(len(rows))])[order]
+    def joined(self, xp: Any, choose: Callable[..., Any], *arrays: Any) -> Any:
+        """Returns ``choose(number, *rows, strategy)`` of all strategies, each with its rows of the arrays, in their order."""
+        rows, order = rows_of_shares(tuple(share for _, share in self.shares), len(arrays[0]))
+        parts = [choose(i, *(array[rows[i]] for array in arrays), self.shares[i][0]) for i in range(len(rows))]
+        return xp.concatenate(parts)[order]
 
-    def goals(self, index: Any, achieved: Callable[[Any], Any], desired: Callable[[Any], Any]) -> Any:
-        """Returns the goals at positions, of which ``achieved`` and ``desired`` return the two kinds."""
-        goals = achieved(index)
+    def goals(self, achieved: Any, index: Any, desired: Callable[[Any], Any]) -> Any:
+        """Returns the goals at positions, of which ``achieved`` are those of one kind, and ``desired`` returns the other."""
         for i, (strategy, _) in enumerate(self.shares):
             if strategy == "desired":
                 rows = rows_of_shares(tuple(share for _, share in self.shares), len(index))[0][i]
-                goals = replaced(goals, rows, desired(index[rows]))
-        return goals
+                achieved = replaced(achieved, rows, desired(index[rows]))
+        return achieved
 
 
 @cache
@@ -259,18 +257,28 @@ def checked_strategy(strategy: Any) -> str | GoalStrategy | MixedStrategies:
     Raises:
         ValueError: for anything else.
     """
-    if isinstance(strategy, Mapping | MixedStrategies):
-        pairs = strategy.shares if isinstance(strategy, MixedStrategies) else strategy.items()
-        names: list[Any] = [checked_strategy(name) for name, _ in pairs]
-        if not names or not all(isinstance(name, str) for name in names):
-            raise ValueError(
-                f"goal_selection_strategy={strategy!r} must have names of strategies as keys, such as "
-                '{"future": 2, "desired": 2}; register_goal_strategy gives a function a name'
-            )
-        shares = [
-            whole(f"goal_selection_strategy {name}", n, 1, MAX_SHARE) for name, (_, n) in zip(names, pairs, strict=True)
-        ]
-        return MixedStrategies(tuple(zip(names, shares, strict=True)))
+    shares = strategy.shares if isinstance(strategy, MixedStrategies) else ((strategy, 1),)
+    shares = tuple(strategy.items()) if isinstance(strategy, Mapping) else shares
+    names = [registered_strategy(name) for name, _ in shares]
+    if not isinstance(strategy, Mapping | MixedStrategies) and names != ["desired"]:
+        return names[0]
+    if not names or not all(isinstance(name, str) for name in names):
+        raise ValueError(
+            f"goal_selection_strategy={strategy!r} must have names of strategies as keys, such as "
+            '{"future": 2, "desired": 2}; register_goal_strategy gives a function a name'
+        )
+    pairs = zip(names, shares, strict=True)
+    return MixedStrategies(
+        tuple((name, whole(f"goal_selection_strategy {name}", n, 1, MAX_SHARE)) for name, (_, n) in pairs)
+    )
+
+
+def registered_strategy(strategy: Any) -> str | GoalStrategy:
+    """Returns the name of a strategy, or a function without a name.
+
+    Raises:
+        ValueError: if there is none of this name.
+    """
     strategy = name_of(strategy)
     strategy = strategy.value if isinstance(strategy, GoalSelectionStrategy) else strategy
     names = [*dict.fromkeys([*(member.value for member in GoalSelectionStrategy), *STRATEGIES])]
@@ -283,18 +291,15 @@ def checked_strategy(strategy: Any) -> str | GoalStrategy | MixedStrategies:
     return strategy
 
 
-def mixed(strategy: str | GoalStrategy | MixedStrategies) -> MixedStrategies:
-    """Returns strategies with shares; a single one has all."""
-    return strategy if isinstance(strategy, MixedStrategies) else MixedStrategies(((strategy, 1),))
-
-
 def counters(config: HindsightConfig | None) -> tuple[str, ...]:
     """Returns the counters that the ring must keep of every row for these settings, None being no hindsight.
 
     >>> counters(HindsightConfig(goal_selection_strategy="future"))
     ('until_end',)
     """
-    strategies = {*dict(mixed(config.goal_selection_strategy).shares)} - {*ANY_STEP} if config is not None else set()
+    strategy = None if config is None else config.goal_selection_strategy
+    strategies = {*dict(strategy.shares)} if isinstance(strategy, MixedStrategies) else {strategy}
+    strategies -= {*ANY_STEP, None}
     if not strategies:
         return ()
     return ("until_end",) if strategies <= {*FROM_LATER} else ("since_start", "until_end")
@@ -356,53 +361,41 @@ class HerReplayBuffer(BaseReplayBuffer):
     def draw(
         self, rng: np.random.Generator, shape: tuple[int, ...], progress: float = 1.0
     ) -> tuple[Transition, Draw | None]:
-        """Returns the batch of :meth:`sample` and, with priorities, the argument of :meth:`update_priorities`.
-
-        Of each batch, the first ``k / (k + 1)`` are relabeled.
-        """
+        """Returns what :meth:`ReplayBuffer.draw` does; of each batch, the first ``k / (k + 1)`` are relabeled."""
         ring = self.ring
         rows, weight, drawn = self.draw_rows(rng, math.prod(shape), progress)
         read = ring.read(rows.position)
         relabeled = relabeled_positions(shape, self.config.n_sampled_goal)
         index = self.goal_index(rng, rows.env[relabeled], rows.time[relabeled], read[0][relabeled])
-        strategies = mixed(self.config.goal_selection_strategy)
-        goal = strategies.goals(index, *(partial(ring.read_leaf, leaf) for leaf in (self.achieved, self.desired)))
-        reward, terminated = self.goals
-        if self.infos is not None:
-            infos_of_rows = self.infos[
-                ring.index(rows.env[relabeled, None], rows.time[relabeled, None] + np.arange(self.n_steps))
-            ]
-            # After the end of an episode there is none, and what a function returns there does not count.
-            infos = [(info or row[0] or {}) for row in infos_of_rows for info in row]
-            reward, terminated = partial(reward, infos=infos), terminated and partial(terminated, infos=infos)
-        goals = NewGoals(relabeled, goal, (self.achieved, self.desired), reward, terminated)
+        goal, strategy = ring.read_leaf(self.achieved, index), self.config.goal_selection_strategy
+        if isinstance(strategy, MixedStrategies):
+            goal = strategy.goals(goal, index, partial(ring.read_leaf, self.desired))
+        functions = self.goals if self.infos is None else self.functions_of(rows.env[relabeled], rows.time[relabeled])
+        goals = NewGoals(relabeled, goal, (self.achieved, self.desired), *functions)
         return self.batch(shape, rows, read, weight, goals), drawn
 
-    def goal_index(self, rng: np.random.Generator, env: np.ndarray, time: np.ndarray, step: np.ndarray) -> np.ndarray:
-        """Returns the positions of the rows whose achieved goals become the new goals, by the strategy, ``(n,)``.
+    def functions_of(self, env: np.ndarray, time: np.ndarray) -> GoalFunctions:
+        """Returns the functions of goals with the infos of steps ``(n,)`` and of the ``n_steps - 1`` that follow each."""
+        infos_of_rows = self.infos[self.ring.index(env[:, None], time[:, None] + np.arange(self.n_steps))]
+        # After the end of an episode there is none, and what a function returns there does not count.
+        infos = [(info or row[0] or {}) for row in infos_of_rows for info in row]
+        reward, terminated = self.goals
+        return GoalFunctions(partial(reward, infos=infos), terminated and partial(terminated, infos=infos))
 
-        Where ``desired`` chooses, it is the desired goals of the rows that become the new goals.
+    def goal_index(
+        self, rng: np.random.Generator, env: np.ndarray, time: np.ndarray, step: np.ndarray, strategy: Any = None
+    ) -> np.ndarray:
+        """Returns the positions ``(n,)`` of the rows whose goals are new ones: achieved goals, desired ones by ``desired``.
 
         Args:
             rng: the only source of random numbers.
             env: environments of the relabeled rows, ``(n,)``.
             time: their times, as in :data:`GoalStrategy`, ``(n,)``.
-            step: their records, ``(n,)``, with the :func:`counters` of the strategy: ``until_end`` is the number of steps from
-                ``time`` to the end of the episode, 0 while it runs; ``since_start`` the number since its first observation.
+            step: their records, ``(n,)``, with the :func:`counters` of the strategy, as :class:`Ring` keeps them.
+            strategy: None for that of the settings.
         """
-        return mixed(self.config.goal_selection_strategy).joined(
-            np, len(time), lambda name, _, rows: self.index_by(name, rng, env[rows], time[rows], step[rows])
-        )
-
-    def index_by(
-        self,
-        strategy: str | GoalStrategy,
-        rng: np.random.Generator,
-        env: np.ndarray,
-        time: np.ndarray,
-        step: np.ndarray,
-    ) -> np.ndarray:
-        """Returns the positions that one strategy chooses; the arguments are those of :meth:`goal_index`."""
+        if isinstance(strategy := strategy or self.config.goal_selection_strategy, MixedStrategies):
+            return np.asarray(strategy.joined(np, lambda _, *rows: self.goal_index(rng, *rows), env, time, step))
         ring, newest = self.ring, self.ring.head[env]
 
         def begin(times: np.ndarray) -> np.ndarray:
@@ -414,15 +407,14 @@ class HerReplayBuffer(BaseReplayBuffer):
                 return np.where(step["until_end"], time + step["until_end"], newest)
             position = ring.index(env, times)
             until_end = ring.until_end[position]  # type: ignore[index]
-            has_ended = (until_end > 0) | (ring.kind[position] == LAST)
-            return np.where(has_ended, times + until_end, newest)
+            return np.where((until_end > 0) | (ring.kind[position] == LAST), times + until_end, newest)
 
         def integers(low: np.ndarray, high: np.ndarray) -> np.ndarray:
-            u = rng.random(np.broadcast_shapes(np.shape(low), np.shape(high)))
-            return low + (u * (high - low)).astype(np.int64)
+            shape = np.broadcast_shapes(np.shape(low), np.shape(high))
+            return low + (rng.random(shape) * (high - low)).astype(np.int64)
 
-        drawn = lambda: ring.draw(rng, len(time))[:2]  # noqa: E731
-        goals_at = partial(ring.read_leaf, self.achieved), partial(ring.read_leaf, self.desired)
+        goals_at = [partial(ring.read_leaf, leaf) for leaf in (self.achieved, self.desired)]
+        drawn = partial(ring.draw, rng, len(time))
         steps = HindsightSteps(np, env, time, newest, ring.rows, begin, end, integers, drawn, ring.index, goals_at)
         return np.asarray(steps.chosen_by(strategy))
 

@@ -269,14 +269,14 @@ class NewGoals(NamedTuple):
     terminated: Any
     """Whether they end the episode, a function as ``reward``; None if the steps keep their own flags."""
 
-    def ends(self, reached: Any, goal: Any, previous_goal: Any, ended: Any) -> Any:
+    def ends(self, reached: Any, goal: Any, own_goal: Any, ended: Any) -> Any:
         """Returns which steps end an episode: those that reach ``goal``, and those that ended otherwise, as in a crash.
 
-        ``ended`` says which of them ended with ``previous_goal``.
+        ``ended`` says which of them ended with ``own_goal``.
         """
         ends = self.terminated(reached, goal).astype(bool)
         none_ended = isinstance(ended, np.ndarray) and not ended.any()  # functions of single goals take long
-        return ends if none_ended else ends | (ended & ~self.terminated(reached, previous_goal).astype(bool))
+        return ends if none_ended else ends | (ended & ~self.terminated(reached, own_goal).astype(bool))
 
 
 class Outcome(NamedTuple):
@@ -295,30 +295,27 @@ def outcome(
 ) -> Outcome:
     """Returns what ``rows`` lead to in up to ``n_steps`` steps, with new goals if there are any."""
     if goals is not None:
-        relabeled, times = goals.which, rows.time[goals.which, None] + 1 + xp.arange(n_steps)[None]
-        position = index(rows.env[relabeled, None], times).reshape(-1)
-        reached, previous_goal = (ring.obs[leaf][position] for leaf in goals.leaves)
+        new, times = goals.which, rows.time[goals.which, None] + 1 + xp.arange(n_steps)[None]
+        position = index(rows.env[new, None], times).reshape(-1)
+        reached, own_goal = (ring.obs[leaf][position] for leaf in goals.leaves)
     if n_steps == 1:
         rewards, terminated = ring.reward[rows.position], ring.kind[rows.position]  # which is STEP or TERMINATED
         if goals is not None:
-            rewards = replaced(rewards, relabeled, goals.reward(reached, goals.goal))
+            rewards = replaced(rewards, new, goals.reward(reached, goals.goal))
             if goals.terminated is not None:
-                ended = goals.ends(reached, goals.goal, previous_goal, terminated[relabeled] == TERMINATED)
-                terminated = replaced(terminated, relabeled, ended)
+                ended = goals.ends(reached, goals.goal, own_goal, terminated[new] == TERMINATED)
+                terminated = replaced(terminated, new, ended)
         return Outcome(rewards, 1, terminated)
     position, valid, terminal = look_ahead(xp, ring, index, rows, n_steps)
     rewards = ring.reward[position]
     if goals is not None:
         each = xp.repeat(goals.goal, n_steps, axis=0)
-        rewards = replaced(rewards, relabeled, goals.reward(reached, each).reshape(-1, n_steps))
+        rewards = replaced(rewards, new, goals.reward(reached, each).reshape(-1, n_steps))
         if goals.terminated is not None:
-            ends = (
-                goals.ends(reached, each, previous_goal, terminal[relabeled].reshape(-1)).reshape(-1, n_steps)
-                & valid[relabeled]
-            )
+            ends = goals.ends(reached, each, own_goal, terminal[new].reshape(-1)).reshape(-1, n_steps) & valid[new]
             goes_on = xp.cumsum(ends, axis=1)[:, :-1] == 0
-            valid = replaced(valid, (relabeled, slice(1, None)), valid[relabeled][:, 1:] & goes_on)
-            terminal = replaced(terminal, relabeled, ends) & valid
+            valid = replaced(valid, (new, slice(1, None)), valid[new][:, 1:] & goes_on)
+            terminal = replaced(terminal, new, ends) & valid
     return Outcome(xp.where(valid, rewards, xp.float32(0)), valid.sum(axis=1), terminal.any(axis=1))
 
 

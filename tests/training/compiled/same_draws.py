@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from rejeu.replay.device_priorities import order
-from rejeu.replay.hindsight import HerReplayBuffer, MixedStrategies
+from rejeu.replay.hindsight import HerReplayBuffer
 from rejeu.replay.prioritized import Draw
 from rejeu.training.compiled.off_policy import draws
 from rejeu.training.compiled.program import random_action
@@ -98,15 +98,13 @@ def use_same_draws(run: Run) -> None:
         rng.begin_batch(shape[0], int(shape[0] * k / (k + 1)))
         return draw(rng, shape, progress)
 
-    def announced_goals(rng: Any, *arguments: Any) -> Any:
-        rng.begin_goals()
-        return goal_index(rng, *arguments)
-
-    def announced_strategy(strategy: Any, rng: Any, env: np.ndarray, *arguments: Any) -> Any:
-        if isinstance(buffer.config.goal_selection_strategy, MixedStrategies):
+    def announced_goals(rng: Any, env: np.ndarray, time: np.ndarray, step: np.ndarray, strategy: Any = None) -> Any:
+        if strategy is None:
+            rng.begin_goals()
+        elif len(env) < rng.sizes[1]:  # one of several strategies
             rng.begin_strategy(len(env))
-        return HerReplayBuffer.index_by(buffer, strategy, rng, env, *arguments)
+        return goal_index(rng, env, time, step, strategy)
 
     buffer.draw = announced_draw
     if goal_index is not None:
-        buffer.goal_index, buffer.index_by = announced_goals, announced_strategy
+        buffer.goal_index = announced_goals
