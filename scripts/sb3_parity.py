@@ -17,6 +17,7 @@ import importlib
 import inspect
 import json
 import pkgutil
+import re
 import statistics
 import sys
 from collections.abc import Iterator
@@ -28,6 +29,8 @@ ROOT = Path(__file__).resolve().parents[1]
 DATA = ROOT / "tests" / "data" / "sb3" / "signatures.json"
 VISIBLE = DATA.with_name("visible_names.json")
 GUIDE = ROOT / "trials" / "results" / "sb3_guide.json"
+FRAGMENT = "NameError|SyntaxError"
+"""Errors of blocks that are a part of a program."""
 PACKAGES = {"stable_baselines3": "rejeu.sb3", "sb3_contrib": "rejeu.sb3_contrib"}
 """The original's packages, and where their names are here."""
 
@@ -219,6 +222,10 @@ def guide() -> str:
         if row["differs"]:
             text = "; ".join(row["differs"][:2]).replace("|", "/").replace("<", "").replace(">", "")
             lines.append(f"- {row['block']}{', with PyTorch' * row['torch']}: `{text.replace(' - ', ', here ')[:150]}`")
+    raising = [row["block"] for row in tried if row["original"]["error"] and row["rejeu"]["error"]]
+    fragments = [row["block"] for row in content["blocks"] if re.match(FRAGMENT, row["original"]["error"] or "")]
+    lines += ["", f"With both these raise, most on purpose: {', '.join(raising)}."]
+    lines += ["", f"Fragments, which name what they do not define: {', '.join(fragments)}."]
     return "\n".join(lines)
 
 
