@@ -33,8 +33,8 @@ class Range:
     """Both ends are less than this."""
     is_whole: ClassVar[bool] = False
     """Whether only whole numbers are meant."""
-    about: ClassVar[str] = ""
-    """What :meth:`__str__` adds to the ends."""
+    prefix: ClassVar[str]
+    """Stands before the ends on the command line and in files."""
 
     def __post_init__(self) -> None:
         for name in ("low", "high"):
@@ -53,36 +53,38 @@ class Range:
         return self.low, self.high
 
     def __str__(self) -> str:
-        return f"{self.low:g} to {self.high:g}{self.about}"
+        return f"{self.prefix}:{self.low}..{self.high}"
 
 
 @dataclass(frozen=True)
 class Uniform(Range):
     """Numbers from ``low`` to ``high``, all equally likely."""
 
+    prefix = "uniform"
+
 
 @dataclass(frozen=True)
 class LogUniform(Range):
     """Numbers from ``low`` to ``high``, all orders of magnitude equally likely."""
 
+    prefix = "log"
     above = 0.0
-    about = ", logarithmic"
 
 
 @dataclass(frozen=True)
 class NearOne(Range):
     """Numbers from ``low`` to ``high`` below 1, all orders of magnitude of ``1 - value`` equally likely."""
 
+    prefix = "near-one"
     below = 1.0
-    about = ", 1 - value logarithmic"
 
 
 @dataclass(frozen=True)
 class Integers(Range):
     """Whole numbers from ``low`` to ``high``, both included, all equally likely."""
 
+    prefix = "int"
     is_whole = True
-    about = ", whole numbers"
 
 
 @dataclass(frozen=True)
@@ -108,7 +110,7 @@ class Choice:
         return self.values
 
     def __str__(self) -> str:
-        return ", ".join(json.dumps(value) for value in self.values)
+        return json.dumps(self.values)
 
 
 Dimension = Range | Choice

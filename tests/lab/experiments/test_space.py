@@ -5,7 +5,7 @@ import pytest
 from rejeu.algorithms.search import Choice, Integers, LogUniform, NearOne, Uniform
 from rejeu.lab.experiments import space
 
-pytest.importorskip("optuna")
+optuna = pytest.importorskip("optuna")
 SPACE = {
     "learning_rate": LogUniform(1e-5, 1e-2),
     "gamma": NearOne(0.9, 0.9999),
@@ -57,45 +57,50 @@ def test_mistakes_are_explained(text, message):
     assert message in str(error.value)
 
 
-def test_a_dimension_of_a_file_is_the_one_that_was_written():
-    for name, dimension in SPACE.items():
-        assert space.from_json(name, space.to_json(dimension)) == dimension
+@pytest.mark.parametrize("dimension", [*SPACE.values(), Choice(("tanh", None, 0.5, True)), Uniform(-1e-17, 0.1 + 0.2)])
+def test_a_dimension_is_read_as_it_was_written(dimension):
+    again = space.dimension_of(str(dimension))
+    assert (again, type(again)) == (dimension, type(dimension))
 
 
 @pytest.mark.parametrize(
-    "record",
-    [
-        {},
-        {"kind": "Uniform"},
-        {"kind": "os.system", "low": 0, "high": 1},
-        {"kind": "Uniform", "low": 0, "high": 1, "more": 2},
-        {"kind": "Uniform", "low": 2, "high": 1},
-        {"kind": "Choice", "values": 3},
-        {"kind": ["Uniform"], "low": 0, "high": 1},
-    ],
+    "text", ["", "os:1..2", "uniform:0..1..2", "uniform:2..1", "[3", "[" * 9_000, '{"a": 1}', "log:"]
 )
-def test_a_damaged_dimension_is_refused(record):
-    with pytest.raises(ValueError, match=r"dimension of a search space|is empty"):
-        space.from_json("gamma", record)
+def test_a_damaged_dimension_is_refused(text):
+    with pytest.raises(ValueError, match=r"no kind of range|must be low\.\.high|is empty|is no list of JSON values"):
+        space.dimension_of(text)
 
 
 def test_values_survive_optuna():
-    values = {
-        "learning_rate": 1e-3,
-        "gamma": 0.99,
-        "policy_delay": 2,
-        "policy_kwargs.net_arch": [256, 256],
-        "exploration_final_eps": 0.1,
+    values = {"learning_rate": 1e-3, "gamma": 0.99, "policy_delay": 2, "exploration_final_eps": 0.1}
+    values["policy_kwargs.net_arch"] = [256, 256]
+    config = values | {
+        "policy_kwargs": {"net_arch": [256.0, 256]},
+        "learning_rate": {"schedule": "linear", "start": 1e-3},
     }
-    params = space.encoded(SPACE, values)
-    assert params.keys() == space.distributions(SPACE).keys()
-    assert space.decoded(SPACE, params) == values
-    for name, one in space.distributions(SPACE).items():
-        assert one.to_external_repr(one.to_internal_repr(params[name])) == params[name]
+    study = optuna.create_study()
+    study.enqueue_trial(space.parameters(SPACE, config))
+    trial = study.ask()
+    assert space.suggested(trial, SPACE) == values
+    study.tell(trial, 0.0)
+    assert space.suggested(study.trials[0], SPACE) == values
+
+
+def test_samples_lie_in_the_space():
+    study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
+    for _ in range(50):
+        trial = study.ask()
+        values = space.suggested(trial, SPACE)
+        assert values.keys() == SPACE.keys()
+        assert all(dimension.contains(values[name]) for name, dimension in SPACE.items())
+        study.tell(trial, 0.0)
+    medians = {key: sorted(trial.params[key] for trial in study.trials)[25] for key in ("learning_rate", "1 - gamma")}
+    assert all(1e-4 < median < 1e-2 for median in medians.values())  # logarithmic: 3e-4 and 3e-3
 
 
 def test_values_outside_of_the_space_are_left_out():
-    assert space.encoded(SPACE, {"learning_rate": 1.0, "gamma": "lin_0.9", "policy_delay": 1.5, "tau": 0.1}) == {}
+    config = {"learning_rate": 1.0, "gamma": "lin_0.9", "policy_delay": 1.5, "tau": 0.1, "policy_kwargs": None}
+    assert space.parameters(SPACE, config) == {}
 
 
 def test_a_value_replaces_the_start_of_a_schedule():

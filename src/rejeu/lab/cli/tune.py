@@ -10,6 +10,7 @@ from rejeu.algorithms.search import Dimension
 from rejeu.core.interrupt import NAMES, Interrupt
 from rejeu.lab.cli.commands import Tune
 from rejeu.lab.experiments import space, study as studies, study_plan as plans, tune as tuning
+from rejeu.lab.experiments.final import announcement
 from rejeu.lab.experiments.study import Study, StudyFolder
 from rejeu.lab.runs import environment
 from rejeu.lab.runs.arguments import Resume
@@ -67,14 +68,14 @@ def resume_study(arguments: Resume) -> tuple[int, dict[str, Any]]:
 def read_search(assignments: Iterable[str], algorithm: str | None) -> dict[str, Dimension]:
     """Returns the dimensions of ``--search``."""
     declared = {} if algorithm is None else getattr(AGENTS[algorithm].algorithm.Config, "search_space", {})
-    return dict(space.parse(one, declared) for one in assignments)
+    return dict(space.parse(assignment, declared) for assignment in assignments)
 
 
 def complete(study: Study, made: Environment, workers: int | None) -> tuple[int, dict[str, Any]]:
     """Runs a study to its end; returns the exit status and the result."""
     echo("\n".join(header(study, made)))
     with Interrupt() as stop:
-        result = tuning.run(study, made.run, workers, stop, tuning.lines(echo, study), echo)
+        result = tuning.run(study, made.run, workers, stop, echo)
     echo()
     if stop.signal is not None:
         echo(f"stopped by {NAMES[stop.signal]}; rejeu resume {quoted(study.folder.path)}{made.run.again()} continues")
@@ -88,17 +89,16 @@ def complete(study: Study, made: Environment, workers: int | None) -> tuple[int,
 
 def header(study: Study, made: Environment) -> list[str]:
     """Returns the first lines of a study."""
-    plan = study.plan
-    done = sum(one.has_ended for one in study.trials())
+    plan, default = study.plan, study.plan.default
+    n_ended = sum(trial.state.is_finished() for trial in study.trials())
     seeds = f", {plan.trial_seeds} seeds each" if plan.trial_seeds > 1 else ""
+    evaluations = f"evaluated on {counted(default.evaluate_episodes, 'episode')} every {default.evaluate_every:,} steps"
+    ended = f"; {n_ended} have ended" if n_ended else ""
     return [
-        f"environment   {made}, {plan.default.n_envs} at once",
-        f"algorithm     {plan.default.algorithm}, seed {plan.seed}, pruner {plan.pruner}",
-        f"trials        {plan.trials} of {plan.default.total_steps:,} steps{seeds}, evaluated on "
-        f"{counted(plan.default.evaluate_episodes, 'episode')} every {plan.default.evaluate_every:,} steps"
-        + f"; {done} have ended"
-        * bool(done),
-        *(f"{'search' if i == 0 else '':<14}{name}: {one}" for i, (name, one) in enumerate(plan.search_space.items())),
-        *([f"at the end    the best trial and the default: {tuning.announcement(plan)}"] if plan.final_seeds else []),
+        f"environment   {made}, {default.n_envs} at once",
+        f"algorithm     {default.algorithm}, seed {plan.seed}, pruner {plan.pruner}",
+        f"trials        {plan.trials} of {default.total_steps:,} steps{seeds}, {evaluations}{ended}",
+        *(f"{'search' if i == 0 else '':<14}{name}: {text}" for i, (name, text) in enumerate(plan.space.items())),
+        *([f"at the end    the best trial and the default: {announcement(plan)}"] if plan.final_seeds else []),
         f"study folder  {study.folder.path}",
     ]

@@ -1,4 +1,4 @@
-"""A study in a folder: the trials in Optuna's journal, shared by processes and machines through locks on files.
+"""A study in a folder, which Optuna stores, samples and prunes, and the trials of it that this process trains.
 
 ::
 
@@ -9,20 +9,19 @@
     preset.json             the winner
     compare.html            the comparison of the winner with the default
 
-Every trial has an index from 0. A trial whose process died is entered again with the same index and parameters, so that the
-study continues as it would have without the interruption.
+A trial is entered into the journal with all of its hyperparameters at once, and the process that trains it holds a lock. A
+running trial whose lock is free has lost its process: the next process continues it.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
-
-from filelock import FileLock
+from typing import TYPE_CHECKING, Any
 
 from rejeu.agents import presets
 from rejeu.agents.presets import Preset
@@ -30,50 +29,28 @@ from rejeu.checkpoints.model_files import WRONG
 from rejeu.checkpoints.run_folder import File
 from rejeu.core import atomic
 from rejeu.core.errors import CheckpointError, requires
-from rejeu.core.records import json_text
+from rejeu.core.records import brief, json_text
 from rejeu.lab.experiments import space as spaces, study_plan as plans
 from rejeu.lab.experiments.folder import begin
 from rejeu.lab.experiments.process import hold
 from rejeu.lab.experiments.study_plan import StudyPlan
-from rejeu.lab.experiments.work import HIDDEN
-from rejeu.lab.runs.read import is_locked
+from rejeu.lab.experiments.work import HIDDEN, Job, Work
+from rejeu.lab.runs.config import RunConfig
+from rejeu.logs.tables import read_table
 
 if TYPE_CHECKING:
     import optuna
+    from filelock import FileLock
+    from optuna.trial import FrozenTrial
 
 NAME = "rejeu"
 """Name of the study in its journal."""
-INDEX, REPEATS, REASON = "index", "repeats", "reason"
-"""User attributes of trials: the index, the number of the interrupted trial that is repeated, why a trial failed."""
+REASON = "reason"
+"""User attribute of trials: why a trial failed."""
+STATES = {"COMPLETE": "complete", "PRUNED": "pruned", "FAIL": "failed", "RUNNING": "running"}
+"""States of trials by Optuna's names."""
 STARTUP_TRIALS = 5
 """Trials before the first one is pruned."""
-LOCK = "trial.lock"
-"""File that the process locks which runs a trial."""
-
-State = Literal["waiting", "running", "complete", "pruned", "failed"]
-
-
-@dataclass(frozen=True)
-class Trial:
-    """What is known of one trial."""
-
-    index: int
-    state: State
-    value: float
-    """Of the last evaluation; NaN if there is none."""
-    values: Mapping[str, Any]
-    """The hyperparameters that were sampled."""
-    evaluations: Mapping[int, float]
-    """The value at each evaluation, by environment step."""
-    seconds: float
-    """Wall time; NaN if unknown."""
-    reason: str
-    """Why it failed."""
-
-    @property
-    def has_ended(self) -> bool:
-        """Whether it is neither waiting nor running."""
-        return self.state in ("complete", "pruned", "failed")
 
 
 @dataclass(frozen=True)
@@ -92,14 +69,82 @@ class StudyFolder:
     """The page that compares the winner with the default."""
     final = File("final")
     """Folder of the final comparison."""
+    lock = File("trial.lock")
+    """In the folder of a trial: locked by the process that trains it."""
 
-    def trial(self, index: int) -> Path:
+    def trial(self, index: int) -> StudyFolder:
         """Returns the folder of a trial."""
-        return self.path / "trials" / f"{index:04d}"
+        return StudyFolder(self.path / "trials" / f"{index:04d}")
 
-    def lock(self) -> FileLock:
-        """Returns the lock that is held while trials are entered."""
-        return atomic.lock(self.path / HIDDEN / "lock")
+    def trainings(self, run: RunConfig, seeds: list[int]) -> list[Work]:
+        """Returns the trainings of the preset in this folder on some seeds; ``run`` is common to all of the study."""
+        run = dataclasses.replace(run, preset=str(self.preset))
+        jobs = [
+            Job(name=f"seed_{seed}", run=dataclasses.replace(run, seed=seed, imports=()), no_report=True, no_video=True)
+            for seed in seeds
+        ]
+        name = self.path.name
+        return [
+            Work(self.path, job, run.imports, True, f"{name}, {job.label}", keeps_checkpoints=False) for job in jobs
+        ]
+
+
+@dataclass(eq=False)
+class RunningTrial:
+    """A trial that this process trains, on one or several seeds. Mutable."""
+
+    trial: optuna.Trial
+    lock: FileLock
+    trainings: list[Work]
+    evaluations: dict[int, float]
+    """The evaluations that Optuna has: the mean over the seeds, by environment step."""
+    has_ended: bool = False
+    """Whether its end is in the journal; its processes may still have to stop."""
+
+    def advance(self, plan: StudyPlan) -> bool:
+        """Reports new evaluations and ends the trial early if it is to be; returns whether there was a new one."""
+        n_before = len(self.evaluations)
+        for training in self.trainings:
+            if training.ending == "failed" and not self.has_ended:
+                self.end("FAIL", f"{training.job.label} {training.reason}")
+        tables = [evaluations(training, plan.column) for training in self.trainings]
+        for rows in zip(*tables, strict=False):  # one training may be ahead of another
+            step = rows[0][0]
+            if not self.has_ended and step not in self.evaluations:
+                self.evaluations[step] = sum(value for _, value in rows) / len(rows)
+                self.trial.report(self.evaluations[step], step)
+                if step < plan.default.total_steps and self.trial.should_prune():
+                    self.end("PRUNED")
+        return len(self.evaluations) > n_before
+
+    def end(self, state: str, reason: str = "", value: float | None = None) -> None:
+        """Writes to the journal how the trial ended: one of Optuna's states, why it failed, and its value."""
+        from optuna.trial import TrialState
+
+        if reason:
+            self.trial.set_user_attr(REASON, reason[:500])
+        self.trial.study.tell(self.trial, value, TrialState[state])
+        self.has_ended = True
+
+    def finish(self, plan: StudyPlan) -> None:
+        """Deletes the checkpoints of a trial whose processes have ended. Without a finite last evaluation it has failed."""
+        value = self.evaluations[max(self.evaluations)] if self.evaluations else math.nan
+        if not self.has_ended and math.isfinite(value):
+            self.end("COMPLETE", value=value)
+        elif not self.has_ended:
+            self.end("FAIL", f"its last evaluation has the {plan.measure} {value}")
+        for training in self.trainings:
+            training.drop_checkpoints()
+        self.lock.release()
+
+
+def evaluations(training: Work, column: str) -> list[tuple[int, float]]:
+    """Returns step and value of each evaluation so far."""
+    try:
+        table = read_table(training.files.evaluations)
+    except OSError:
+        return []
+    return list(zip(table.column("step").astype(int).tolist(), table.column(column).tolist(), strict=True))
 
 
 @dataclass(eq=False)
@@ -108,171 +153,131 @@ class Study:
 
     folder: StudyFolder
     plan: StudyPlan
+    lock: FileLock
+    """Held while the journal is written, and while a trial is entered or continued."""
     optuna_study: optuna.Study
-    held: dict[int, FileLock] = field(default_factory=dict)
-    """Locks of the trials that this process trains, by index."""
+    storage: optuna.storages.BaseStorage
 
-    def take(self) -> tuple[optuna.Trial, int] | None:
-        """Returns the next trial with its index, locks it, and writes its preset; None if no trial is left to begin.
-
-        Trials whose process has died come first. The sampler, TPE, expects nothing of trials that still run.
-        """
-        from optuna.samplers import TPESampler
-
-        with self.folder.lock(), readable(self.folder.journal):
-            self.enter_interrupted()
-            index = self.next_index()
-            if index is None:
+    def take(self, run: RunConfig) -> RunningTrial | None:
+        """Returns a trial to train, with its preset written: one that lost its process, else a new one; None without one."""
+        with self.lock, readable(self.folder.journal):
+            for trial in self.trials():
+                if trial.state.name == "RUNNING" and (lock := hold(self.folder.trial(trial.number).lock)) is not None:
+                    return self.running(trial, lock, run)
+            if len(self.trials()) >= self.plan.trials:
                 return None
-            space = self.plan.search_space
-            self.optuna_study.sampler = TPESampler(seed=self.plan.sampler_seed(index), constant_liar=True)
-            trial = self.optuna_study.ask(spaces.distributions(space))
-            trial.set_user_attr(INDEX, index)
-            lock = hold(self.folder.trial(index) / LOCK)
-            assert lock is not None, "trials are entered under the lock of the study"
-            self.held[index] = lock
-        values = spaces.decoded(space, trial.params)
-        source = f"rejeu tune, trial {index} of a study with seed {self.plan.seed}"
-        preset = self.plan.preset(spaces.applied(self.plan.fixed, values), source)
-        presets.write(preset, StudyFolder(self.folder.trial(index)).preset)
-        return trial, index
+            self.optuna_study.add_trial(self.sampled())
+            trial = self.trials()[-1]
+            new = hold(self.folder.trial(trial.number).lock)
+            assert new is not None, "trials are entered under the lock of the study"
+            return self.running(trial, new, run)
 
-    def next_index(self) -> int | None:
-        """Returns the index of the next trial: of one that waits, else a new one; None if all have begun."""
-        trials = self.optuna_study.get_trials(deepcopy=False)
-        waiting = [one.user_attrs[INDEX] for one in trials if one.state.name == "WAITING"]
-        if waiting:
-            return int(waiting[0])
-        index = len({one.user_attrs[INDEX] for one in trials if INDEX in one.user_attrs})
-        return index if index < self.plan.trials else None
+    def sampled(self) -> FrozenTrial:
+        """Returns a new trial. The first one has the values of the default, as far as they lie in the search space.
 
-    def enter_interrupted(self) -> None:
-        """Enters running trials that no process holds again, with the same index and parameters."""
-        from optuna.trial import TrialState
+        A copy of the study is asked for it, because Optuna would write its parameters to the journal one after the other.
+        """
+        from optuna import create_study
+        from optuna.samplers import TPESampler
+        from optuna.trial import TrialState, create_trial
 
-        trials = self.optuna_study.get_trials(deepcopy=False)
-        repeated = {one.user_attrs.get(REPEATS) for one in trials}
-        names = spaces.distributions(self.plan.search_space).keys()
-        for one in trials:
-            index = one.user_attrs.get(INDEX)
-            if one.state.name != "RUNNING" or (index is not None and is_locked(self.folder.trial(index) / LOCK)):
-                continue
-            if index is not None and one.number not in repeated:
-                params = dict(one.params) if one.params.keys() >= names else {}
-                self.optuna_study.enqueue_trial(params, user_attrs={INDEX: index, REPEATS: one.number})
-            self.optuna_study.tell(one.number, state=TrialState.FAIL)
+        space, trials = self.plan.search_space, self.trials()
+        study = create_study(sampler=TPESampler(seed=self.plan.sampler_seed(len(trials))), direction="maximize")
+        study.add_trials(trials)
+        if not trials:
+            study.enqueue_trial(spaces.parameters(space, self.plan.configuration))
+        trial = study.ask()
+        spaces.suggested(trial, space)
+        return create_trial(state=TrialState.RUNNING, params=trial.params, distributions=trial.distributions)
 
-    def report(self, trial: optuna.Trial, step: int, value: float) -> bool:
-        """Adds an evaluation to a trial; returns whether the trial is to be pruned."""
+    def running(self, trial: FrozenTrial, lock: FileLock, run: RunConfig) -> RunningTrial:
+        """Returns a trial of the journal as one that this process trains."""
+        from optuna import Trial
+
+        folder, study_id = self.folder.trial(trial.number), self.storage.get_study_id_from_name(NAME)
+        source = f"rejeu tune, trial {trial.number} of a study with seed {self.plan.seed}"
+        presets.write(self.preset_of(trial, source), folder.preset)
+        trial_id = self.storage.get_trial_id_from_study_id_trial_number(study_id, trial.number)
+        trainings = folder.trainings(run, self.plan.seeds(trial.number))
+        return RunningTrial(Trial(self.optuna_study, trial_id), lock, trainings, {**trial.intermediate_values})
+
+    def trials(self) -> list[FrozenTrial]:
+        """Returns all trials, except for those that another program enqueued."""
         with readable(self.folder.journal):
-            trial.report(value, step)
-            return step < self.plan.default.total_steps and trial.should_prune()
+            return [trial for trial in self.optuna_study.get_trials(deepcopy=False) if trial.state.name != "WAITING"]
 
-    def finish(self, trial: optuna.Trial, index: int, state: State, value: float = math.nan, reason: str = "") -> None:
-        """Ends a trial and releases its lock. A trial without a finite value has failed."""
-        from optuna.trial import TrialState
-
-        if state == "complete" and not math.isfinite(value):
-            state, reason = "failed", f"its last evaluation has the {self.plan.measure} {value}"
-        with readable(self.folder.journal):
-            if reason:
-                trial.set_user_attr(REASON, reason[:500])
-            name = {"complete": "COMPLETE", "pruned": "PRUNED", "failed": "FAIL"}[state]
-            self.optuna_study.tell(trial, value if state == "complete" else None, TrialState[name])
-        self.release(index)
-
-    def release(self, index: int) -> None:
-        """Releases the lock of a trial."""
-        if index in self.held:
-            self.held.pop(index).release()
-
-    def trials(self) -> list[Trial]:
-        """Returns all trials by index, each once."""
-        with readable(self.folder.journal):
-            trials = self.optuna_study.get_trials(deepcopy=False)
-            found = {one.user_attrs[INDEX]: self.trial_of(one) for one in trials if INDEX in one.user_attrs}
-        return [found[index] for index in sorted(found)]
-
-    def trial_of(self, trial: optuna.trial.FrozenTrial) -> Trial:
-        """Returns what is known of a trial of Optuna."""
-        states: dict[str, State] = {"FAIL": "failed", "COMPLETE": "complete", "PRUNED": "pruned", "RUNNING": "running"}
-        last = trial.intermediate_values.get(trial.last_step) if trial.last_step is not None else None
-        value = trial.value if trial.value is not None else last
-        return Trial(
-            index=int(trial.user_attrs[INDEX]),
-            state=states.get(trial.state.name, "waiting"),
-            value=math.nan if value is None else float(value),
-            values=spaces.decoded(self.plan.search_space, trial.params),
-            evaluations=dict(sorted(trial.intermediate_values.items())),
-            seconds=trial.duration.total_seconds() if trial.duration is not None else math.nan,
-            reason=str(trial.user_attrs.get(REASON, "")),
-        )
+    def best(self) -> FrozenTrial | None:
+        """Returns the complete trial with the highest value, of equals the first; None without one."""
+        return self.optuna_study.best_trial if any(trial.state.name == "COMPLETE" for trial in self.trials()) else None
 
     def is_searched(self) -> bool:
         """Returns whether all trials have ended."""
-        return sum(one.has_ended for one in self.trials()) >= self.plan.trials
+        trials = self.trials()
+        return len(trials) >= self.plan.trials and all(trial.state.is_finished() for trial in trials)
 
-    def preset_of(self, trial: Trial, source: str) -> Preset:
+    def record(self, trial: FrozenTrial) -> dict[str, Any]:
+        """Returns a trial as plain values, those of a file that may be damaged."""
+        with readable(self.folder.journal):
+            evaluations = {step: float(value) for step, value in sorted(trial.intermediate_values.items())}
+            value = (
+                evaluations.get(max(evaluations, default=0), math.nan) if trial.value is None else float(trial.value)
+            )
+            return {
+                "index": trial.number,
+                "state": STATES[trial.state.name],
+                "value": value,
+                "values": spaces.suggested(trial, self.plan.search_space),
+                "evaluations": evaluations,
+                "seconds": math.nan if trial.duration is None else trial.duration.total_seconds(),
+                "reason": str(trial.user_attrs.get(REASON, "")),
+            }
+
+    def preset_of(self, trial: FrozenTrial, source: str) -> Preset:
         """Returns a trial as a preset."""
-        return self.plan.preset(spaces.applied(self.plan.fixed, trial.values), source)
-
-
-def best_of(trials: list[Trial]) -> Trial | None:
-    """Returns the complete trial with the highest value, of equals the first; None without one."""
-    return max((one for one in trials if one.state == "complete"), key=lambda one: one.value, default=None)
+        return self.plan.preset(spaces.applied(self.plan.fixed, self.record(trial)["values"]), source)
 
 
 def open_study(folder: StudyFolder, plan: StudyPlan | None = None) -> Study:
-    """Opens the study of a folder; with ``plan`` it is created if there is none.
+    """Opens the study of a folder, whose trials are checked; with ``plan`` it is created if there is none.
 
-    The plan of one that exists must be the same, except for the number of trials and of final seeds. The first trial has the
-    values of the default, as far as they lie in the search space.
+    The plan of one that exists must be the same, except for the number of trials and of final seeds.
 
     Raises:
         FileExistsError: if the folder holds something else.
         FileNotFoundError: if there is no study, without ``plan``.
         ValueError: if the plan differs.
         CheckpointError: if a file is damaged.
+        MissingExtra: if Optuna is not installed.
     """
-    require()
+    with requires("rejeu tune", "optuna", "tune"):
+        import optuna
+    from optuna.storages import JournalStorage
+    from optuna.storages.journal import JournalFileBackend
+
     there = (
         plans.read(folder.plan) if plan is None else begin(folder.path, plans.FILE, plan, plans.read, plans.difference)
     )
     plan = plan or there
-    with folder.lock():
-        if there != plan:
-            atomic.write(folder.plan, json_text(plan))
-        study = connect(folder, plan)
-        if not study.get_trials(deepcopy=False):
-            values = plans.default_values(plan)
-            study.enqueue_trial(spaces.encoded(plan.search_space, values), user_attrs={INDEX: 0})
-    return Study(folder, plan, study)
-
-
-def connect(folder: StudyFolder, plan: StudyPlan) -> optuna.Study:
-    """Returns Optuna's study of a folder, which is created if it does not exist.
-
-    Raises:
-        CheckpointError: if the journal is damaged.
-    """
-    import optuna
-    from optuna.storages import JournalStorage
-    from optuna.storages.journal import JournalFileBackend
-
+    if there != plan:
+        atomic.write(folder.plan, json_text(plan))
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    lock: Any = atomic.lock(f"{folder.journal}.held")  # released with the process, as those of Optuna are not
-    complete_last_line(folder.journal, lock)
-    with readable(folder.journal):
-        return optuna.create_study(
-            storage=JournalStorage(JournalFileBackend(str(folder.journal), lock)),
-            study_name=NAME,
-            direction="maximize",
-            load_if_exists=True,
-            pruner=make_pruner(plan),
+    atomic.make_folder(folder.path / HIDDEN)
+    lock: Any = atomic.lock(folder.path / HIDDEN / "lock")  # unlike Optuna's, it ends with its process
+    with lock, readable(folder.journal):
+        cut_last_line(folder.journal)
+        storage = JournalStorage(JournalFileBackend(str(folder.journal), lock))
+        study = optuna.create_study(
+            storage=storage, study_name=NAME, direction="maximize", load_if_exists=True, pruner=make_pruner(plan)
         )
+        if [direction.name for direction in study.directions] != ["MAXIMIZE"]:
+            raise ValueError("it does not maximize one value")
+    opened = Study(folder, plan, lock, study, storage)
+    for trial in opened.trials():
+        opened.record(trial)
+    return opened
 
 
-def complete_last_line(journal: Path, lock: Any) -> None:
+def cut_last_line(journal: Path) -> None:
     """Cuts the part of a line at the end of a journal that a killed process left behind; Optuna cannot read on after it.
 
     Raises:
@@ -280,13 +285,10 @@ def complete_last_line(journal: Path, lock: Any) -> None:
     """
     if journal.is_symlink():
         raise CheckpointError(f"{journal} is a link and no file; it is from another program")
-    if not journal.is_file():
-        return
-    with lock:
-        content = journal.read_bytes()
-        if content and not content.endswith(b"\n"):
-            with atomic.open_file(journal, "r+b") as file:
-                file.truncate(content.rfind(b"\n") + 1)
+    content = journal.read_bytes() if journal.is_file() else b""
+    if content and not content.endswith(b"\n"):
+        with atomic.open_file(journal, "r+b") as file:
+            file.truncate(content.rfind(b"\n") + 1)
 
 
 @contextmanager
@@ -298,17 +300,10 @@ def readable(journal: Path) -> Iterator[None]:
         yield
     except CheckpointError:
         raise
-    except (*WRONG, AssertionError, OptunaError) as error:
+    except (*WRONG, AssertionError, RuntimeError, OptunaError) as error:
         raise CheckpointError(
-            f"{journal} is damaged: {type(error).__name__}: {' '.join(str(error).split())[:200]}; restore it from a copy, or "
-            "begin a study in another folder"
+            f"{journal} is damaged: {type(error).__name__}: {brief(error)}; restore it from a copy, or begin another study"
         ) from error
-
-
-def require() -> None:
-    """Raises :class:`MissingExtra` if Optuna is not installed."""
-    with requires("rejeu tune", "optuna", "tune"):
-        import optuna  # noqa: F401 - only whether it is there
 
 
 def make_pruner(plan: StudyPlan) -> optuna.pruners.BasePruner:

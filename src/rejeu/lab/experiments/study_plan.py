@@ -57,8 +57,8 @@ class StudyPlan:
     """Names of its wrappers, innermost first."""
     fixed: dict[str, Any]
     """Hyperparameters of every trial, before those that are searched: of the default, with what the user set."""
-    space: dict[str, dict[str, Any]]
-    """Where the others are searched; see :func:`rejeu.lab.experiments.space.to_json`."""
+    space: dict[str, str]
+    """Where the others are searched, as ``--search`` takes it."""
     trials: Annotated[int, Meta(ge=1, le=MAX_TRIALS)] = 30
     trial_seeds: Annotated[int, Meta(ge=1, le=1000)] = 1
     """Seeds of each trial, whose evaluations are averaged."""
@@ -71,6 +71,12 @@ class StudyPlan:
     """What is maximized: the mean return of the last evaluation, or its success rate."""
     checkpoint_minutes: Annotated[float, Meta(ge=0, le=1e6)] = 5.0
 
+    def __post_init__(self) -> None:
+        if 0 < self.final_seeds < MIN_FINAL_SEEDS:
+            raise ValueError(
+                f"final_seeds={self.final_seeds} cannot tell luck from a difference; give {MIN_FINAL_SEEDS} or more, or 0"
+            )
+
     @property
     def run(self) -> RunConfig:
         """The environment of all trainings."""
@@ -80,7 +86,13 @@ class StudyPlan:
     @property
     def search_space(self) -> dict[str, Dimension]:
         """Where hyperparameters are searched, by name."""
-        return {name: spaces.from_json(name, one) for name, one in self.space.items()}
+        return {name: spaces.dimension_of(text) for name, text in self.space.items()}
+
+    @property
+    def configuration(self) -> dict[str, Any]:
+        """All hyperparameters before those that are searched, as JSON."""
+        config_class = AGENTS[self.default.algorithm].algorithm.Config
+        return configs.to_json(validation.build(config_class, self.fixed))
 
     @property
     def column(self) -> str:
@@ -97,8 +109,7 @@ class StudyPlan:
 
     def fresh_seeds(self) -> list[int]:
         """Returns the seeds of the final comparison. They are odd, so that no trial has one of them."""
-        n = max(self.final_seeds, MIN_FINAL_SEEDS) if self.final_seeds else 0  # earlier versions took 3
-        return [number | 1 for number in self._numbers(n, FINAL)]
+        return [number | 1 for number in self._numbers(self.final_seeds, FINAL)]
 
     def _numbers(self, n: int, *key: int) -> list[int]:
         return np.random.SeedSequence([self.seed, *key]).generate_state(max(n, 1)).tolist()[:n]
@@ -128,54 +139,35 @@ def make(
         ValueError: for an unknown algorithm, an empty space, or a value out of range.
         TypeError: for a hyperparameter that the algorithm does not have, with the nearest one, or one that JSON does not have.
     """
-    base = starting_point(env_id, algorithm, preset)
+    name = None if algorithm is None else find_agent(algorithm).algorithm.Config.name
+    base = preset or presets.find(env_id, name)
+    if base is None and name is None:
+        raise ValueError(f"{env_id} has no preset; name the algorithm to tune, such as --algo PPO")
+    base = base or presets.default(env_id, str(name))
     fixed = {key: configs.value_to_json(value) for key, value in (fixed or {}).items()}
     values = {**base.hyperparameters, **fixed}
     space = choose_space(base.algorithm, values, fixed, search or {}, only)
     total = validation.whole("steps", steps or base.total_steps, least=1)
-    given = {name: value for name, value in others.items() if value is not None}
+    settings = {key: value for key, value in others.items() if value is not None}
     usual: dict[str, Any] = {"name": "", "evaluate_every": max(total // EVALUATIONS, 1)}
-    if given.get("env_kwargs") or given.get("wrappers"):
+    if settings.get("env_kwargs") or settings.get("wrappers"):
         usual["backend"] = "auto"
-    of_default = usual | {name: given.pop(name) for name in OF_DEFAULT & given.keys()}
-    plan = StudyPlan(
-        default=dataclasses.replace(base, env_id=env_id, total_steps=total, **of_default),
-        fixed=values,
-        space={key: spaces.to_json(one) for key, one in space.items()},
-        **given,
-    )
-    if 0 < plan.final_seeds < MIN_FINAL_SEEDS:
-        raise ValueError(
-            f"final_seeds={plan.final_seeds} cannot tell luck from a difference; give {MIN_FINAL_SEEDS} or more, or 0"
-        )
+    of_default = usual | {key: settings.pop(key) for key in OF_DEFAULT & settings.keys()}
+    default = dataclasses.replace(base, env_id=env_id, total_steps=total, **of_default)
+    texts = {key: str(dimension) for key, dimension in space.items()}
     try:  # as it is read again, so that a study begins and goes on with the same
-        return convert(json.loads(json_text(plan)), StudyPlan)
+        return convert(
+            json.loads(json_text(StudyPlan(default=default, fixed=values, space=texts, **settings))), StudyPlan
+        )
     except CheckpointError as error:
         raise ValueError(str(error)) from None
     except TypeError as error:
         raise TypeError(f"a study takes only hyperparameters that JSON can express: {error}") from None
 
 
-def starting_point(env_id: str, algorithm: str | None, preset: Preset | None) -> Preset:
-    """Returns the preset that trials start from: the given one, rejeu's own, or one of the algorithm's defaults.
-
-    Raises:
-        ValueError: for an unknown algorithm, or if there is none and the environment has no preset.
-    """
-    name = None if algorithm is None else find_agent(algorithm).algorithm.Config.name
-    base = preset or presets.find(env_id, name)
-    if base is None and name is None:
-        raise ValueError(f"{env_id} has no preset; name the algorithm to tune, such as --algo PPO")
-    return base or presets.default(env_id, str(name))
-
-
 def choose_space(
-    algorithm: str,
-    values: Mapping[str, Any],
-    fixed: Mapping[str, Any],
-    search: SearchSpace,
-    only: tuple[str, ...],
-) -> dict[str, Dimension]:
+    algorithm: str, values: Mapping[str, Any], fixed: Mapping[str, Any], search: SearchSpace, only: tuple[str, ...]
+) -> SearchSpace:
     """Returns the search space of a study, in which every extreme value is known to be valid.
 
     Raises:
@@ -183,18 +175,18 @@ def choose_space(
         TypeError: for a name that the algorithm does not have.
     """
     config_class = AGENTS[algorithm].algorithm.Config
-    own: dict[str, Dimension] = dict(getattr(config_class, "search_space", {}))
+    declared: dict[str, Dimension] = dict(getattr(config_class, "search_space", {}))
     if getattr(validation.build(config_class, values), "hindsight", None) is not None:
-        own |= HINDSIGHT
-    own = {name: one for name, one in own.items() if not is_set(fixed, name)} | dict(search)
+        declared |= HINDSIGHT
+    space = {name: dimension for name, dimension in declared.items() if not is_set(fixed, name)} | dict(search)
     for name in only:
-        if name not in own:
-            raise ValueError(validation.unknown_name(name, own, f"the search space of {algorithm}"))
-    own = {name: one for name, one in own.items() if not only or name in only}
-    check_ends(config_class, values, own)
-    if not own:
+        if name not in space:
+            raise ValueError(validation.unknown_name(name, space, f"the search space of {algorithm}"))
+    space = {name: dimension for name, dimension in space.items() if not only or name in only}
+    check_ends(config_class, values, space)
+    if not space:
         raise ValueError(f"there is nothing to search for {algorithm}; give a range, such as learning_rate=1e-4..1e-2")
-    return own
+    return space
 
 
 def is_set(fixed: Mapping[str, Any], name: str) -> bool:
@@ -211,12 +203,11 @@ def read(path: Path) -> StudyPlan:
         FileNotFoundError: if it is not there.
         CheckpointError: if it is damaged, or names an algorithm that is not registered.
     """
-    return folders.read(path, StudyPlan, MAX_BYTES, lambda plan: check(plan, path))
 
+    def check(plan: StudyPlan) -> None:
+        check_ends(agent_of_file(plan.default.algorithm, path).algorithm.Config, plan.fixed, plan.search_space)
 
-def check(plan: StudyPlan, path: Path) -> None:
-    """Raises ``ValueError`` or ``TypeError`` if the algorithm of a plan from a file does not take its hyperparameters."""
-    check_ends(agent_of_file(plan.default.algorithm, path).algorithm.Config, plan.fixed, plan.search_space)
+    return folders.read(path, StudyPlan, MAX_BYTES, check)
 
 
 def check_ends(config_class: type, values: Mapping[str, Any], space: SearchSpace) -> None:
@@ -226,18 +217,11 @@ def check_ends(config_class: type, values: Mapping[str, Any], space: SearchSpace
             validation.build(config_class, spaces.applied(values, {name: value}))
 
 
-def default_values(plan: StudyPlan) -> dict[str, Any]:
-    """Returns the values of the searched hyperparameters in the default, as far as they lie in the search space."""
-    config = validation.build(AGENTS[plan.default.algorithm].algorithm.Config, plan.fixed)
-    values = spaces.values_at(configs.to_json(config), plan.search_space)
-    return {name: value for name, value in values.items() if plan.search_space[name].contains(value)}
-
-
 def difference(plan: StudyPlan, other: StudyPlan) -> str:
     """Returns the first setting in which two plans differ and which a study cannot change, as text; empty if none does."""
-    one, two = ({**vars(known.default), **vars(known), "default": None} for known in (plan, other))
-    for name, ours in one.items():
-        if name not in ("trials", "final_seeds", "checkpoint_minutes") and ours != two[name]:
-            typed = name.removeprefix("total_")  # --steps
-            return f"another study: {typed} is {str(ours)[:100]} there, not {str(two[name])[:100]}"
+    before, after = ({**vars(study.default), **vars(study), "default": None} for study in (plan, other))
+    for name, value in before.items():
+        if name not in ("trials", "final_seeds", "checkpoint_minutes") and value != after[name]:
+            option = name.removeprefix("total_")  # --steps
+            return f"another study: {option} is {str(value)[:100]} there, not {str(after[name])[:100]}"
     return ""

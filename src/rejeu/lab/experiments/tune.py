@@ -6,11 +6,11 @@ See :mod:`rejeu.lab.experiments.study` for the files, :mod:`rejeu.algorithms.sea
 from __future__ import annotations
 
 import dataclasses
-import math
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rejeu import envs
 from rejeu.agents import modules_of, presets
@@ -19,14 +19,17 @@ from rejeu.algorithms.search import SearchSpace
 from rejeu.checkpoints.run_folder import dated
 from rejeu.core.errors import MissingExtra
 from rejeu.core.interrupt import Interrupt
-from rejeu.lab.experiments import display, search as searches, study as studies, study_plan as plans
+from rejeu.lab.experiments import display, study as studies, study_plan as plans
+from rejeu.lab.experiments.final import Final, compare_with_default
 from rejeu.lab.experiments.process import default_workers
-from rejeu.lab.experiments.search import Final, Search, Watch
-from rejeu.lab.experiments.study import Study, StudyFolder, Trial
+from rejeu.lab.experiments.search import Search
+from rejeu.lab.experiments.study import STATES, Study, StudyFolder
 from rejeu.lab.experiments.study_plan import Measure, Pruner, StudyPlan
-from rejeu.lab.reporting.report.sections import duration
 from rejeu.lab.runs.config import RunConfig
-from rejeu.logs.formatting import number
+from rejeu.logs.formatting import counted, number
+
+if TYPE_CHECKING:
+    from optuna.trial import FrozenTrial
 
 Echo = Callable[[str], object]
 
@@ -35,13 +38,11 @@ Echo = Callable[[str], object]
 class Result:
     """The results of a study so far; ``print`` shows a summary."""
 
-    folder: Path
-    """The study folder."""
-    plan: StudyPlan
-    """The settings of the study."""
-    trials: tuple[Trial, ...]
-    """All trials that have begun, by index."""
-    best: Trial | None
+    study: Study
+    """The study: its ``folder``, its ``plan``, and ``optuna_study``, that of Optuna."""
+    trials: tuple[FrozenTrial, ...]
+    """All trials that have begun, as Optuna has them."""
+    best: FrozenTrial | None
     """The complete trial with the highest value; None if no trial is complete."""
     final: Final | None
     """The comparison with the default; None before it."""
@@ -53,29 +54,27 @@ class Result:
     """What could not be started or written."""
 
     @property
+    def folder(self) -> Path:
+        """The study folder."""
+        return self.study.folder.path
+
+    @property
     def preset(self) -> Preset | None:
         """The winner as a preset."""
-        path = StudyFolder(self.folder).preset
-        return presets.read(path) if path.is_file() else None
+        return None if self.best is None else presets.read(self.study.folder.preset)
 
     def to_dict(self) -> dict[str, Any]:
         """Returns everything as plain values."""
-        compared = None if self.final is None else self.final.comparison
+        final, default = self.final or Final("not compared"), self.study.plan.default
         return {
-            "study": self.folder,
-            "env_id": self.plan.default.env_id,
-            "algorithm": self.plan.default.algorithm,
-            "seed": self.plan.seed,
-            "complete": self.complete,
-            "signal": self.signal,
-            "trials": [dict(vars(one)) for one in self.trials],
-            "best": None if self.best is None else dict(vars(self.best)),
-            "preset": StudyFolder(self.folder).preset if self.best is not None else None,
-            "verdict": None if self.final is None else self.final.verdict,
-            "difference": None if self.final is None else self.final.difference,
-            "comparison": None if compared is None else compared.table(),
-            "failed": () if self.final is None else self.final.failed,
-            "notes": self.notes,
+            **{"study": self.folder, "env_id": default.env_id, "algorithm": default.algorithm},
+            **{"seed": self.study.plan.seed, "complete": self.complete, "signal": self.signal},
+            "trials": [self.study.record(trial) for trial in self.trials],
+            "best": None if self.best is None else self.study.record(self.best),
+            "preset": None if self.best is None else self.study.folder.preset,
+            **{"verdict": self.final and final.verdict, "difference": final.difference},
+            "comparison": None if final.comparison is None else final.comparison.table(),
+            **{"failed": final.failed, "notes": self.notes},
         }
 
     def __str__(self) -> str:
@@ -162,33 +161,28 @@ def tune(
         pruner=pruner,
         measure=measure,
     )
-    study = open_study(plan, None if folder is None else Path(folder))
+    study = open_study(plan, folder)
     echo: Echo = print if verbose else lambda text: None
     config = RunConfig(env=plan.default.env_id, env_kwargs=plan.env_kwargs, imports=tuple(imports))
     with Interrupt() as stop:
-        result = run(study, config, workers, stop, lines(echo, study), echo, bool(verbose))
+        result = run(study, config, workers, stop, echo, bool(verbose))
     echo(str(result))
     return result
 
 
-def open_study(plan: StudyPlan, folder: Path | None) -> Study:
+def open_study(plan: StudyPlan, folder: str | Path | None) -> Study:
     """Returns the study of a folder, which is created if it is new or empty; None makes one under ``runs``.
 
     Raises:
         ValueError: if it is the folder of another study.
         FileExistsError: if it is something else.
     """
-    return studies.open_study(StudyFolder(folder or dated("tune", plan.default.env_id, plan.default.algorithm)), plan)
+    path = Path(folder or dated("tune", plan.default.env_id, plan.default.algorithm))
+    return studies.open_study(StudyFolder(path), plan)
 
 
 def run(
-    study: Study,
-    config: RunConfig,
-    workers: int | None,
-    stop: Interrupt,
-    watch: Watch,
-    echo: Echo,
-    progress: bool = True,
+    study: Study, config: RunConfig, workers: int | None, stop: Interrupt, echo: Echo, progress: bool = True
 ) -> Result:
     """Searches, writes the winner, compares it with the default, and writes the page about that; returns the result.
 
@@ -197,96 +191,68 @@ def run(
         config: the environment of all trainings and what they import, as the command line named them.
         workers: trials at once.
         stop: ends the study where it is.
-        watch: called with all trials when there is news.
-        echo: takes messages.
+        echo: takes a line for each trial that has ended, and messages.
         progress: whether the trainings are shown; see :func:`rejeu.lab.experiments.display.shown`.
     """
-    plan, folder = study.plan, study.folder
+    plan, folder, final = study.plan, study.folder, None
     at_once = workers or default_workers()
     imports = tuple(modules_of(plan.default.algorithm, config.imports))
     config = dataclasses.replace(config, imports=imports, checkpoint_minutes=plan.checkpoint_minutes)
     search = Search(study, config, at_once, stop)
     with display.shown(search.scheduler, lambda: how_far(study), progress) as show:
-        search.run(watch, show)
-    trials = study.trials()
-    best = studies.best_of(trials)
-    compared = None
-    if best is not None:
-        presets.write(study.preset_of(best, source(study, best)), folder.preset)
-    if best is not None and not stop.requested and plan.final_seeds:
-        failed: list[str] = []
-        if not searches.is_default(study, study.preset_of(best, "")):
-            echo(f"comparing trial {best.index} with the default: {announcement(plan, trials, at_once)}")
-            failed = searches.train_final(searches.final_trainings(study, best, config), at_once, stop, echo)
-        compared = None if stop.requested else searches.compared(study, best, failed)
-    complete = study.is_searched() and not stop.requested and not (compared and compared.failed)
+        search.run(lines(echo, study), show)
     notes = [f"trial {text}" for text in search.scheduler.left]
-    if compared and compared.comparison:
+    best = study.best()
+    if best is not None:
+        n_seeds = counted(plan.trial_seeds, "seed")
+        value = f"mean {plan.measure} {number(study.optuna_study.best_value)} of the last evaluation on {n_seeds}"
+        source = f"rejeu tune: trial {best.number} of {plan.trials}, {value}"
+        presets.write(study.preset_of(best, source), folder.preset)
+    if best is not None and plan.final_seeds and not stop.requested:
+        final = compare_with_default(study, best, config, at_once, stop, echo)
+    if final and final.comparison:
         try:
-            compared.comparison.save(folder.page)
+            final.comparison.save(folder.page)
             echo(f"page          {folder.page}")
         except (MissingExtra, OSError) as error:
             notes.append(f"no {folder.page.name}: {error}")
-    return Result(folder.path, plan, tuple(trials), best, compared, complete, stop.signal, tuple(notes))
+    complete = study.is_searched() and not stop.requested and not (final and final.failed)
+    return Result(study, tuple(study.trials()), best, final, complete, stop.signal, tuple(notes))
 
 
 def how_far(study: Study) -> str:
     """Returns how many trials have ended, and which is the best so far."""
-    trials = study.trials()
-    text = f"{sum(one.has_ended for one in trials)} of {study.plan.trials} trials have ended"
-    best = studies.best_of(trials)
-    return text if best is None else f"{text}, best {study.plan.measure} {number(best.value)} (trial {best.index})"
-
-
-def announcement(plan: StudyPlan, trials: Sequence[Trial] = (), workers: int = 1) -> str:
-    """Returns what the final comparison trains, and about how long that takes if trials have ended.
-
-    >>> announcement(plans.make("Pendulum-v1", steps=2000))
-    '5 fresh seeds each, 10 trainings of 2,000 steps'
-    """
-    text = (
-        f"{plan.final_seeds} fresh seeds each, {2 * plan.final_seeds} trainings of {plan.default.total_steps:,} steps"
-    )
-    seconds = [one.seconds for one in trials if one.state == "complete" and math.isfinite(one.seconds)]
-    if not seconds:
-        return text
-    return f"{text}, about {duration(sum(seconds) / len(seconds) * math.ceil(2 * plan.final_seeds / workers))}"
-
-
-def source(study: Study, best: Trial) -> str:
-    """Returns where a winner comes from, for its preset."""
+    n_ended, best = sum(trial.state.is_finished() for trial in study.trials()), study.best()
+    text = f"{n_ended} of {study.plan.trials} trials have ended"
     return (
-        f"rejeu tune: trial {best.index} of {study.plan.trials}, mean {study.plan.measure} {number(best.value)} of the last "
-        f"evaluation on {study.plan.trial_seeds} seed{'s' * (study.plan.trial_seeds != 1)}"
+        text
+        if best is None
+        else f"{text}, best {study.plan.measure} {number(study.optuna_study.best_value)} (trial {best.number})"
     )
 
 
-def lines(echo: Echo, study: Study) -> Watch:
+def lines(echo: Echo, study: Study) -> Callable[[], None]:
     """Returns a function that prints a line for each trial that has ended since the last call."""
-    known = {one.index for one in study.trials() if one.has_ended}
+    n_before = {trial.number for trial in study.trials() if trial.state.is_finished()}
 
-    def watch(trials: list[Trial]) -> None:
-        best = studies.best_of(trials)
-        for one in trials:
-            if one.has_ended and one.index not in known:
-                known.add(one.index)
-                echo(line(one, study.plan) + "  (best)" * (one is best))
+    def watch() -> None:
+        best = study.best()
+        for trial in study.trials():
+            if trial.state.is_finished() and trial.number not in n_before:
+                n_before.add(trial.number)
+                echo(line(study, trial) + "  (best)" * (best is not None and trial.number == best.number))
 
     return watch
 
 
-def line(trial: Trial, plan: StudyPlan) -> str:
+def line(study: Study, trial: FrozenTrial) -> str:
     """Returns a trial on one line."""
-    values = settings(trial)
-    if trial.state == "failed":
-        return f"trial {trial.index:>3}  failed: {trial.reason}  {values}"
-    at = f" at step {max(trial.evaluations, default=0):,}" if trial.state == "pruned" else ""
-    return f"trial {trial.index:>3}  {trial.state}{at}  {plan.measure} {number(trial.value)}  {values}"
-
-
-def settings(trial: Trial) -> str:
-    """Returns the hyperparameters of a trial, on one line."""
-    return " ".join(f"{name}={short(value)}" for name, value in trial.values.items())
+    record = study.record(trial)
+    values = " ".join(f"{name}={short(value)}" for name, value in record["values"].items())
+    if trial.state.name == "FAIL":
+        return f"trial {trial.number:>3}  failed: {record['reason']}  {values}"
+    at = f" at step {trial.last_step:,}" if trial.state.name == "PRUNED" else ""
+    return f"trial {trial.number:>3}  {record['state']}{at}  {study.plan.measure} {number(record['value'])}  {values}"
 
 
 def short(value: Any) -> str:
@@ -300,19 +266,14 @@ def short(value: Any) -> str:
 
 def summary(result: Result) -> list[str]:
     """Returns the last lines of a study."""
-    counts = {
-        state: sum(one.state == state for one in result.trials)
-        for state in ("complete", "pruned", "failed", "running", "waiting")
-    }
-    found = [f"trials        {', '.join(f'{n} {state}' for state, n in counts.items() if n) or 'none'}"]
+    counts = Counter(STATES[trial.state.name] for trial in result.trials)
+    states = ", ".join(f"{counts[state]} {state}" for state in STATES.values() if counts[state])
+    words = [f"trials        {states or 'none'}"]
     if result.best is None:
-        found.append("best trial    none: no trial is complete")
+        words.append("best trial    none: no trial is complete")
     else:
-        found.append(f"best trial    {line(result.best, result.plan)}")
-        found.append(f"preset        {StudyFolder(result.folder).preset}")
+        words.append(f"best trial    {line(result.study, result.best)}")
+        words.append(f"preset        {result.study.folder.preset}")
     if result.final is not None:
-        found.append(f"comparison    {result.final}")
-        found += [f"failed        {text}" for text in result.final.failed]
-    found += [f"note          {text}" for text in result.notes]
-    found.append(f"study folder  {result.folder}")
-    return found
+        words += [f"comparison    {result.final}", *(f"failed        {text}" for text in result.final.failed)]
+    return [*words, *(f"note          {text}" for text in result.notes), f"study folder  {result.folder}"]
