@@ -123,7 +123,7 @@ def processes(folder: Path) -> list[tuple[int, int, str]]:
 
 def run_of(task: str) -> str:
     """Returns the run folder to which the file of a task belongs."""
-    return task.removesuffix(".task").removeprefix(".sweep/").replace("/process", "/run")
+    return task.removesuffix(".task").replace(".sweep/", "")
 
 
 def seconds_since_checkpoint(run: Path) -> float | None:
