@@ -87,14 +87,6 @@ def test_gradient_steps_follow_the_steps_after_learning_starts(n_envs, train_fre
     assert agent.n_updates == sum(calls)
 
 
-def test_learning_that_starts_within_a_step_of_many_environments_counts_only_what_is_beyond():
-    """With 8 environments and learning_starts 4, 4 of the first 8 steps are beyond: one update each."""
-    agent = small_sac(counters(8), learning_starts=4, batch_size=2)
-    calls = count_updates(agent)
-    agent.learn(8)
-    assert sum(calls) == 4
-
-
 @pytest.mark.parametrize(("gradient_steps", "updates"), [(-1, 20), (3, 6)])
 def test_learning_by_episodes_takes_as_many_gradient_steps_as_environment_steps_or_a_number_each(
     gradient_steps, updates

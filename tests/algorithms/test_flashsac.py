@@ -112,6 +112,14 @@ def test_an_update_uses_the_equations_in_the_documented_order(name):
     np.testing.assert_allclose(after.target_critics.head.bias, old + config.tau * (mean[1] - old), atol=1e-6)
 
 
+def test_the_critics_loss_is_the_sum_of_that_of_each():
+    critics, batch = made("XQC").state.critics, box_batch(2, BATCH)
+    target = jnp.float32(np.random.default_rng(0).dirichlet(np.ones(N_BINS), BATCH))
+    loss = jax.jit(lambda critics: flashsac.critics_loss(critics, batch, batch.action, target)[0])
+    each = [float(loss(jax.tree.map(lambda leaf, i=i: leaf[i : i + 1], critics))) for i in (0, 1)]
+    assert float(loss(critics)) == pytest.approx(sum(each), rel=1e-5)
+
+
 @exhaustive
 @pytest.mark.parametrize("name", only(["XQC"], MODULES))
 def test_the_target_has_no_gradient_and_the_critics_follow_theirs(name):

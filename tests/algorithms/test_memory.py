@@ -271,20 +271,21 @@ def numpy_relu(reader, x):
 
 @pytest.mark.parametrize("n_envs", [1, 2])
 def test_the_memory_of_a_sequence_is_that_before_its_first_row_that_is_there(n_envs):
-    """A row's number is its time, and so is its memory. Those that are gone are shown as the oldest, and not counted."""
+    """A row shows its time, and its memory 100 more, at the start of an episode 0. Rows that are gone look like the oldest."""
     leaf = Leaf("", "continuous", (1,), "float32")
     ring = Ring(12 * n_envs, n_envs, (leaf,), jax.tree.structure(0), (), np.int32, memory_size=1)
-    buffer, nobody = ReplayBuffer(ring, 0.9, sequence=(4, 3)), np.zeros(n_envs, bool)
+    buffer = ReplayBuffer(ring, 0.9, sequence=(4, 3))
     for time in range(40):
-        row = np.full((n_envs, 1), time, np.float32)
-        if time in (0, 33):
+        row, begins = np.full((n_envs, 1), time, np.float32), np.full(n_envs, time in (0, 33))
+        if begins.all():
             buffer.begin(row)
         else:
-            buffer.add(np.zeros(n_envs, np.int32), np.zeros(n_envs, np.float32), nobody, row)
-        ring.remember(row, nobody)
+            buffer.add(np.zeros(n_envs, np.int32), np.zeros(n_envs, np.float32), begins, row)
+        ring.remember(row + 100, begins)
     obs, (oldest, final, newest) = buffer.sample(np.random.default_rng(0), (400,)).obs, (28, 32, 39)
-    for row, (first,), n_absent, reads in zip(obs.obs[..., 0], obs.memory, obs.n_absent, obs.reads, strict=True):
-        times = first - n_absent + np.arange(len(row))
+    for row, (memory,), n_absent, reads in zip(obs.obs[..., 0], obs.memory, obs.n_absent, obs.reads, strict=True):
+        times = row[n_absent] - n_absent + np.arange(len(row))
+        assert memory == (0 if row[n_absent] == final + 1 else row[n_absent] + 100)
         np.testing.assert_array_equal(row, np.clip(times, oldest, newest))
         assert n_absent == np.sum(times < oldest)
         assert not {final, newest} & {*row[reads].tolist()}  # from which no step was taken

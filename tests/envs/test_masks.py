@@ -17,7 +17,7 @@ from rejeu.algorithms.actor_critic.steps import samples
 from rejeu.core.algorithm import Clock, Masked
 from rejeu.core.errors import BadEnvironmentError, WorkerError
 from rejeu.envs.make import InProcess, make_vector
-from rejeu.envs.masks import make_masked
+from rejeu.envs.masks import flat_mask, make_masked
 from rejeu.sb3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor
 from rejeu.training.learner import Readings
 from tests.environments import Counter
@@ -343,6 +343,12 @@ def test_masks_may_come_as_a_list_of_parts():
     assert make_masked(env).reset().mask.tolist() == [[True, False, False, True]]
 
 
+@pytest.mark.parametrize("mask", [[0, 0, 1, 1], [1, 1, 0, 0]])
+def test_every_choice_needs_an_option(mask):
+    with pytest.raises(BadEnvironmentError, match="Fixed allows no action"):
+        flat_mask(mask, spaces.MultiDiscrete([2, 2]), "Fixed", over=False)
+
+
 class Mute(Fixed):
     def step(self, action):
         return (*super().step(action)[:4], None if self.time == 3 else {})
@@ -353,7 +359,6 @@ class Mute(Fixed):
     [
         (lambda: Fixed([0, 0, 0]), BadEnvironmentError, r"Fixed allows no action: its mask is \[0, 0, 0\]"),
         (lambda: Fixed([1, 1]), BadEnvironmentError, "Fixed gave a mask of 2 entries, expected 3"),
-        (lambda: Fixed([1, 1, 0, 0], spaces.MultiDiscrete([2, 2])), BadEnvironmentError, "Fixed allows no action"),
         (lambda: Mute([1, 1, 0]), BadEnvironmentError, "Mute, environment 0, step 3: step returned the info None"),
         (Silent, BadEnvironmentError, r'put info\["action_mask"\] into what reset and step return'),
         # the id of one of EnvPool's environments is made where its masks can be reached

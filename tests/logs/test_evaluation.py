@@ -61,6 +61,21 @@ def test_exactly_as_many_episodes_are_played_as_asked_for(n_envs):
     assert len(rejeu.evaluate_policy(Still(), envs(), 7, return_episode_rewards=True)[0]) == 7
 
 
+def test_policies_are_told_where_episodes_begin():
+    told = []
+
+    def told_policy(obs, began):
+        told.extend(zip(began.tolist(), (obs[:, 1] == 0).tolist(), strict=True))
+        return still(obs, began)
+
+    model = SimpleNamespace(
+        predict=lambda obs, state, episode_start, deterministic: (told_policy(obs, episode_start), None)
+    )
+    evaluate(told_policy, InProcess([Counter((2, 3)), Counter((4,))]), 6)
+    rejeu.evaluate_policy(model, InProcess([Counter((2, 3)), Counter((4,))]), 6)
+    assert {*told} == {(True, True), (False, False)}
+
+
 def timed(monkeypatch, envs, episodes, seconds, compiling=0.0):
     """Returns the lengths of the episodes played where every step of all environments takes one second.
 

@@ -66,6 +66,8 @@ def test_sizes_are_presets_of_each_algorithm_with_a_name():
     found = {name: find_preset("Hopper-v5", name, "small") for name in ("FlashSAC", "XQC")}
     assert {name: widths(one) for name, one in found.items()} == {"FlashSAC": [64, 64], "XQC": [128, 128]}
     assert find_preset("Pendulum-v1", "XQC", "small").total_steps < found["XQC"].total_steps
+    assert presets.small("DQN") == find_preset("CartPole-v1", "DQN", "small").hyperparameters != presets.small("XQC")
+    assert presets.small("PPO") == {}
     assert find_preset("Pendulum-v1", "FlashSAC", "full").hyperparameters == {}
     assert presets.find("HalfCheetah-v5") is None
     assert presets.find("Pendulum-v1", "FlashSAC") is None

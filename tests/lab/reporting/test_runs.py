@@ -64,6 +64,8 @@ def test_complete_run(folder):
     np.testing.assert_array_equal(run.evaluations.column("mean_return"), [25.0])
     assert run.versions == {"python": "3.11.7"}
     assert run.notes == ()
+    (folder / "evaluations.csv").unlink()
+    assert read_run(folder).steps == 100
 
 
 def test_changed_hyperparameters_and_command(folder):
