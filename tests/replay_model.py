@@ -71,9 +71,8 @@ class Model:
             frames.append(Frame(frames[-1].episode + 1 if frames else 0))
             self.must_begin[env] = False
 
-    def add(self, envs: list[int], action: np.ndarray, reward: np.ndarray, ends: list[str]) -> None:
-        for env in envs:
-            frames = self.frames[env]
+    def add(self, action: np.ndarray, reward: np.ndarray, ends: list[str]) -> None:
+        for env, frames in enumerate(self.frames):
             frames[-1].step = (float(action[env]), float(reward[env]), ends[env] == "terminated")
             frames.append(Frame(frames[-1].episode))
             self.must_begin[env] = ends[env] != "no"
@@ -83,18 +82,17 @@ class Model:
 class Turn:
     """An operation on the environments."""
 
-    stepping: list[bool]
     ends: list[str]
     restarting: list[bool]
     """Environments whose running episode is discarded after the step."""
 
 
 def turns(n_envs: int, most: int = 40) -> st.SearchStrategy[list[Turn]]:
-    """Random histories with partial steps, both kinds of episode ends, and discarded episodes."""
+    """Random histories with both kinds of episode ends, and discarded episodes."""
     each = lambda values: st.lists(values, min_size=n_envs, max_size=n_envs)  # noqa: E731
     end = st.sampled_from(["no"] * 6 + ["terminated", "truncated"])
     restart = st.sampled_from([False] * 9 + [True])
-    turn = st.builds(Turn, each(st.sampled_from([True, True, True, False])), each(end), each(restart))
+    turn = st.builds(Turn, each(end), each(restart))
     return st.lists(turn, min_size=1, max_size=most)
 
 
@@ -144,12 +142,9 @@ def play(replay: Any, model: Model, history: list[Turn], observe_function: Any =
 
     begin(list(range(n_envs)))
     for turn in history:
-        stepping = [env for env in range(n_envs) if turn.stepping[env]]
-        if stepping:
-            action = rng.uniform(-1, 1, (n_envs, 1)).astype(np.float32)
-            reward = rng.normal(size=n_envs).astype(np.float32)
-            terminated = np.array([end == "terminated" for end in turn.ends])
-            everyone = len(stepping) == n_envs
-            replay.add(action, reward, terminated, observed(), None if everyone else np.array(stepping))
-            model.add(stepping, action[:, 0], reward, turn.ends)
+        action = rng.uniform(-1, 1, (n_envs, 1)).astype(np.float32)
+        reward = rng.normal(size=n_envs).astype(np.float32)
+        terminated = np.array([end == "terminated" for end in turn.ends])
+        replay.add(action, reward, terminated, observed())
+        model.add(action[:, 0], reward, turn.ends)
         begin([env for env in range(n_envs) if model.must_begin[env] or turn.restarting[env]])

@@ -36,12 +36,24 @@ def agent():
 # Steps.
 
 
-@pytest.mark.parametrize(("n_envs", "total"), [(1, 17), (3, 17), (3, 18), (8, 17), (8, 3), (3, 1)])
-def test_learn_takes_exactly_the_steps_that_were_asked_for(n_envs, total):
+@pytest.mark.parametrize(("n_envs", "total", "taken"), [(1, 17, 17), (3, 17, 18), (3, 18, 18), (8, 3, 8)])
+def test_learn_ends_with_the_turn_that_reaches_the_number_of_steps(n_envs, total, taken):
     agent = small_sac(counters(n_envs), learning_starts=NEVER).learn(total)
-    assert agent.num_timesteps == agent.replay_buffer.size() == total
+    assert agent.num_timesteps == agent.replay_buffer.size() == taken
     agent.learn(total)
-    assert agent.replay_buffer.size() == 2 * total
+    assert agent.replay_buffer.size() == 2 * taken
+
+
+@pytest.mark.parametrize("settings", [{"n_steps": 5}, {"n_episodes": 1, "n_steps": 9}])
+def test_on_policy_learning_ends_with_a_rollout_also_after_one_that_was_stopped(settings):
+    """Rollouts of 10 steps: 5 of each of two environments, whose episodes have 5 steps."""
+    agent = rejeu.A2C("MlpPolicy", counters(2), seed=0, **settings)
+    turns = []
+    agent.learn(11, lambda agent, turn: turns.append((turn.step, turn.rollout_ended)))
+    assert [step for step, rollout_ended in turns if rollout_ended] == [10, 20]
+    assert turns[-1] == (20, True)
+    agent.learn(20, lambda agent, turn: turn.step < 24, reset_num_timesteps=False)
+    assert agent.learn(1, reset_num_timesteps=False).num_timesteps == 30
 
 
 @pytest.mark.parametrize("total", [0, -1, 2.5, "many", True, None])
@@ -243,7 +255,7 @@ def test_only_false_stops_training_at_once_and_learning_can_go_on(number):
     agent = small_sac(counters(3), learning_starts=NEVER)
     answers = iter([None, True, 0, []])
     agent.learn(10, callback=lambda a, progress: seen.append((a is agent, progress.step)) or next(answers))
-    assert seen == [(True, 3), (True, 6), (True, 9), (True, 10)]
+    assert seen == [(True, 3), (True, 6), (True, 9), (True, 12)]
     agent = small_sac(counters(1), learning_starts=NEVER)
     assert agent.learn(10, callback=lambda a, p: number(p.step) < 4).num_timesteps == 4
     assert agent.learn(10, reset_num_timesteps=False).num_timesteps == 14

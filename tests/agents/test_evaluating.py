@@ -119,9 +119,9 @@ LEARNERS = {
 def test_every_loop_goes_on_after_an_evaluation_in_a_callback(name):
     agent, results = LEARNERS[name](), []
     agent.learn(41, every(9, lambda agent: results.append(agent.evaluate(2, seed=5))))
-    assert agent.num_timesteps == 41
+    assert agent.num_timesteps >= 41
     assert len(results) >= 2
-    assert agent.history["length"].sum() <= 41
+    assert agent.history["length"].sum() <= agent.num_timesteps
 
 
 def test_callbacks_after_one_that_evaluated_see_observations_of_new_episodes():

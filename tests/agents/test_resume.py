@@ -489,13 +489,14 @@ def test_masks_are_carried_too(tmp_path):
     ),
 )
 def test_a_rollout_that_waits_for_the_next_learn_is_in_the_checkpoint(name, settings, tmp_path):
-    """Two environments, 16 steps each a rollout: 13 more steps end within a turn, and are fewer than a minibatch."""
+    """A callback stops training after 7 of the 16 turns of a rollout."""
     make_env = vector("rejeu/CartPoleNoVelocity-v0", 2)
     make = lambda: rejeu.AGENTS[name]("MlpPolicy", make_env(), **settings)  # noqa: E731
     with shared_learners():
-        whole = make().learn(45).learn(50, reset_num_timesteps=False)
-        cut_off = make().learn(45, Checkpoint(tmp_path))
-        assert cut_off.run.replay.size() == 13
+        stop = lambda agent, turn: turn.step < 46  # noqa: E731
+        whole = make().learn(64, stop).learn(50, reset_num_timesteps=False)
+        cut_off = make().learn(64, [stop, Checkpoint(tmp_path)])
+        assert cut_off.run.replay.length == 7
         again = rejeu.AGENTS[name].resume(tmp_path, make_env())
         assert_same(facts(again), facts(cut_off))
         again.learn(50, reset_num_timesteps=False)

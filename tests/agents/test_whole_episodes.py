@@ -28,6 +28,11 @@ def small(env, algorithm=rejeu.A2C, **settings):
     return algorithm("MlpPolicy", env, **{**SMALL, "n_steps": 20, **settings})
 
 
+def until(step):
+    """Returns a callback that stops training at a step."""
+    return lambda agent, turn: turn.step < step
+
+
 def rollouts_of(agent, n_steps=None, **kwargs):
     """Trains, and returns what each update was given, and the state before it."""
     seen, update = [], agent.learner.update
@@ -110,35 +115,31 @@ def test_with_lambda_1_advantages_are_returns_to_go_minus_the_value(ends):
             at += length
 
 
-def test_the_steps_asked_for_are_taken_exactly_and_an_incomplete_rollout_waits():
+def test_a_rollout_in_which_the_number_of_steps_is_reached_is_completed():
     agent = small(counters(), n_episodes=1, n_steps=7)
-    assert rollouts_of(agent, 11) == []  # 2 + 4 + 7 would be 13; all take 2 steps, two take 2 more, and one is left
-    assert agent.num_timesteps == 11
-    seen = rollouts_of(agent, 2, reset_num_timesteps=False)
+    seen = rollouts_of(agent, 11)
+    assert agent.num_timesteps == 2 + 4 + 7
     assert [rollout.valid.sum(axis=0).tolist() for _, rollout in seen] == [[2, 4, 7]]
     assert agent.history["length"].tolist() == [2, 4, 7]
 
 
 def test_episodes_that_an_update_cut_off_do_not_run_on_in_the_history():
     """The environment of long episodes is cut after 4 steps by n_steps, and begun anew: those 4 count for nothing."""
-    env = counters(((3,), (50,), (4, 4)))
-    agent = small(env, n_episodes=1, n_steps=4).learn(11)
-    env.envs[1].lengths = (2,)
-    agent.learn(9)
+    agent = small(counters(((3,), (50, 2), (4, 4))), n_episodes=1, n_steps=4).learn(11).learn(9)
     second = [(e.length, e.episode_return) for e in agent.history.episodes if e.env == 1]
     assert second == [(2, 100.0 + 101.0)]
 
 
 def test_a_run_that_stopped_within_an_episode_goes_on_with_it():
     env = counters(((6,), (6,)))
-    agent = small(env, n_episodes=1, n_steps=6).learn(4).learn(8)
+    agent = small(env, n_episodes=1, n_steps=6).learn(12, until(4)).learn(8)
     assert [(e.length, e.episode_return) for e in agent.history.episodes] == [(6, 15.0)] * 2
     assert agent.n_updates == 1
 
 
 def test_a_rollout_of_whole_episodes_begins_again_where_new_episodes_must_begin():
     env = counters(((6,), (6,)))
-    agent = small(env, n_episodes=1, n_steps=6).learn(4)
+    agent = small(env, n_episodes=1, n_steps=6).learn(12, until(4))
     agent.evaluate(1)  # in the same environments
     (_, rollout), *_ = rollouts_of(agent, 12)
     assert rollout.valid.sum(axis=0).tolist() == [6, 6]

@@ -112,12 +112,11 @@ def test_without_a_time_limit_every_episode_counts_as_many_steps(length, counted
     assert len(agent.history.episodes) == (4 if length == counted else 0)  # what was cut is no episode
 
 
-def test_a_learn_that_ends_in_a_part_of_a_step_cuts_no_episode(found):
-    """Two environments with episodes of 10 steps; the first ``learn`` ends with a step of one of them."""
+def test_learning_ends_with_an_iteration_and_cuts_no_episode(found):
+    """Two environments with episodes of 10 steps, of which an iteration has 4."""
     env = rejeu.make_vector(lambda: Lasting(10), 2, "gymnasium")
     agent = rejeu.ARS("MlpPolicy", env, n_delta=2, n_steps=50, seed=0)
     agent.learn(15)
-    agent.learn(25, reset_num_timesteps=False)
     assert found == [[-10.0] * 4]
     assert agent.num_timesteps == 40
 
@@ -126,10 +125,10 @@ def test_an_iteration_that_begins_again_begins_with_the_first_direction():
     """After an evaluation in the environments of training the numbers of episodes start again with the rollout."""
     env = Lasting(10)
     agent = rejeu.ARS("MlpPolicy", env, n_delta=2, n_steps=50, seed=0)
-    agent.learn(25)
+    agent.learn(25, lambda agent, turn: turn.step < 25)
     assert agent.run.carry.episode.tolist() == [3]
     agent.evaluate(episodes=1, env=env)
-    agent.learn(5, reset_num_timesteps=False)
+    agent.learn(5, lambda agent, turn: turn.step < 30, reset_num_timesteps=False)
     assert agent.run.carry.episode.tolist() == [1]
 
 

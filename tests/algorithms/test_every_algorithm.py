@@ -90,15 +90,14 @@ def test_the_steps_asked_for_are_taken_and_as_many_updates_as_they_owe(kind):
 @pytest.mark.parametrize(("n_envs", "total"), [(1, 45), (3, 50), (3, 67)])
 @every_on_policy
 def test_of_rollouts_so_many_updates_are_owed(kind, n_envs, total):
-    """16 steps a gradient step, each learned from 4 times; a last rollout of fewer than 16, or of A2C's, has to wait."""
+    """16 steps a gradient step, each learned from 4 times, but A2C's; the number of steps is rounded up to whole rollouts."""
     agent = start(kind, n_envs).learn(total)
-    assert agent.num_timesteps == total
     size = agent.config.n_steps * n_envs
-    rest = total % size
-    sizes = [size] * (total // size) + [rest] * (kind.name != "A2C" and rest >= 16)
-    expected = len(sizes) if kind.name == "A2C" else sum(4 * -(-n // 16) for n in sizes)
-    assert agent.n_updates == int(agent.state.n_updates) == expected
-    assert sum(agent.history["length"]) <= total
+    n_rollouts = -(-total // size)
+    assert agent.num_timesteps == n_rollouts * size
+    of_rollout = 1 if kind.name == "A2C" else 4 * -(-size // 16)
+    assert agent.n_updates == int(agent.state.n_updates) == n_rollouts * of_rollout
+    assert sum(agent.history["length"]) <= agent.num_timesteps
 
 
 CRITIC = {"value_loss", "entropy_loss", "explained_variance"}
@@ -163,7 +162,7 @@ def test_learning_in_parts_is_learning_at_once(kind, n_envs):
 
 @every_on_policy
 def test_what_was_collected_when_a_run_ended_is_learnt_from_later(kind):
-    """Whether a callback's False ends it within a rollout, Ctrl-C, or the number of steps."""
+    """Whether a callback's False ends it within a rollout or Ctrl-C."""
     size = kind.settings["n_steps"]
     whole = start(kind).learn(3 * size)
 
@@ -173,15 +172,9 @@ def test_what_was_collected_when_a_run_ended_is_learnt_from_later(kind):
 
     stopped = start(kind).learn(3 * size, callback=lambda agent, progress: progress.step < size + 2)
     interrupted = start(kind).learn(3 * size, callback=press)
-    short = start(kind)
-    before = short.get_parameters()
-    short.learn(size - 1)
-    assert short.n_updates == 0
-    for name, array in short.get_parameters().items():
-        np.testing.assert_array_equal(array, before[name])
-    assert [agent.num_timesteps for agent in (stopped, interrupted, short)] == [size + 2, size + 5, size - 1]
-    assert [agent.interrupted for agent in (stopped, interrupted, short)] == [False, True, False]
-    for agent in (stopped, interrupted, short):
+    assert [agent.num_timesteps for agent in (stopped, interrupted)] == [size + 2, size + 5]
+    assert [agent.interrupted for agent in (stopped, interrupted)] == [False, True]
+    for agent in (stopped, interrupted):
         agent.learn(3 * size - agent.num_timesteps, reset_num_timesteps=False)
         assert_same_parameters(whole, agent)
         np.testing.assert_array_equal(whole.history["return"], agent.history["return"])
@@ -192,9 +185,10 @@ def test_what_was_collected_when_a_run_ended_is_learnt_from_later(kind):
 def test_a_rollout_that_another_policy_or_environment_collected_is_not_learned_from(kind, change):
     """The log-probabilities of its actions are computed later, by the policy that learns from it."""
     size = kind.settings["n_steps"]
+    until = lambda step: lambda agent, turn: turn.step < step  # noqa: E731
     agent = start(kind).learn(size)
     agent.remember_best(1.0)
-    agent.learn(size - 1, reset_num_timesteps=False)
+    agent.learn(size, until(2 * size - 1), reset_num_timesteps=False)
     assert agent.run.replay.size() == size - 1
     if change == "set_parameters":
         agent.set_parameters(agent.get_parameters())
@@ -203,7 +197,7 @@ def test_a_rollout_that_another_policy_or_environment_collected_is_not_learned_f
     else:
         agent.set_env(kind.envs(Wanderer))
     n_updates = agent.n_updates
-    agent.learn(size - 1, reset_num_timesteps=False)
+    agent.learn(size, until(3 * size - 2), reset_num_timesteps=False)
     assert (agent.n_updates, agent.run.replay.size()) == (n_updates, size - 1)
     agent.learn(1, reset_num_timesteps=False)
     assert agent.n_updates > n_updates
@@ -248,7 +242,7 @@ def test_another_number_of_environments_may_follow(kind):
     agent = start(kind).learn(21)
     agent.set_env(kind.envs(Wanderer, 3))
     agent.learn(50)
-    assert agent.num_timesteps == 50
+    assert agent.num_timesteps >= 50
     assert agent.n_updates == int(agent.state.n_updates)
     assert all(np.isfinite(array).all() for array in agent.get_parameters().values())
 

@@ -273,7 +273,7 @@ def test_the_values_for_many_environments_are_those_of_the_authors():
 def test_values_for_another_number_of_environments_are_warned_of(n_envs, settings):
     agent = rejeu.PQN("MlpPolicy", rejeu.make_vector("jax/CartPole-v1", n_envs), seed=0, **settings)
     with pytest.warns(UserWarning, match=f"environments, and there are {n_envs}"):
-        agent.learn(n_envs)
+        agent.learn(n_envs, lambda agent, turn: False)
 
 
 # With a constant learning rate of 5e-4, one of these seeds ended at 103 with one environment and two with four.

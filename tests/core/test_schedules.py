@@ -131,7 +131,7 @@ def test_schedules_continue_over_learn_as_in_stable_baselines3():
 
 def test_schedules_follow_training_time_likewise(monkeypatch):
     monkeypatch.setattr("time.perf_counter", lambda: 100.0)
-    call = TrainingCall(None, None, 60.0, 0, 0, 4, 0, seconds_before=20.0)
+    call = TrainingCall(None, None, 60.0, 0, 0, 4, 0, None, seconds_before=20.0)
     assert call.progress(5, 1) == 20 / 80
     monkeypatch.setattr("time.perf_counter", lambda: 130.0)
     assert call.progress(5, 1) == 50 / 80

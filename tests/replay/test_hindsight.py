@@ -152,7 +152,7 @@ def test_samples_agree_with_a_brute_force_relabeller(case, strategy, k, n_steps,
 
 
 def turn(*ends):
-    return Turn([True] * len(ends), list(ends), [False] * len(ends))
+    return Turn(list(ends), [False] * len(ends))
 
 
 RUNNING_AND_WRAPPED = [turn("truncated" if i == 5 else "terminated" if i == 13 else "no") for i in range(24)]

@@ -90,7 +90,7 @@ def test_a_restored_buffer_samples_and_grows_like_the_original(case, more):
     for buffer in (replay, other):
         again = Model(n_envs, rows)
         again.frames = [list(frames) for frames in model.frames]
-        fitted = [Turn(*([(values * n_envs)[:n_envs] for values in (t.stepping, t.ends, t.restarting)])) for t in more]
+        fitted = [Turn(*([(values * n_envs)[:n_envs] for values in (t.ends, t.restarting)])) for t in more]
         play(buffer, again, fitted, seed=5)
     if replay.size():
         one, two = (buffer.sample(np.random.default_rng(3), (2, 16)) for buffer in (replay, other))
@@ -113,12 +113,12 @@ def test_counters_are_those_of_the_episodes(case):
         assert until_end == [end - place for place, end in zip(places, ends, strict=True)]
 
 
-NO_END = Turn([True] * 2, ["no"] * 2, [False] * 2)
+NO_END = Turn(["no"] * 2, [False] * 2)
 
 
 def test_steps_are_drawn_uniformly_over_uneven_environments_and_short_episodes():
-    """Environment 1 has a third of the steps and many final rows; Pearson's chi-square at the 0.1 % level."""
-    history = [Turn([True, i % 3 == 0], ["no", "truncated" if i % 6 == 0 else "no"], [False, False]) for i in range(60)]
+    """Every second row of environment 1 is a final one; Pearson's chi-square at the 0.1 % level."""
+    history = [Turn(["no", "truncated"], [False, False])] * 60
     replay, model = filled(2, 70, history)
     steps = sorted(model.steps())
     assert {env for env, _ in steps} == {0, 1}

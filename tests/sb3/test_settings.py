@@ -104,7 +104,8 @@ def test_what_cannot_be_set_raises_and_changes_nothing(dqn, name, value, error, 
 
 
 def test_the_size_of_a_buffer_that_holds_steps_cannot_be_set():
-    model = PPO("MlpPolicy", gym.make("CartPole-v1"), **TINY, n_steps=16, batch_size=16).learn(4)
+    stop = lambda local_variables, global_variables: local_variables["self"].num_timesteps < 4  # noqa: E731
+    model = PPO("MlpPolicy", gym.make("CartPole-v1"), **TINY, n_steps=16, batch_size=16).learn(16, stop)
     with pytest.raises(ValueError, match="n_steps cannot be set on a PPO whose buffer holds steps"):
         model.n_steps = 8
     model.n_steps = 16

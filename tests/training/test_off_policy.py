@@ -16,12 +16,12 @@ from rejeu.training.compiled import off_policy as on_device
 
 def host_turns(config, learn_from):
     """A function of the steps and the ended episodes of a turn that returns the gradient steps which are due."""
-    run = SimpleNamespace(step=0, learn_from=learn_from, owed=0, steps_since_update=0)
+    run = SimpleNamespace(step=0, learn_from=learn_from, owed=0, steps_since_update=0, env=SimpleNamespace())
     run.replay = SimpleNamespace(size=lambda: run.step)
 
     def turn(taken, ended):
-        run.step += taken
-        return off_policy.due(run, config, taken, ended)
+        run.step, run.env.n_envs = run.step + taken, taken
+        return off_policy.due(run, config, ended)
 
     return turn
 
@@ -72,4 +72,5 @@ def test_periods_end_where_a_multiple_of_their_length_is_crossed():
         config = OffPolicyConfig(train_freq=every)
         for step in range(n_envs, 40, n_envs):
             crossed = any(one % every == 0 for one in range(step - n_envs + 1, step + 1))
-            assert off_policy.reaches(SimpleNamespace(step=step), config, n_envs, 0) == crossed
+            run = SimpleNamespace(step=step, env=SimpleNamespace(n_envs=n_envs))
+            assert off_policy.reaches(run, config, 0) == crossed

@@ -48,7 +48,7 @@ class Agent(BaseAgent):
         """Trains, and returns the agent.
 
         Args:
-            total_timesteps: environment steps, over all environments; exactly this number is taken. None with
+            total_timesteps: environment steps, over all environments, rounded up to whole turns or rollouts. None with
                 ``episodes`` or ``minutes``.
             callback: one or several, called after every step as ``callback(agent, progress)``; ``False`` stops training.
                 A :class:`rejeu.callbacks.TrainingCallback` is also called when training starts and ends, as are those

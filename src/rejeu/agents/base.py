@@ -386,8 +386,12 @@ class BaseAgent(ABC):
         """Returns the environment step of the first gradient step, for a run that starts at ``step``."""
 
     @abstractmethod
+    def steps_to_take(self, n_steps: int) -> int:
+        """Returns after how many environment steps a ``learn`` of ``n_steps`` ends."""
+
+    @abstractmethod
     def loop(self, n_steps: int | None, progress: Callable[[int], float]) -> Iterator[Progress]:
-        """Trains for ``n_steps`` environment steps (None: without end); yields after each step of all environments.
+        """Trains until ``n_steps`` environment steps are taken (None: without end), and yields after every turn.
 
         Args:
             n_steps: over all environments.

@@ -175,6 +175,6 @@ def episodes_to_judge(agent: BaseAgent, call: TrainingCall, turn: Progress) -> i
         return len(turn.episodes)
     period = MAX_TURNS * agent.n_envs
     n_periods = (turn.step - agent.n_envs) // period  # of which the episodes were judged
-    if turn.step // period == n_periods and not call.is_over(turn.step, agent.run.episode):
+    if turn.step // period == n_periods and not call.is_over(agent.run):
         return 0
     return int(np.count_nonzero(agent.history["step"] > n_periods * period))

@@ -111,6 +111,9 @@ class OffPolicyAgent(Agent):
     def first_learning_step(self, step: int) -> int:
         return step + self.config.learning_starts
 
+    def steps_to_take(self, n_steps: int) -> int:
+        return n_steps
+
     def loop(self, n_steps: int | None, progress: Callable[[int], float]) -> Iterator[Progress]:
         if self.stops is not None:
             return train_one(self.run, self.learner, self.config, n_steps, progress, self.stops)

@@ -18,7 +18,7 @@ from rejeu.exploration.noise import Noise
 from rejeu.replay.rollout import RolloutBuffer
 from rejeu.training import finite
 from rejeu.training.compiled import train_one
-from rejeu.training.on_policy import begin_episodes, on_policy
+from rejeu.training.on_policy import begin_episodes, on_policy, steps_to_take
 from rejeu.training.run import Progress
 
 
@@ -73,6 +73,9 @@ class OnPolicyAgent(Agent):
 
     def first_learning_step(self, step: int) -> int:
         return step
+
+    def steps_to_take(self, n_steps: int) -> int:
+        return steps_to_take(self.run, self.config, n_steps)
 
     def loop(self, n_steps: int | None, progress: Callable[[int], float]) -> Iterator[Progress]:
         if self.stops is not None:

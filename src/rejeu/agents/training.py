@@ -157,6 +157,7 @@ def start_call(
             steps_before=run.step - agent.reset_step,
             episodes_before=run.episode - agent.reset_episode,
             seconds_before=run.seconds["total"] - agent.reset_seconds,
+            last_step=None if limits[0] is None else run.step + agent.steps_to_take(limits[0]),
         )
     is_touched = run.fingerprint not in (None, snapshot.fingerprint(run.env))
     if is_touched or (run.env.venv is not None and (reset_num_timesteps or resumes)):  # or stepped by hand unseen
@@ -173,7 +174,7 @@ def unfinished_call(agent: BaseAgent) -> TrainingCall:
     call = agent.training_call if agent.resumed is not None else None
     if call is None:
         raise ValueError("learn needs total_timesteps, episodes or minutes (or an agent from resume(), to continue)")
-    if call.is_over(agent.run.step, agent.run.episode):
+    if call.is_over(agent.run):
         raise ValueError(
             "the run is complete; to train on, say how long: total_timesteps (--steps), episodes or minutes (--minutes)"
         )
@@ -249,7 +250,7 @@ def session(
             write_row(agent, call, turn, outputs)  # with what these callbacks have recorded
             answers += [called(callback, agent, turn) for callback in callbacks if runs_last(callback)]
             agent.failed_writes.retry_if_due()
-            over = call.is_over(turn.step, agent.run.episode)
+            over = call.is_over(agent.run)
             return over or any(isinstance(answer, bool | np.bool_) and not answer for answer in answers)
 
         try:

@@ -66,7 +66,6 @@ class Config(RolloutConfig):
     optimizer: ClassVar[str] = "sgd"  # type: ignore[misc]
     max_grad_norm: ClassVar[None] = None  # type: ignore[misc]
 
-    needs_whole_episodes: ClassVar[bool] = True
     name: ClassVar[str] = "ARS"
     hidden_layers: ClassVar[Widths] = Widths((), ())
     search_space: ClassVar[SearchSpace] = {

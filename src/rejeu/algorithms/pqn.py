@@ -138,10 +138,6 @@ class Config(RolloutConfig):
         """Returns the number of steps of ``n_envs`` environments per gradient step."""
         return min(self.batch_size, self.n_steps * n_envs)
 
-    def learns_from_part(self, n: int, n_envs: int) -> bool:
-        """Returns whether an incomplete rollout of ``n`` steps is learned from when ``learn`` ends: from a minibatch on."""
-        return n >= self.batch_size
-
     def gradient_steps(self, n: int) -> int:
         """Returns the number of gradient steps on a rollout of ``n`` steps."""
         return self.n_epochs * -(-n // self.batch_size)

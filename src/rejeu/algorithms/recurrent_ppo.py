@@ -111,13 +111,6 @@ class Config(ppo.Config):
         """Whether a rollout may be worth fewer gradient steps than :meth:`gradient_steps` says: minibatches are uneven."""
         return True
 
-    def learns_from_part(self, n: int, n_envs: int) -> bool:
-        """Returns whether an incomplete rollout of ``n`` steps is learned from when ``learn`` ends.
-
-        It is if the environments of a minibatch hold ``batch_size`` steps by then.
-        """
-        return n // n_envs * envs_per_batch(self, self.n_steps, n_envs) >= self.batch_size
-
     def steps_per_gradient(self, n_envs: int) -> int:
         """Returns the number of steps of ``n_envs`` environments per gradient step."""
         return self.n_steps * envs_per_batch(self, self.n_steps, n_envs)

@@ -49,13 +49,6 @@ class RolloutConfig(AlgorithmConfig):
         """Returns the number of gradient steps on a rollout of ``n`` steps, if nothing stops them early."""
         return 1
 
-    def learns_from_part(self, n: int, n_envs: int) -> bool:
-        """Returns whether an incomplete rollout of ``n`` steps is learned from when ``learn`` ends.
-
-        It must hold a minibatch at least. Where a whole rollout is one minibatch it is never learned from.
-        """
-        return False
-
     @property
     def stops_early(self) -> bool:
         """Whether the gradient steps may stop early; the metric ``gradient_steps`` is then their number."""

@@ -73,10 +73,9 @@ def crossed(before: int, now: int, every: int) -> bool:
     return now // every > before // every
 
 
-def step_before(agent: Any, progress: Progress, n_steps: int | None = None) -> int:
-    """Returns the total environment steps before the first turn of a ``learn`` of ``n_steps`` (None: of more than a turn)."""
-    n_taken = agent.n_envs if n_steps is None else min(agent.n_envs, n_steps)
-    return max(progress.step - n_taken, 0)
+def step_before(agent: Any, progress: Progress) -> int:
+    """Returns the total environment steps before the first turn of a ``learn``."""
+    return max(progress.step - agent.n_envs, 0)
 
 
 def listed(callback: Callback | Iterable[Callback] | None) -> list[Callback]:

@@ -89,7 +89,8 @@ class ProgressBar(TrainingCallback):
     @classmethod
     def of(cls, call: TrainingCall, steps_before: int = 0) -> Self:
         """Returns the bar of a call of ``learn``, of which ``steps_before`` steps were taken before it was resumed."""
-        return cls(call.n_steps, call.seconds, steps_before=steps_before, spent=call.spent)
+        n_steps = None if call.last_step is None else call.last_step - call.first_step
+        return cls(n_steps, call.seconds, steps_before=steps_before, spent=call.spent)
 
     def before_training(self, agent: Any) -> None:
         """Notes the step at which training begins, since the bar is first called after a turn, or after many at once."""
@@ -135,9 +136,7 @@ class ProgressBar(TrainingCallback):
             self._live.stop()
 
     def _start(self, agent: Any, progress: Progress, now: float) -> None:
-        before = self._step_before
-        if before is None:
-            before = step_before(agent, progress, None if self.n_steps is None else self.n_steps - self._taken)
+        before = step_before(agent, progress) if self._step_before is None else self._step_before
         self._first_step = before - self._taken
         self._marks.append(_Mark(self._began, before, agent.seconds))
         if self._live is None and self._display is None:
@@ -154,7 +153,7 @@ class ProgressBar(TrainingCallback):
         shares, seconds_left = [], []
         if self.n_steps is not None:
             shares.append(done / self.n_steps)
-            seconds_left.append((self.n_steps - done) / max(rate, 1e-9))
+            seconds_left.append(max(self.n_steps - done, 0) / max(rate, 1e-9))
         if self.seconds is not None:
             spent_seconds = self._spent + now - self._began
             shares.append(spent_seconds / self.seconds)

@@ -100,7 +100,7 @@ class DeviceReplay:
     def add(
         self, ring: DeviceRing, action: Array, reward: Array, terminated: Array, next_obs: PyTree, is_stored: Array
     ) -> DeviceRing:
-        """Returns the ring after one step of the environments where ``is_stored``; see :meth:`Ring.add`."""
+        """Returns the ring after one step of each environment if ``is_stored``, ``bool[]``; see :meth:`Ring.add`."""
         envs = jnp.arange(self.n_envs)
         index = jnp.where(is_stored, self.positions(envs, ring.head), len(ring.kind))
         kinds_of_rows = jnp.where(terminated, TERMINATED, STEP).astype(jnp.uint8)

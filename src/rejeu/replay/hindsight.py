@@ -341,22 +341,13 @@ class HerReplayBuffer(BaseReplayBuffer):
         self.last_infos: Callable[[], Any] = tuple
         """Returns the infos of the step that is added, one for each environment; set by the agent."""
 
-    def add(
-        self,
-        action: np.ndarray,
-        reward: np.ndarray,
-        terminated: np.ndarray,
-        next_obs: Any,
-        envs: np.ndarray | None = None,
-    ) -> None:
+    def add(self, action: np.ndarray, reward: np.ndarray, terminated: np.ndarray, next_obs: Any) -> None:
         """Records one step of each environment; see :meth:`Ring.add`."""
         if self.infos is not None:
-            env_numbers, last = self.ring.all_envs if envs is None else envs, self.last_infos()
-            for position, env in zip(
-                self.ring.index(env_numbers, self.ring.head[env_numbers]), env_numbers, strict=True
-            ):
+            last = self.last_infos()
+            for env, position in enumerate(self.ring.index(self.ring.all_envs, self.ring.head)):
                 self.infos[position] = deepcopy(last[env]) if last else {}
-        super().add(action, reward, terminated, next_obs, envs)
+        super().add(action, reward, terminated, next_obs)
 
     def draw(
         self, rng: np.random.Generator, shape: tuple[int, ...], progress: float = 1.0

@@ -135,22 +135,21 @@ class Ring:
         reward: np.ndarray,
         terminated: np.ndarray,
         next_obs: Any,
-        envs: np.ndarray | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Records one step of each environment in ``envs``; the arrays cover all environments, ``(n_envs, ...)``.
+        """Records one step of each environment, ``(n_envs, ...)``.
 
         Returns the positions of the steps and of the rows after them.
         """
-        env_numbers = self._all if envs is None else envs
-        index = self.base[env_numbers] + self.head[env_numbers] % self.rows
-        self.action[index] = action[env_numbers]
-        self.reward[index] = reward[env_numbers]
-        self.kind[index] = terminated[env_numbers]
-        following = self._advance(env_numbers)
-        self.n_steps[env_numbers] += 1
+        envs = self._all
+        index = self.base[envs] + self.head[envs] % self.rows
+        self.action[index] = action[envs]
+        self.reward[index] = reward[envs]
+        self.kind[index] = terminated[envs]
+        following = self._advance(envs)
+        self.n_steps[envs] += 1
         if self.since_start is not None:
-            self.since_start[following] = self.head[env_numbers] - self.start[env_numbers]
-        self._write_obs(following, next_obs, env_numbers)
+            self.since_start[following] = self.head[envs] - self.start[envs]
+        self._write_obs(following, next_obs, envs)
         return index, following
 
     def remember(self, memory: np.ndarray, ended: np.ndarray) -> None:

@@ -80,16 +80,9 @@ class BaseReplayBuffer(ABC):
             envs = self.ring.all_envs if envs is None else envs
             self.priorities.tree.set(self.ring.index(envs, self.ring.head[envs]), 0.0)
 
-    def add(
-        self,
-        action: np.ndarray,
-        reward: np.ndarray,
-        terminated: np.ndarray,
-        next_obs: Any,
-        envs: np.ndarray | None = None,
-    ) -> None:
+    def add(self, action: np.ndarray, reward: np.ndarray, terminated: np.ndarray, next_obs: Any) -> None:
         """Records one step of each environment; see :meth:`Ring.add`."""
-        index, following = self.ring.add(action, reward, terminated, next_obs, envs)
+        index, following = self.ring.add(action, reward, terminated, next_obs)
         if self.priorities is not None:
             self.priorities.add(index, following)
 

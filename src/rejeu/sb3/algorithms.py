@@ -671,10 +671,10 @@ def scaled(buffer: Any, agent: Original) -> Any:
     def begin(obs: Any, which: Any = None) -> None:
         kind.begin(buffer, agent.run.env.original_obs(final=False), which)
 
-    def add(action: Any, reward: Any, terminated: Any, obs: Any, which: Any = None) -> None:
+    def add(action: Any, reward: Any, terminated: Any, obs: Any) -> None:
         env: Any = agent.run.env
         original = env.vec_normalize.get_original_reward()
-        kind.add(buffer, action, original, terminated, env.original_obs(final=True), which)
+        kind.add(buffer, action, original, terminated, env.original_obs(final=True))
 
     def draw(*args: Any) -> Any:
         batch, drawn = kind.draw(buffer, *args)

@@ -42,13 +42,13 @@ Choice = tuple[np.ndarray | Array, int]
 def off_policy(
     run: Run, learner: Learner, config: OffPolicyConfig, n_steps: int | None, progress: Callable[[int], float]
 ) -> Iterator[Progress]:
-    """Trains for exactly ``n_steps`` environment steps (None: until the caller stops), yielding after every turn.
+    """Trains until ``n_steps`` environment steps are taken (None: until the caller stops), yielding after every turn.
 
     Args:
         run: mutated; consistent whenever the generator has yielded.
         learner: the algorithm.
         config: its hyperparameters.
-        n_steps: over all environments; if their number does not divide it, the last turn keeps as many as remain.
+        n_steps: over all environments; the turn that reaches it is the last.
         progress: returns the progress of schedules after a number of steps.
 
     Raises:
@@ -67,13 +67,13 @@ def off_policy(
             run.action = np.array(choose(run, learner, config, clock_of(run, progress(run.step - first)))[0])
         action = scale(run.action)
         step = checked_step(run, action)
-        n_kept, episodes = store(run, learner, config, step, last)
+        episodes = store(run, learner, config, step)
         last_obs = begin_where_ended(run, step)
         if learner.observe is not None:
             observe(run, learner)
         done = progress(run.step - first)
         clock = clock_of(run, done)
-        n_updates = due(run, config, n_kept, len(episodes))
+        n_updates = due(run, config, len(episodes))
         if config.overlap:
             chosen = choose(run, learner, config, clock)
         samples = sample(run, config, n_updates, done)
@@ -81,7 +81,7 @@ def off_policy(
         if not config.overlap:
             chosen = choose(run, learner, config, clock)
         read(run, chosen)
-        ended = n_updates > 0 or (run.step <= run.learn_from and reaches(run, config, n_kept, len(episodes)))
+        ended = n_updates > 0 or (run.step <= run.learn_from and reaches(run, config, len(episodes)))
         yield Progress(run.step, episodes, run.metrics, action, step, last_obs, ended)
 
 
@@ -121,22 +121,14 @@ def learn_from(
 
 
 @timed("replay")
-def store(
-    run: Run, learner: Learner, config: OffPolicyConfig, step: Step, last: int | None
-) -> tuple[int, list[Episode]]:
-    """Adds a step to the replay buffer and to the running episodes.
-
-    Returns how many environments' steps were kept, so that there are ``last`` in all, and the episodes that ended.
-    """
-    n_envs = run.env.n_envs
-    n_kept = n_envs if last is None else min(n_envs, last - run.step)
-    kept = None if n_kept == n_envs else np.arange(n_kept)
+def store(run: Run, learner: Learner, config: OffPolicyConfig, step: Step) -> list[Episode]:
+    """Adds a step to the replay buffer and to the running episodes, and returns the episodes that ended."""
     if learner.observe is not None:
         before = np.where(run.ended, np.float32(0), run.running_return)
         run.running_return = config.gamma * before + step.reward
-    run.replay.add(run.action, step.reward, step.terminated, step.obs, kept)
-    run.step += n_kept
-    return n_kept, record_step(run, step, None if kept is None else np.arange(n_envs) < n_kept)
+    run.replay.add(run.action, step.reward, step.terminated, step.obs)
+    run.step += run.env.n_envs
+    return record_step(run, step)
 
 
 def begin_where_ended(run: Run, step: Step) -> PyTree:
@@ -210,11 +202,11 @@ def update(run: Run, learner: Learner, samples: list[tuple[Any, Any]], clock: Cl
             run.td_errors.append((drawn, td_error))
 
 
-def due(run: Run, config: OffPolicyConfig, taken: int, ended: int) -> int:
+def due(run: Run, config: OffPolicyConfig, ended: int) -> int:
     """Returns the number of gradient steps of this turn, and counts the steps since the last update."""
     if run.step <= run.learn_from:
         return 0
-    taken = min(taken, run.step - run.learn_from)
+    taken = min(run.env.n_envs, run.step - run.learn_from)
     run.steps_since_update += taken
     new, every = (taken, config.train_freq) if isinstance(config.train_freq, int) else (ended, config.train_freq[0])
     run.owed += new
@@ -225,10 +217,10 @@ def due(run: Run, config: OffPolicyConfig, taken: int, ended: int) -> int:
     return steps if config.gradient_steps == -1 else times * config.gradient_steps
 
 
-def reaches(run: Run, config: OffPolicyConfig, taken: int, ended: int) -> bool:
-    """Returns whether a turn of ``taken`` steps, in which ``ended`` episodes ended, completes a period of ``train_freq``."""
+def reaches(run: Run, config: OffPolicyConfig, ended: int) -> bool:
+    """Returns whether a turn in which ``ended`` episodes ended completes a period of ``train_freq``."""
     if isinstance(config.train_freq, int):
-        count, passed, every = run.step, taken, config.train_freq
+        count, passed, every = run.step, run.env.n_envs, config.train_freq
     else:
         count, passed, every = run.episode, ended, config.train_freq[0]
     return count // every > (count - passed) // every

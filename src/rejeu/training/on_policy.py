@@ -28,16 +28,16 @@ from rejeu.training.run import Episode, Progress, Run, clock_of, record_step, st
 def on_policy(
     run: Run, learner: Learner, config: RolloutConfig, n_steps: int | None, progress: Callable[[int], float]
 ) -> Iterator[Progress]:
-    """Trains for exactly ``n_steps`` environment steps (None: until the caller stops), yielding after every turn.
+    """Trains until ``n_steps`` environment steps are taken (None: until the caller stops), yielding after every turn.
 
-    A rollout that is not complete after the last step is learned from if ``config.learns_from_part`` says that it holds
-    enough. Otherwise it stays in the buffer, and the next call adds to it.
+    A rollout of whole episodes that is under way then is completed. One of a number of steps stays in the buffer, and the
+    next call adds to it.
 
     Args:
         run: mutated; consistent whenever the generator has yielded. ``run.replay`` is a rollout buffer.
         learner: the algorithm.
         config: its hyperparameters.
-        n_steps: over all environments; if their number does not divide it, the last turn keeps as many as remain.
+        n_steps: over all environments; :func:`steps_to_take` rounds it up to whole rollouts.
         progress: returns the progress of schedules after a number of steps.
 
     Raises:
@@ -45,20 +45,19 @@ def on_policy(
         NonFiniteError: if the state is not finite when training begins.
         NonFiniteUpdate: if an update leaves numbers that are not finite.
     """
-    env, n_envs, scale, rollout = run.env, run.env.n_envs, action_scaler(run.env.action_space), run.replay
+    env, scale, rollout = run.env, action_scaler(run.env.action_space), run.replay
     first, last = run.step, None if n_steps is None else run.step + n_steps
     check_state(run, learner)
     start_clock(run)
-    while last is None or run.step < last:
+    while last is None or run.step < last or run.in_episodes:
         if run.obs is None or (env.must_reset and not rollout.length):
             begin_episodes(run, config, learner)
         run.action = act(run, learner, clock_of(run, progress(run.step - first)))
-        stepped = None if config.n_episodes is None else still_playing(run, config, last)
+        stepped = None if config.n_episodes is None or run.playing.all() else run.playing > 0
         action = scale(run.action)
         step = checked_step(run, action, stepped)
-        episodes = store(run, config, step, stepped, last)
-        is_complete = rollout.full if config.n_episodes is None else not run.playing.any()
-        is_done = is_complete or (run.step == last and config.learns_from_part(rollout.size(), n_envs))
+        episodes = store(run, config, step, stepped)
+        is_done = rollout.full if config.n_episodes is None else not run.playing.any()
         last_obs = jax.tree.map(np.copy, step.obs) if run.ended.any() else None
         run.obs = next_obs(run, step, config, is_done)
         if is_done:
@@ -80,14 +79,16 @@ def act(run: Run, learner: Learner, clock: Clock) -> np.ndarray:
 
 
 @timed("replay")
-def store(run: Run, config: RolloutConfig, step: Step, stepped: np.ndarray | None, last: int | None) -> list[Episode]:
-    """Adds a step to the rollout and to the running episodes, and returns the episodes that ended."""
-    counts = which_count(run, stepped, last)
+def store(run: Run, config: RolloutConfig, step: Step, stepped: np.ndarray | None) -> list[Episode]:
+    """Adds a step to the rollout and to the running episodes, and returns the episodes that ended.
+
+    ``stepped`` are the environments that took it, ``bool (n_envs,)``; None stands for all.
+    """
     run.running_return = np.where(run.ended, 0.0, config.gamma * run.running_return) + step.reward
-    valid = True if counts is None else counts
+    valid = True if stepped is None else stepped
     run.replay.add(run.action, step.reward, step.terminated, step.truncated, step.obs, run.running_return, valid)
-    run.step += run.env.n_envs if counts is None else int(counts.sum())
-    episodes = record_step(run, step, counts, stepped)
+    run.step += run.env.n_envs if stepped is None else int(stepped.sum())
+    episodes = record_step(run, step, stepped)
     if config.n_episodes is not None:
         end_long_episodes(run, config)
         run.playing -= run.ended
@@ -127,13 +128,17 @@ def begin(run: Run, config: RolloutConfig) -> None:
     run.playing = np.full(run.env.n_envs, 0 if config.n_episodes is None else config.episodes(run.env.n_envs))
 
 
-def still_playing(run: Run, config: RolloutConfig, last: int | None) -> np.ndarray | None:
-    """Returns which environments have episodes of the rollout left to play, ``bool (n_envs,)``; None for all.
+def steps_to_take(run: Run, config: RolloutConfig, n_steps: int) -> int:
+    """Returns ``n_steps`` environment steps rounded up, so that they end with a rollout.
 
-    At the end of a run in which episodes must not be cut, only those take a step whose step counts.
+    The end of a rollout of whole episodes is not known before; then it is ``n_steps``.
     """
-    stepped = None if run.playing.all() else run.playing > 0
-    return which_count(run, stepped, last) if config.needs_whole_episodes else stepped
+    if config.n_episodes is not None:
+        return n_steps
+    n_envs, turns_of_rollout = run.env.n_envs, run.replay.n_steps
+    taken = run.replay.length % turns_of_rollout
+    turns = -(-n_steps // n_envs) + taken
+    return (-(-turns // turns_of_rollout) * turns_of_rollout - taken) * n_envs
 
 
 def end_long_episodes(run: Run, config: RolloutConfig) -> None:
@@ -141,18 +146,6 @@ def end_long_episodes(run: Run, config: RolloutConfig) -> None:
     is_long = run.episode_length >= run.replay.n_steps // config.episodes(run.env.n_envs)
     run.ended |= is_long
     run.episode_return[is_long], run.episode_length[is_long] = 0.0, 0
-
-
-def which_count(run: Run, stepped: np.ndarray | None, last: int | None) -> np.ndarray | None:
-    """Returns which environments' steps are kept, ``bool (n_envs,)``; None for all.
-
-    A run takes exactly the number of steps that it was asked for, up to the step ``last``.
-    """
-    n_envs = run.env.n_envs
-    if last is None or last - run.step >= (n_envs if stepped is None else int(stepped.sum())):
-        return stepped
-    among = np.ones(n_envs, bool) if stepped is None else stepped
-    return among & (np.cumsum(among) <= last - run.step)
 
 
 def next_obs(run: Run, step: Step, config: RolloutConfig, is_done: bool) -> PyTree:

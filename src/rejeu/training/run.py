@@ -135,6 +135,11 @@ class Run:
     def replay(self, buffer: Any) -> None:
         self.buffer, self.fetch = buffer, None
 
+    @property
+    def in_episodes(self) -> bool:
+        """Whether a rollout of whole episodes is under way."""
+        return bool(self.playing.any() and self.buffer.length)
+
     def copy_replay(self) -> None:
         """Copies to ``buffer`` what a loop on the device has added to it there."""
         if self.fetch is not None:
@@ -161,33 +166,22 @@ def clock_of(run: Run, progress: float) -> Clock:
     return Clock(np.uint32(run.step), np.uint32(run.episode), np.float32(progress), np.uint32(n_envs))
 
 
-def record_step(run: Run, step: Step, counts: np.ndarray | None, stepped: np.ndarray | None = None) -> list[Episode]:
+def record_step(run: Run, step: Step, stepped: np.ndarray | None = None) -> list[Episode]:
     """Adds a step to the returns and lengths of the running episodes and returns the episodes that ended.
 
-    Args:
-        run: mutated.
-        step: what the environments returned.
-        counts: which environments' steps are kept, ``bool (n_envs,)``, None for all. The episodes of environments that
-            were stepped but do not count are discarded.
-        stepped: which environments were stepped, likewise.
+    ``stepped`` are the environments that took it, ``bool (n_envs,)``; None stands for all.
     """
     run.ended = step.terminated | step.truncated
-    if counts is None:
-        run.episode_return += step.reward
-        run.episode_length += 1
-    else:
-        run.ended |= ~counts if stepped is None else stepped & ~counts
-        run.episode_return[counts] += step.reward[counts]
-        run.episode_length[counts] += 1
+    run.episode_return += step.reward
+    run.episode_length += 1 if stepped is None else stepped
     if not np.count_nonzero(run.ended):  # ten times as fast as any()
         return []
     episodes = []
     for env in np.flatnonzero(run.ended).tolist():
-        if counts is None or counts[env]:
-            run.episode += 1
-            value = step.return_of(env, run.episode_return[env])
-            success = run.env.judge(step, env, value, run.success_threshold)
-            episodes.append(Episode(run.step, env, value, int(run.episode_length[env]), success, run.seconds["total"]))
+        run.episode += 1
+        value = step.return_of(env, run.episode_return[env])
+        success = run.env.judge(step, env, value, run.success_threshold)
+        episodes.append(Episode(run.step, env, value, int(run.episode_length[env]), success, run.seconds["total"]))
         run.episode_return[env] = 0.0
         run.episode_length[env] = 0
     return episodes
@@ -261,7 +255,7 @@ class TrainingCall:
     """One call of ``learn``. Mutable: ``logged`` is updated with each row of statistics."""
 
     n_steps: Positive | None
-    """Environment steps to take; None for no such limit."""
+    """Environment steps to take at least; None for no such limit."""
     n_episodes: Positive | None
     """Episodes to finish; None for no such limit."""
     seconds: Duration | None
@@ -274,6 +268,8 @@ class TrainingCall:
     """Episodes between two rows of statistics."""
     logged: Count
     """Episodes in the history when the last row was written."""
+    last_step: Count | None
+    """Total environment steps at which it is over; None without ``n_steps``."""
     steps_before: Count = 0
     """Environment steps before it that schedules count: those since the last ``learn`` that reset the counters."""
     episodes_before: Count = 0
@@ -290,18 +286,14 @@ class TrainingCall:
         """Time it has taken, without interruptions and compilation, in seconds."""
         return self.spent + clock() - self.began
 
-    @property
-    def last_step(self) -> int | None:
-        """Total environment steps at which it ends; None if it has no limit of steps."""
-        return None if self.n_steps is None else self.first_step + self.n_steps
-
     def progress(self, step: Any, episode: int) -> Any:
         """Returns the progress of schedules, in [0, 1], after ``step`` environment steps and ``episode`` episodes in total.
 
         ``step`` is a number, or an array of numbers, each of which gets its own progress.
 
         As in Stable-Baselines3, earlier steps count as done and as part of the total: with 100 steps before and 300 to
-        take, progress goes from 0.25 to 1. With several limits the nearest one counts.
+        take, progress goes from 0.25 to 1, and stays there until the last rollout is complete. With several limits the
+        nearest one counts.
         """
         by_steps = share(self.steps_before, step - self.first_step, self.n_steps)
         by_episodes = share(self.episodes_before, episode - self.first_episode, self.n_episodes)
@@ -311,10 +303,10 @@ class TrainingCall:
             return np.minimum(np.maximum(by_steps, others), 1.0)
         return min(max(by_steps, others), 1.0)
 
-    def is_over(self, step: int, episode: int) -> bool:
+    def is_over(self, run: Run) -> bool:
         """Returns whether one of its limits is reached."""
-        by_steps = self.last_step is not None and step >= self.last_step
-        by_episodes = self.n_episodes is not None and episode - self.first_episode >= self.n_episodes
+        by_steps = self.last_step is not None and run.step >= self.last_step and not run.in_episodes
+        by_episodes = self.n_episodes is not None and run.episode - self.first_episode >= self.n_episodes
         return by_steps or by_episodes or (self.seconds is not None and self.elapsed >= self.seconds)
 
     def to_json(self) -> dict[str, Any]:

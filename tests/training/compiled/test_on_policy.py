@@ -56,7 +56,7 @@ def assert_same_runs(one: Any, two: Any, tolerance: float) -> None:
 )
 @pytest.mark.parametrize("n_steps", only([55], [75, 55]))
 def test_training_equals_the_loop_of_the_host(kind: Any, env: Any, settings: dict[str, Any], n_steps: int) -> None:
-    """75 steps end in a part of a rollout that PPO learns from, and 55 in one that waits for the next ``learn``."""
+    """The steps are those of whole rollouts, or end within one."""
     device, host = (make(kind, env, **settings) for _ in range(2))
     host.on_device = False
     for agent in (device, host):

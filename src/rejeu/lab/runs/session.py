@@ -279,7 +279,7 @@ def evaluate_now(evaluate: Evaluate, agent: Agent) -> None:
 
 def has_reached_goal(agent: Agent) -> bool:
     """Returns whether the current or last ``learn`` reached its limit."""
-    return agent.training_call is None or agent.training_call.is_over(agent.run.step, agent.run.episode)
+    return agent.training_call is None or agent.training_call.is_over(agent.run)
 
 
 def pause(agent: Agent, limits: TrainingLimits) -> Callable[[Progress], bool]:

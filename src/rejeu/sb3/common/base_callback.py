@@ -95,7 +95,7 @@ class BaseCallback(TrainingCallback):
         )
         if not self.on_step():
             return False
-        is_last = call.last_step is not None and progress.step >= call.last_step
+        is_last = call.is_over(agent.run)
         if progress.rollout_ended or is_last:
             self.on_rollout_end()
             if not is_last:

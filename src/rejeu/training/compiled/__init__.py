@@ -20,7 +20,7 @@ from rejeu.core.xla import clock
 from rejeu.training.checks import check_state
 from rejeu.training.compiled.off_policy import OffPolicyProgram
 from rejeu.training.compiled.on_policy import OnPolicyProgram
-from rejeu.training.compiled.program import MAX_TURNS, NO_LIMIT, Limits, Remake
+from rejeu.training.compiled.program import MAX_STEP, MAX_TURNS, Limits, Remake
 from rejeu.training.compiled.trainer import DeviceTrainer
 from rejeu.training.finite import NonFiniteSteps
 from rejeu.training.learner import Learner, bad_leaves, checked
@@ -59,13 +59,13 @@ def train(
     remake: Remake | None = None,
     hyper: Sequence[dict[str, float]] | None = None,
 ) -> Iterator[list[Progress | None]]:
-    """Trains runs of equal settings for exactly ``n_steps`` environment steps each; yields after every chunk.
+    """Trains runs of equal settings until each has taken ``n_steps`` environment steps; yields after every chunk.
 
     Args:
         runs: mutated; consistent whenever the generator has yielded.
         learner: of one of them.
         config: its hyperparameters.
-        n_steps: over all environments of a run; None: until the caller stops.
+        n_steps: over all environments of a run, rounded up to whole turns; None: until the caller stops.
         progress: returns the progress of schedules after a number of steps, or an array of it after an array of numbers.
         stops: where chunks must end.
         active: indices of the runs that are trained, ascending. The caller may remove some between chunks: such runs stay
@@ -94,9 +94,9 @@ def train(
     trainer = DeviceTrainer(program, runs, learner, hyper or [{}] * len(runs))
     first = runs[active[0]].step
     last = None if n_steps is None else first + n_steps
-    if last is not None and last >= NO_LIMIT:
+    if last is not None and last + program.n_envs > MAX_STEP:
         raise ValueError(
-            f"the run would end at step {last:,}, and steps are counted up to {NO_LIMIT - 1:,} here; give fewer "
+            f"the run would end at step {last:,}, and steps are counted up to {MAX_STEP - program.n_envs:,} here; give fewer "
             "total_timesteps, or minutes"
         )
     for run in runs:
@@ -137,10 +137,8 @@ def take_chunks(
             n_turns = min(n_turns, max(-(-(leader.learn_from - step) // n_envs), 1))
         limits = Limits(
             np.int32(n_turns),
-            np.uint32(NO_LIMIT if last is None else last),
-            schedule(progress, step - first, n_turns, n_envs, capacity, last, first),
+            schedule(progress, step - first, n_turns, n_envs, capacity),
             np.uint32(leader.learn_from),
-            np.bool_(trainer.program.uses_part(leader, n_turns, last)),
         )
         began, paced, before = time.perf_counter(), clock(), [(run.state, run.n_updates) for run in runs]
         trainer.take(limits)
@@ -195,12 +193,9 @@ def turns_left(step: int, n_envs: int, last: int | None, stops: Stops) -> int:
     return -(-(nearest - step) // n_envs)
 
 
-def schedule(
-    progress: Callable[[Any], Any], taken: int, n_turns: int, n_envs: int, capacity: int, last: int | None, first: int
-) -> np.ndarray:
+def schedule(progress: Callable[[Any], Any], taken: int, n_turns: int, n_envs: int, capacity: int) -> np.ndarray:
     """Returns the progress after 0 to ``n_turns`` turns, ``float32 (capacity + 1,)``, padded."""
-    most = np.iinfo(np.int64).max if last is None else last - first
-    steps = np.minimum(taken + n_envs * np.arange(n_turns + 1), most)
+    steps = taken + n_envs * np.arange(n_turns + 1)
     values = np.broadcast_to(np.asarray(progress(steps), np.float32), steps.shape)
     return np.pad(values, (0, capacity - n_turns), mode="edge")
 

@@ -114,9 +114,6 @@ class OffPolicyProgram(Program):
     def begin_episodes(self, run: Run) -> None:
         run.replay.begin(checked_restart(run))
 
-    def uses_part(self, run: Run, n_turns: int, last: int | None) -> bool:
-        return False
-
     def counts_of(self, run: Run) -> Counts:
         pending = sum(len(draw.position) for draw, _ in run.td_errors) // self.replay.batch_size
         return Counts(jnp.uint32(run.step), jnp.int32(run.owed), jnp.int32(run.steps_since_update), jnp.int32(pending))
@@ -161,15 +158,15 @@ def take_turn(program: OffPolicyProgram, env: FunctionalEnv, loop: Loop, limits:
     """Returns what the ``i``-th turn of a chunk passes on."""
     config, algorithm, replay, before = program.config, program.algorithm, program.replay, loop.carry
     assert before.action is not None
-    loop, result = step_envs(program, env, loop, before.action, limits, i)
+    loop, result = step_envs(program, env, loop, before.action, i)
     episodes, learned = loop.carry.episodes, loop.learned
-    kept = result.kept & ~loop.nonfinite_env & all_finite(before.action)  # a run with NaN goes on until the chunk ends
-    ring = replay.add(loop.experience, before.action, result.reward, result.terminated, result.obs, kept)
+    is_stored = ~loop.nonfinite_env & all_finite(before.action)  # a run with NaN goes on until the chunk ends
+    ring = replay.add(loop.experience, before.action, result.reward, result.terminated, result.obs, is_stored)
     ring = replay.begin(ring, episodes.obs, episodes.ended)
     if algorithm.observe is not None:
         learned = learned._replace(state=algorithm.observe(learned.state, episodes.obs, episodes.running_return))
     n_ended = (episodes.n_finished - before.episodes.n_finished).astype(jnp.int32)
-    n, counts = due(config, before.counts, jnp.sum(result.kept, dtype=jnp.int32), n_ended, limits.learn_from)
+    n, counts = due(config, before.counts, program.n_envs, n_ended, limits.learn_from)
     clock = Clock(counts.step, episodes.n_finished, limits.progress[i + 1], program.n_envs)
     carry, root = loop.carry._replace(counts=counts), draws(before.key, clock.step)
 
@@ -198,11 +195,11 @@ def draws(key: Array, step: Array) -> Array:
     return jax.random.fold_in(nth(key, jnp.uint32(DRAWS)), step)
 
 
-def due(config: OffPolicyConfig, counts: Counts, taken: Array, ended: Array, learn_from: Array) -> tuple[Array, Counts]:
-    """Returns the gradient steps of a turn of ``taken`` steps, and the counters after it; see the host's ``due``."""
-    step = counts.step + taken.astype(jnp.uint32)
+def due(config: OffPolicyConfig, counts: Counts, n_envs: int, ended: Array, learn_from: Array) -> tuple[Array, Counts]:
+    """Returns the gradient steps of a turn, and the counters after it; see the host's ``due``."""
+    step = counts.step + jnp.uint32(n_envs)
     learns = step > learn_from
-    counted = jnp.where(learns, jnp.minimum(taken.astype(jnp.uint32), step - learn_from).astype(jnp.int32), 0)
+    counted = jnp.where(learns, jnp.minimum(jnp.uint32(n_envs), step - learn_from).astype(jnp.int32), 0)
     since = counts.since_update + counted
     if isinstance(config.train_freq, int):
         owed, every = counts.owed + counted, config.train_freq

@@ -57,8 +57,8 @@ class OnPolicyProgram(Program):
         def one_rollout(outer: tuple[Array, Loop]) -> tuple[Array, Loop]:
             i, loop = jax.lax.while_loop(fills, one_turn, outer)
             counts = loop.carry.counts
-            is_done = (counts.length == n_steps) | (limits.uses_part & (counts.step == limits.last))
             clock = Clock(counts.step, loop.carry.episodes.n_finished, limits.progress[i])
+            is_done = counts.length == n_steps
             loop = jax.lax.cond(is_done, lambda loop: end_of_rollout(self, loop, clock), lambda loop: loop, loop)
             return i, loop
 
@@ -66,20 +66,6 @@ class OnPolicyProgram(Program):
 
     def begin_episodes(self, run: Run) -> None:
         begin_episodes(run, self.config)
-
-    def uses_part(self, run: Run, n_turns: int, last: int | None) -> bool:
-        """Returns whether the rollout that is under way at the step ``last`` is learned from.
-
-        It begins in this chunk or holds the steps of the buffer.
-        """
-        n_steps, n_envs = self.config.n_steps, run.env.n_envs
-        if last is None or run.step + n_turns * n_envs < last:
-            return False
-        length = run.replay.length
-        turns, size = (length + n_turns) % n_steps, run.replay.size() + last - run.step
-        if length + n_turns >= n_steps:
-            size = turns * n_envs - (run.step + n_turns * n_envs - last)
-        return bool(turns) and self.config.learns_from_part(size, n_envs)
 
     def counts_of(self, run: Run) -> RolloutCounts:
         return RolloutCounts(jnp.uint32(run.step), jnp.int32(run.replay.length))
@@ -114,7 +100,7 @@ def take_turn(program: OnPolicyProgram, env: FunctionalEnv, loop: Loop, limits: 
     actor, key = program.algorithm.actor(loop.learned.state), nth(carry.key, clock.step)
     action, explorer = program.explorer.act(carry.explorer, actor, before.obs, before.ended, key, clock)
     action = action.astype(steps.action.dtype)
-    loop, result = step_envs(program, env, loop, action, limits, i)
+    loop, result = step_envs(program, env, loop, action, i)
     episodes = loop.carry.episodes
     put = lambda stores, values: jax.tree.map(lambda s, v: s.at[t].set(v.astype(s.dtype)), stores, values)  # noqa: E731
     steps = steps._replace(
@@ -124,10 +110,10 @@ def take_turn(program: OnPolicyProgram, env: FunctionalEnv, loop: Loop, limits: 
         reward=put(steps.reward, result.reward),
         discount=put(steps.discount, jnp.where(result.terminated, 0.0, config.gamma)),
         ended=put(steps.ended, episodes.ended),
-        valid=put(steps.valid, result.kept),
+        valid=put(steps.valid, jnp.ones(program.n_envs, bool)),
         running_return=put(steps.running_return, episodes.running_return),
     )
-    counts = RolloutCounts(counts.step + jnp.sum(result.kept, dtype=jnp.uint32), t + 1)
+    counts = RolloutCounts(counts.step + jnp.uint32(program.n_envs), t + 1)
     return loop._replace(carry=loop.carry._replace(explorer=explorer, counts=counts), experience=steps)
 
 

@@ -43,8 +43,8 @@ MAX_TURNS = 1000
 """Turns of a chunk at most. Chunks also end at multiples of it, where the best weights are looked for."""
 LOG_SIZE = 2**18
 """Entries of a chunk's log of episodes at most: turns times environments."""
-NO_LIMIT = 2**32 - 1
-"""The value for no last step; steps are counted in ``uint32``."""
+MAX_STEP = 2**32 - 1
+"""The last step of a run at most: steps are counted in ``uint32``."""
 
 Remake = Callable[[Any], tuple[Algorithm, Explorer]]
 """Makes the algorithm of a configuration, and its exploration."""
@@ -55,14 +55,10 @@ class Limits(NamedTuple):
 
     n_turns: Any
     """Turns to take, ``int32[]``."""
-    last: Any
-    """Total environment steps at which training ends, ``uint32[]``, ``NO_LIMIT`` for never."""
     progress: Any
     """Progress of schedules after 0, 1, ... turns of the chunk, ``float32 (capacity + 1,)``."""
     learn_from: Any
     """The environment step after which off-policy updates begin, ``uint32[]``."""
-    uses_part: Any
-    """Whether an incomplete rollout is learned from at the last step, ``bool[]``."""
 
 
 class EpisodeLog(NamedTuple):
@@ -103,8 +99,6 @@ class StepResult(NamedTuple):
     reward: Array
     """``float32 (n_envs,)``."""
     terminated: Array
-    kept: Array
-    """Which of the steps count, ``bool (n_envs,)``; all but in the last turn."""
 
 
 class Learned(NamedTuple):
@@ -196,10 +190,6 @@ class Program(ABC):
     @abstractmethod
     def begin_episodes(self, run: Run) -> None:
         """Starts an episode in every environment of a run."""
-
-    @abstractmethod
-    def uses_part(self, run: Run, n_turns: int, last: int | None) -> bool:
-        """Returns whether an incomplete rollout is learned from if the step ``last`` is reached in so many turns."""
 
     @abstractmethod
     def counts_of(self, run: Run) -> Any:
@@ -323,9 +313,7 @@ def plain(space: gym.Space, obs: PyTree) -> PyTree:
     return jax.tree.unflatten(spaces.structure(space), parts)
 
 
-def step_envs(
-    program: Program, env: FunctionalEnv, loop: Loop, action: Array, limits: Limits, turn: Array
-) -> tuple[Loop, StepResult]:
+def step_envs(program: Program, env: FunctionalEnv, loop: Loop, action: Array, turn: Array) -> tuple[Loop, StepResult]:
     """Takes one step of all environments, and starts new episodes where some ended; returns what is passed on, and the step.
 
     Args:
@@ -333,22 +321,17 @@ def step_envs(
         env: the environment.
         loop: before the step.
         action: in the range of algorithms, ``(n_envs, ...)``.
-        limits: of the chunk. In its last turn only as many steps count as remain; the episodes of the other environments are
-            discarded.
         turn: the number of the turn in the chunk, ``int32[]``.
     """
-    before, step = loop.carry.episodes, loop.carry.counts.step
+    before = loop.carry.episodes
     assert before.env is not None
-    kept = jnp.arange(program.n_envs, dtype=jnp.uint32) < jnp.minimum(limits.last - step, jnp.uint32(program.n_envs))
     taken = spaces.scale_action(env.action_space, action, jnp)
     vstate, obs, reward, terminated, truncated, success = step_all(env, before.env, taken)
     obs, reward = observed(env, obs), reward.astype(jnp.float32)
-    episode_return = before.episode_return + jnp.where(kept, reward, 0.0)
-    length = before.length + kept
-    over = terminated | truncated
-    ended, counts = over | ~kept, over & kept
+    episode_return, length = before.episode_return + reward, before.length + 1
+    ended = terminated | truncated
     log = EpisodeLog(
-        loop.log.length.at[turn].set(jnp.where(counts, length, 0)),
+        loop.log.length.at[turn].set(jnp.where(ended, length, 0)),
         loop.log.episode_return.at[turn].set(episode_return),
         loop.log.success.at[turn].set(
             jnp.full_like(episode_return, jnp.nan) if success is None else success.astype(jnp.float32)
@@ -363,11 +346,11 @@ def step_envs(
         jnp.where(ended, 0.0, episode_return),
         jnp.where(ended, 0, length),
         jnp.where(before.ended, 0.0, program.config.gamma * before.running_return) + reward,
-        before.n_finished + jnp.sum(counts, dtype=jnp.uint32),
+        before.n_finished + jnp.sum(ended, dtype=jnp.uint32),
     )
     spoiled = all_finite(action) & ~all_finite(reward, *jax.tree.leaves((obs, fresh)))
     carry, nonfinite_env = loop.carry._replace(episodes=episodes), loop.nonfinite_env | spoiled
-    return loop._replace(carry=carry, log=log, nonfinite_env=nonfinite_env), StepResult(obs, reward, terminated, kept)
+    return loop._replace(carry=carry, log=log, nonfinite_env=nonfinite_env), StepResult(obs, reward, terminated)
 
 
 def all_finite(*arrays: Array) -> Array:

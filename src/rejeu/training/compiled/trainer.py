@@ -131,7 +131,7 @@ class DeviceTrainer:
         run.fetch = partial(self._fetch, which)
         if run.step >= run.next_look:
             check_bounds(run, run.obs)
-        episodes = episodes_in(run, report.log, first_step, run.step)
+        episodes = episodes_in(run, report.log, first_step)
         return Progress(run.step, episodes, run.metrics, rollout_ended=bool(report.n_updates))
 
     def fault(self, which: int) -> bool:
@@ -229,21 +229,20 @@ def put_episodes(run: Run, episodes: Any) -> None:
     run.episode = int(episodes.n_finished)
 
 
-def episodes_in(run: Run, log: EpisodeLog, first_step: int, last_step: int) -> list[Episode]:
+def episodes_in(run: Run, log: EpisodeLog, first_step: int) -> list[Episode]:
     """Returns the episodes that ended in a chunk, in the order in which they ended.
 
     Args:
         run: whose environments and success threshold count.
         log: on the host.
         first_step: total environment steps before the chunk.
-        last_step: total environment steps after it.
     """
     threshold = run.env.reward_threshold if run.success_threshold is None else run.success_threshold
     episodes = []
     for turn, env in zip(*(found.tolist() for found in np.nonzero(log.length)), strict=True):
         value = float(log.episode_return[turn, env])
         success = success_by(float(log.success[turn, env]), value, threshold)
-        step = min(first_step + (turn + 1) * run.env.n_envs, last_step)
+        step = first_step + (turn + 1) * run.env.n_envs
         episodes.append(Episode(step, env, value, int(log.length[turn, env]), success, run.seconds["total"]))
     return episodes
 
