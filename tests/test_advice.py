@@ -31,7 +31,10 @@ PROSE = {
     "wrote",
 }
 """Verbs that follow the name of the package where no command is meant."""
-ELSEWHERE = {"autoreset_mode", "episode_reward", "features_extractor_class", "padding_type", "vectorization_mode"}
+ELSEWHERE = {"autoreset_mode", "episode_reward", "features_extractor_class", "optimizer_class"} | {
+    "padding_type",
+    "vectorization_mode",
+}
 """Arguments of Gymnasium, keys of the original's ``policy_kwargs``, and what its callbacks print."""
 OF_OTHERS = {"--head", "--help", "--version"}
 """Options of all commands, and of Ray."""

@@ -25,8 +25,8 @@ import rejeu
 from rejeu.algorithms import ppo, sac
 from rejeu.core import validation
 from rejeu.lab import cli
-from rejeu.lab.experiments import process
 from rejeu.lab.experiments.plan import read_plan
+from rejeu.lab.runs import process
 from rejeu.lab.runs.config import assigned, merged
 from rejeu.sb3 import load_zip
 from tests.sb3_models import MadeUp

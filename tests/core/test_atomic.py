@@ -14,11 +14,11 @@ import pytest
 import rejeu
 from rejeu.agents import presets
 from rejeu.core import atomic
-from rejeu.lab.experiments.process import Process
 from rejeu.lab.experiments.work import Work
 from rejeu.lab.runs import config
 from rejeu.lab.runs.config import DecidedRun, Task
 from rejeu.lab.runs.output import noted_in
+from rejeu.lab.runs.process import Process
 from rejeu.logs.history import History
 from rejeu.logs.logging import CsvFile, JsonLines
 

@@ -43,6 +43,7 @@ SEEN = {
 DONE = {
     "one": spaces.Discrete(1),
     "matrix": Box(-1, 1, (2, 2), np.float32),
+    "number": Box(-1, 1, (), np.float32),
     "float64": Box(-2, 3, (2,), np.float64),
     "half": Box(-1, 1, (2,), np.float16),
     "one-sided": Box(0, np.inf, (1,), np.float32),
@@ -56,7 +57,6 @@ NO_AGENT = {
     "graph": Sampled(spaces.Graph(Box(-1, 1, (2,)), None)),
     "one of": Sampled(spaces.OneOf([spaces.Discrete(2), spaces.Discrete(3)])),
     "equal bounds": Sampled(SEEN["number"], Box(np.float32([-1, 0]), np.float32([1, 0]))),
-    "number to choose": Sampled(SEEN["number"], Box(-1, 1, (), np.float32)),
     "nothing to choose": Sampled(SEEN["number"], Box(-1, 1, (0,), np.float32)),
     "whole numbers in a dict": Sampled(SEEN["number"], spaces.Dict({"a": Box(0, 3, (2,), np.int32)})),
     "text to choose": Sampled(SEEN["number"], spaces.Text(3)),

@@ -311,7 +311,8 @@ def test_a_self_resetting_vector_without_shared_memory_is_refused():
     """Its workers forget a masked reset, and would reset once more instead of taking the next step."""
     env = AsyncVectorEnv([Counter] * 2, shared_memory=False, context=pool.START_METHOD)
     with pytest.raises(
-        ValueError, match=r"AsyncVectorEnv without shared memory .*autoreset_mode=AutoresetMode.DISABLED"
+        ValueError,
+        match=r"AsyncVectorEnv without shared memory .*autoreset_mode=gymnasium.vector.AutoresetMode.DISABLED",
     ):
         GymnasiumVector(env)
     env.close()

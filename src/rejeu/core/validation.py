@@ -79,7 +79,7 @@ def is_number(value: Any) -> bool:
     (True, False, False)
     """
     is_real = isinstance(value, numbers.Integral | float) and not isinstance(value, bool)
-    return is_real and abs(value) <= sys.float_info.max
+    return bool(is_real and abs(value) <= sys.float_info.max)
 
 
 def flag(key: str, value: Any) -> bool:

@@ -361,7 +361,7 @@ class Original(Agent):
             env = Monitor(env)
         if isinstance(env, VecTransposeImage) and mine is not None and env.venv.observation_space == mine:
             env = env.venv
-        return super().make_envs(env, *args, **kwargs)  # type: ignore[safe-super]
+        return super().make_envs(env, *args, **kwargs)
 
     @property
     def env(self) -> Any:

@@ -10,7 +10,8 @@ import pytest
 
 from rejeu.lab import cli
 from rejeu.lab.cli import sweep
-from rejeu.lab.experiments import process, scheduler
+from rejeu.lab.experiments import scheduler
+from rejeu.lab.runs import process
 from rejeu.lab.runs.arguments import Train
 from rejeu.lab.runs.config import RunConfig
 from tests.lab.reporting.test_comparison import write_run

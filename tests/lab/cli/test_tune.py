@@ -9,8 +9,8 @@ import pytest
 
 from rejeu.lab import cli
 from rejeu.lab.cli import tune as tune_command
-from rejeu.lab.experiments import display, process, study as studies, study_plan
-from rejeu.lab.runs import environment
+from rejeu.lab.experiments import display, study as studies, study_plan
+from rejeu.lab.runs import environment, process
 from rejeu.lab.runs.config import RunConfig
 from tests.lab.experiments.fake_training import Pretended
 

@@ -12,8 +12,9 @@ import pytest
 import rejeu
 from rejeu.core.errors import ClusterError
 from rejeu.envs.workers import cluster
-from rejeu.lab.experiments import process, ray as launcher
+from rejeu.lab.experiments import ray as launcher
 from rejeu.lab.experiments.folder import Resources
+from rejeu.lab.runs import process
 from tests.envs import ray_cluster
 from tests.lab.cli.test_sweep import assert_equal, models
 

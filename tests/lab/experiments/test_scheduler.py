@@ -12,11 +12,11 @@ from rejeu.core.errors import CheckpointError
 from rejeu.core.interrupt import Interrupt
 from rejeu.lab.experiments import scheduler
 from rejeu.lab.experiments.folder import NOTHING, Plan, open_folder, read_folder
-from rejeu.lab.experiments.process import hold
 from rejeu.lab.experiments.scheduler import MAX_LOST, Scheduler
 from rejeu.lab.experiments.sweep import imports_of
 from rejeu.lab.experiments.work import Job, Work
 from rejeu.lab.runs.config import RunConfig
+from rejeu.lab.runs.process import hold
 
 
 class Handle:

@@ -14,9 +14,10 @@ from rejeu.agents import presets
 from rejeu.algorithms.search import LogUniform
 from rejeu.core.errors import CheckpointError
 from rejeu.core.interrupt import Interrupt
-from rejeu.lab.experiments import final, process, study as studies, study_plan as plans, tune as tuning
+from rejeu.lab.experiments import final, study as studies, study_plan as plans, tune as tuning
 from rejeu.lab.experiments.search import Search
 from rejeu.lab.experiments.study import StudyFolder
+from rejeu.lab.runs import process
 from rejeu.lab.runs.config import RunConfig
 from tests.lab.experiments.fake_training import Pretended
 from tests.tiers import only

@@ -115,9 +115,19 @@ def test_all_that_makes_an_environment_or_starts_a_process_asks_what_was_typed()
     ]
     assert len(asked) >= 5
     assert [call for call in asked if MADE[call[1]] not in call[2] and call[0] != "player.py"] == []
-    makers = {"from_arguments", "make", "make_vector", "make_env", "find_id", "import_source", "Popen", "run"}
+    makers = {
+        "from_arguments",
+        "make",
+        "make_vector",
+        "make_env",
+        "find_id",
+        "import_source",
+        "Popen",
+        "start_apart",
+        "run",
+    }
     assert {(file, name) for file, name, _ in calls if name in makers} == {
-        ("processes.py", "Popen"),  # start
+        ("processes.py", "start_apart"),  # start
         ("new.py", "Popen"),  # rejeu check of what is in the form
         ("server.py", "run"),  # the server itself
     }

@@ -20,7 +20,6 @@ from rejeu.envs.functional import is_functional
 from rejeu.envs.make import BACKENDS
 from rejeu.lab.cli.commands import Sweep
 from rejeu.lab.experiments.folder import Plan, SweepFolder, open_folder, read_folder
-from rejeu.lab.experiments.process import default_workers, hold, threads_of
 from rejeu.lab.experiments.sweep import SweepResult, imports_of, make_launcher, prepare, states_text, train
 from rejeu.lab.experiments.work import Job, Work, again
 from rejeu.lab.reporting.comparison import By, Comparison, compare
@@ -30,6 +29,7 @@ from rejeu.lab.runs.begin import begin
 from rejeu.lab.runs.config import RunConfig
 from rejeu.lab.runs.environment import find_id
 from rejeu.lab.runs.output import Stopwatch, echo, header
+from rejeu.lab.runs.process import default_workers, hold, threads_of
 from rejeu.lab.runs.session import Session, installed_logs, make_evaluation_env
 from rejeu.logs.formatting import counted, quoted
 

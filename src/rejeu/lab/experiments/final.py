@@ -13,12 +13,12 @@ from rejeu.agents import AGENTS, presets
 from rejeu.checkpoints.run_folder import RunFolder
 from rejeu.core import validation
 from rejeu.core.interrupt import Interrupt
-from rejeu.lab.experiments.process import LocalLauncher
 from rejeu.lab.experiments.scheduler import Scheduler
 from rejeu.lab.experiments.study import Study, StudyFolder
 from rejeu.lab.experiments.study_plan import MIN_FINAL_SEEDS, Measure, StudyPlan
 from rejeu.lab.reporting.comparison import Comparison, compare
 from rejeu.lab.runs.config import RunConfig
+from rejeu.lab.runs.process import LocalLauncher
 from rejeu.lab.runs.read import RunSummary, read_run
 from rejeu.logs import statistics
 

@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from rejeu.core import atomic, hardware
 from rejeu.core.errors import ClusterError
 from rejeu.envs.workers import cluster
-from rejeu.lab.experiments.process import LOST, THREADS, Process
 from rejeu.lab.runs.config import read_task, write_task
+from rejeu.lab.runs.process import LOST, THREADS, Process
 
 if TYPE_CHECKING:
     from rejeu.lab.experiments.folder import Resources

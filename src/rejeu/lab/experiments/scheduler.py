@@ -24,9 +24,9 @@ from filelock import FileLock
 
 from rejeu.checkpoints.run_folder import newest_step
 from rejeu.core.interrupt import TAKEN, Interrupt
-from rejeu.lab.experiments.process import hold, last_line
 from rejeu.lab.experiments.work import Ending, Work
 from rejeu.lab.runs.config import write_task
+from rejeu.lab.runs.process import hold, last_line
 from rejeu.lab.runs.read import is_locked
 
 POLL = 0.2

@@ -9,10 +9,10 @@ import time
 from collections.abc import Callable
 
 from rejeu.core.interrupt import Interrupt
-from rejeu.lab.experiments.process import LocalLauncher
 from rejeu.lab.experiments.scheduler import Scheduler
 from rejeu.lab.experiments.study import RunningTrial, Study
 from rejeu.lab.runs.config import RunConfig
+from rejeu.lab.runs.process import LocalLauncher
 
 IDLE = 5.0
 """Seconds between two looks at trials that other processes train."""

@@ -32,10 +32,10 @@ from rejeu.core.errors import CheckpointError, requires
 from rejeu.core.records import brief, json_text
 from rejeu.lab.experiments import space as spaces, study_plan as plans
 from rejeu.lab.experiments.folder import begin
-from rejeu.lab.experiments.process import hold
 from rejeu.lab.experiments.study_plan import StudyPlan
 from rejeu.lab.experiments.work import HIDDEN, Job, Work
 from rejeu.lab.runs.config import RunConfig
+from rejeu.lab.runs.process import hold
 from rejeu.logs.tables import read_table
 
 if TYPE_CHECKING:

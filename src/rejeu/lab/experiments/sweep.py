@@ -19,10 +19,10 @@ from rejeu.core.interrupt import Interrupt
 from rejeu.lab.experiments import display
 from rejeu.lab.experiments.folder import SweepFolder, open_folder, read_folder
 from rejeu.lab.experiments.plan import read_plan
-from rejeu.lab.experiments.process import LocalLauncher, default_workers, threads_of
 from rejeu.lab.experiments.scheduler import Launcher, Scheduler
 from rejeu.lab.experiments.work import HIDDEN, Work
 from rejeu.lab.runs.config import RunConfig
+from rejeu.lab.runs.process import LocalLauncher, default_workers, threads_of
 
 STATES = ("running", "done", "failed", "stopped", "waiting")
 

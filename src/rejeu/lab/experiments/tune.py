@@ -21,11 +21,11 @@ from rejeu.core.errors import MissingExtra
 from rejeu.core.interrupt import Interrupt
 from rejeu.lab.experiments import display, study as studies, study_plan as plans
 from rejeu.lab.experiments.final import Final, compare_with_default
-from rejeu.lab.experiments.process import default_workers
 from rejeu.lab.experiments.search import Search
 from rejeu.lab.experiments.study import STATES, Study, StudyFolder
 from rejeu.lab.experiments.study_plan import Measure, Pruner, StudyPlan
 from rejeu.lab.runs.config import RunConfig
+from rejeu.lab.runs.process import default_workers
 from rejeu.logs.formatting import counted, number
 
 if TYPE_CHECKING:

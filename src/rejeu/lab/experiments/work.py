@@ -25,8 +25,8 @@ from rejeu.checkpoints.run_folder import RunFolder, newest_step
 from rejeu.core import atomic
 from rejeu.core.errors import CheckpointError
 from rejeu.envs.registry import are_plain
-from rejeu.lab.experiments.process import LOST
 from rejeu.lab.runs.config import RunConfig, Task, written
+from rejeu.lab.runs.process import LOST
 from rejeu.lab.runs.read import is_locked
 from rejeu.logs.tables import read_bytes
 

@@ -5,19 +5,15 @@ from __future__ import annotations
 import os
 import re
 import subprocess
-import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from rejeu.core import atomic
-from rejeu.core.interrupt import program
+from rejeu.lab.runs.process import start_apart
 from rejeu.lab.runs.read import is_file
 
 HIDDEN = ".studio"
 """Folder of the logs, beside the run folders."""
-APART: dict[str, Any] = {"creationflags": 0x208} if sys.platform == "win32" else {"start_new_session": True}
-"""Options of a process that no signal to this one reaches; on Windows it is detached, and a process group of its own."""
 STARTED: dict[tuple[str, str], subprocess.Popen[bytes]] = {}
 """The processes by command and run: what is under way is not started twice. That a run begins is one command."""
 TAIL = 2**16
@@ -37,11 +33,8 @@ def start(words: Sequence[str], run: Path) -> subprocess.Popen[bytes]:
     log = log_of(run)
     atomic.check_no_link(log.parent)
     atomic.make_folder(log.parent)
-    with atomic.open_file(log) as out:
-        process = STARTED[key] = subprocess.Popen(
-            program("-m", "rejeu", *words), stdin=subprocess.DEVNULL, stdout=out, stderr=out, **APART
-        )
-        return process
+    process = STARTED[key] = start_apart(words, log)
+    return process
 
 
 def log_of(run: Path) -> Path:

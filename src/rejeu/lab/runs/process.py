@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import os
 import subprocess
+import sys
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 from filelock import FileLock, Timeout
 
@@ -34,7 +37,7 @@ class Process:
         """
         with atomic.open_file(log) as file:
             self._process = subprocess.Popen(
-                interrupt.program("-m", "rejeu", "--task", str(task)),
+                program(task),
                 stdin=subprocess.PIPE,
                 stdout=file,
                 stderr=subprocess.STDOUT,
@@ -62,6 +65,26 @@ class Process:
         self._process.kill()
         self._process.wait()
         self.stop()
+
+
+def program(task: Path) -> list[str]:
+    """Returns the command line of a process that does what the file of a task says."""
+    return interrupt.program("-m", "rejeu", "--task", str(task))
+
+
+APART: dict[str, Any] = {"creationflags": 0x208} if sys.platform == "win32" else {"start_new_session": True}
+"""Options of a process that no signal to this one reaches; on Windows it is detached, and a process group of its own."""
+
+
+def start_apart(words: Sequence[str], log: Path) -> subprocess.Popen[bytes]:
+    """Starts the command ``rejeu`` with these words, which goes on when this process ends; ``log`` gets what it prints.
+
+    Raises:
+        OSError: if the log cannot be written, such as a symbolic link.
+    """
+    with atomic.open_file(log) as output:
+        command = interrupt.program("-m", "rejeu", *words)
+        return subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=output, stderr=output, **APART)
 
 
 def last_line(log: Path) -> str:
