@@ -165,7 +165,7 @@ class BaseAgent(ABC):
     last_saved: Path | None = None
     """The newest file that :meth:`save` wrote."""
     report_folder: Path | None = None
-    """Where a batch that led to a non-finite number is saved; None: see :func:`rejeu.training.finite.folder_of`."""
+    """Where batches that led to a non-finite number are saved; None: see :func:`rejeu.training.finite.folder_of`."""
     made_from_id: bool = False
     """Whether the environments were made from an id."""
     trained_on: tuple[str, Mapping[str, Any]] | None = None

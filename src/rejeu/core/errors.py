@@ -69,9 +69,9 @@ class NonFiniteError(RuntimeError):
         self.step = step
         """Environment steps at the start of the update."""
         self.n_updates = n_updates
-        """Total number of gradient steps, with that of the error."""
+        """Total number of gradient steps before those of the error."""
         self.batch = batch
-        """Path of the saved batch, None if there is none."""
+        """Path of the saved batches, None if there are none."""
 
 
 class WorkerError(RuntimeError):

@@ -39,6 +39,7 @@ from rejeu.envs.registry import make_env
 from rejeu.logs.formatting import counted
 from rejeu.networks.batch_renorm import in_training, is_normalized, with_statistics
 from rejeu.networks.projected import projected
+from rejeu.training import finite
 from rejeu.training.learner import Learner
 from rejeu.training.off_policy import STEPS_OFFLINE, learn_from
 
@@ -401,6 +402,7 @@ def learn_offline(
     Raises:
         ValueError: if the spaces differ, the agent has no replay buffer, or the policy is to be kept and the agent has no
             critics apart from it.
+        NonFiniteError: if an update leaves NaN or infinity.
     """
     check(agent, demonstrations)
     learner = keeping_policy(agent) if keep_policy else agent.learner
@@ -417,9 +419,9 @@ def learn_offline(
     for n in chunks(updates):
         learn_from(run, learner, agent.config, replay, [(done + i) / updates for i in range(n)], done)
         done += n
+        finite.settle(agent)
         if interrupt.requested() is not None:
             break
-    run.monitor.read()
     return {name: float(value) for name, value in (run.metrics or {}).items()}
 
 

@@ -108,7 +108,7 @@ def _observation_error(run: Run, leaf: int, array: np.ndarray, taken: int, what:
 
 def _check_action(run: Run, taken: int) -> None:
     if run.action is not None and not is_finite(run.action):
-        run.monitor.read()
+        run.monitor.check(run.state)
         which = int(np.argwhere(~np.isfinite(run.action))[0][0])
         raise NonFiniteError(
             f"the policy chose the action {run.action[which]} in environment {which} after {taken} steps, and "
@@ -130,7 +130,7 @@ def _state_error(run: Run, bad: list[str]) -> Exception:
     more = f" and {len(bad) - 1} more of its arrays are" if len(bad) > 1 else " is"
     return NonFiniteError(
         f"{bad[0]} of the agent's state{more} not finite before learning begins (step {run.step}, update "
-        f"{run.n_updates}); set_parameters or a file put them there: give it finite numbers, or load another model",
+        f"{run.n_updates}): load another model, or give it finite numbers with set_parameters",
         names=[text.split(" ")[0] for text in bad],
         step=run.step,
         n_updates=run.n_updates,

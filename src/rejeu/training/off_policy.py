@@ -101,7 +101,7 @@ def offline(
         n = n if last is None else min(n, last - run.step)
         learn_from(run, learner, config, run.replay, [progress(run.step + i - first) for i in range(n)])
         run.step += n
-        run.monitor.read()
+        run.monitor.check(run.state)
         yield Progress(run.step, [], run.metrics)
 
 
@@ -180,7 +180,7 @@ def observe(run: Run, learner: Learner) -> None:
     They are copied: the device may read an array after the environments have written the next step to it.
     """
     assert learner.observe is not None
-    run.state = run.monitor.follow(learner.observe, run.state, jax.tree.map(np.copy, run.obs), run.running_return)
+    run.state = learner.observe(run.state, jax.tree.map(np.copy, run.obs), run.running_return)
 
 
 @timed("replay")

@@ -73,7 +73,7 @@ def act(run: Run, learner: Learner, clock: Clock) -> np.ndarray:
     """Returns the actions at the current observations, and puts these into the rollout."""
     chosen, run.carry = learner.act(run.state, run.carry, run.obs, run.ended, run.key, clock)
     action = np.asarray(chosen)
-    run.monitor.read()  # before the rollout of the last update is overwritten
+    run.monitor.check(run.state)  # before the rollout of the last update is overwritten
     run.replay.observe(run.obs)
     return action
 

@@ -24,7 +24,7 @@ from rejeu.core.xla import clock
 from rejeu.envs.base import Step, VectorEnv, seed_of_run
 from rejeu.replay.prioritized import Draw
 from rejeu.training.finite import NonFiniteMonitor
-from rejeu.training.learner import Learner, PackedState, is_finite
+from rejeu.training.learner import Learner, PackedState
 
 F = TypeVar("F", bound=Callable[..., Any])
 PARTS = ("env", "replay", "update")
@@ -202,7 +202,7 @@ def initial_run(
         key=explore_key,
         rng=np.random.default_rng(seed),
         carry=learner.initial_carry(1 if env is None else env.n_envs),
-        monitor=NonFiniteMonitor(learner.copy, is_finite, learner.skips),
+        monitor=NonFiniteMonitor(learner.skips),
         learn_from=learn_from,
         seed=seed_of_run(seed),
     )

@@ -82,15 +82,15 @@ def test_nan_of_an_update_is_reported_with_its_steps(kind: Any, env: Any, settin
         assert_finite_experience(agent)
 
 
-def test_an_agent_trains_on_after_a_nan_and_the_host_names_its_update(tmp_path: Path) -> None:
+def test_an_agent_trains_on_after_a_nan_and_the_host_saves_its_batches(tmp_path: Path) -> None:
     agent = make(rejeu.DQN, "jax/CartPole-v1", **HUGE)
-    step = assert_reported(agent, "names the update and saves its batch").step
+    step = assert_reported(agent, "names the turn and saves its batches").step
     agent.learning_rate = 1e-3
     agent.learn(40, reset_num_timesteps=False)
     assert agent.num_timesteps == step + 40
     agent.learning_rate = 1e30
     agent.on_device, agent.report_folder = False, tmp_path
-    with pytest.raises(rejeu.NonFiniteError, match="update ") as raised:
+    with pytest.raises(rejeu.NonFiniteError, match="in the update after environment step ") as raised:
         agent.learn(40, reset_num_timesteps=False)
     assert raised.value.batch is not None
 

@@ -298,7 +298,7 @@ def saved_at_exit(agent: Agent, folder: RunFolder, evaluate: Evaluate) -> Iterat
         if not evaluate.results:
             save_model(agent, folder.best)
     except (errors.BadEnvironmentError, errors.NonFiniteError, errors.WorkerError):
-        save_model(agent, folder.agent)
+        save_model(agent, folder.agent)  # raises the same error where the weights are not finite
         raise
     finally:
         write = partial(agent.history.write_csv, folder.episodes)
