@@ -21,7 +21,7 @@ from rejeu.core import schedules, xla
 from rejeu.core.interrupt import Interrupt
 from rejeu.envs import snapshot
 from rejeu.exploration.noise import warn_without_noise
-from rejeu.logs.logging import Console, RetryingSink, Sink, guarded, next_folder, open_log
+from rejeu.logs.logging import Console, GuardedSink, Sink, guarded, next_folder, open_log
 from rejeu.training import finite
 from rejeu.training.finite import NonFiniteSteps, NonFiniteUpdate
 from rejeu.training.run import Episode, Progress, TrainingCall, checked_limits, time_shares
@@ -39,7 +39,7 @@ LOGGED_AS = {"exploration_rate": "rollout/exploration_rate"}
 
 def open_outputs(
     agent: BaseAgent, sinks: Iterable[Sink], tb_log_name: str | None, stack: ExitStack
-) -> Sequence[RetryingSink]:
+) -> Sequence[GuardedSink]:
     """Returns the outputs for rows of statistics; ``stack`` closes those that are opened here."""
     given, opened = [*sinks, *agent.logger.outputs], list[Sink]()
     if agent.verbose and not agent.logger.outputs:
@@ -233,10 +233,8 @@ def session(
     agent.training_call, agent.callbacks = call, stateful(callbacks)
     agent.interrupted, agent.interrupted_by = False, None
     agent.run.success_threshold = agent.success_threshold
-    agent.failed_writes.forget_written()
     with ExitStack() as stack:
         stack.callback(lambda: setattr(agent.run, "fingerprint", snapshot.fingerprint(agent.run.env)))
-        stack.callback(agent.failed_writes.warn)
         outputs = open_outputs(agent, sinks, tb_log_name, stack)
         stack.callback(agent.failed_writes.retry)
         for output in outputs:
@@ -249,7 +247,6 @@ def session(
             answers = [called(callback, agent, turn) for callback in callbacks if not runs_last(callback)]
             write_row(agent, call, turn, outputs)  # with what these callbacks have recorded
             answers += [called(callback, agent, turn) for callback in callbacks if runs_last(callback)]
-            agent.failed_writes.retry_if_due()
             over = call.is_over(agent.run)
             return over or any(isinstance(answer, bool | np.bool_) and not answer for answer in answers)
 

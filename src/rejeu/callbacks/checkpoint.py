@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from pathlib import Path
 from typing import Any, ClassVar
@@ -11,7 +10,6 @@ import jax
 
 from rejeu.callbacks.base import TrainingCallback, crossed
 from rejeu.core.errors import NonFiniteError
-from rejeu.core.failed_writes import RETRY_SECONDS
 from rejeu.core.validation import number, whole
 from rejeu.training.run import Progress
 
@@ -60,7 +58,6 @@ class Checkpoint(TrainingCallback):
         self._saved: tuple[int, int] | None = None
         self._last_step = 0
         self._last_time = 0.0
-        self._retry_at = math.inf
 
     def before_training(self, agent: Any) -> None:
         """Locks the folder, and saves at once if it contains no checkpoint.
@@ -82,7 +79,7 @@ class Checkpoint(TrainingCallback):
         by_steps = self.every is not None and crossed(before, progress.step, self.every)
         now = time.monotonic()
         by_time = self.minutes is not None and now - self._last_time >= 60 * self.minutes
-        if by_steps or by_time or now >= self._retry_at:
+        if by_steps or by_time:
             self._attempt(agent)
 
     def after_training(self, agent: Any, error: BaseException | None) -> None:
@@ -116,13 +113,9 @@ class Checkpoint(TrainingCallback):
         return path
 
     def _attempt(self, agent: Any, reason: str = "") -> None:
-        """Saves; if that fails, warns and tries again after a minute."""
-        description = f"checkpoints in {self.folder}"
-        written = agent.failed_writes.attempt(description, lambda: self.save(agent, reason), retry=False)
-        self._retry_at = math.inf
-        if not written:
+        """Saves; if that fails, warns, and the next checkpoint makes up for it."""
+        if not agent.failed_writes.attempt(f"checkpoints in {self.folder}", lambda: self.save(agent, reason)):
             self._last_time = time.monotonic()
-            self._retry_at = self._last_time + RETRY_SECONDS
 
     def _save_after(self, error: Exception, agent: Any) -> None:
         """Saves what is intact after an error within a step: the resumed run starts with new episodes."""

@@ -110,7 +110,8 @@ class Evaluate(TrainingCallback):
             self.best = result
             agent.remember_best(merit(result.evaluation), "evaluation")
             if self.best_path is not None:
-                agent.failed_writes.attempt(f"best model {self.best_path}", agent.snapshot(self.best_path))
+                save = agent.snapshot(self.best_path)
+                agent.failed_writes.attempt(f"best model {self.best_path}", save, is_model=True)
         agent.logger.write(step, logged(result.evaluation))
         if self.report is not None:
             self.report(result, is_best)

@@ -77,7 +77,7 @@ class RecordVideo:
         if due:
             path = self.folder / f"step_{progress.step:0{DIGITS}}.mp4"
             record = partial(record_video, agent, path, self.env, self.episodes, self.max_steps, self.seed)
-            if agent.failed_writes.attempt(f"video {path}", record, retry=False):
+            if agent.failed_writes.attempt(f"video {path}", record):
                 self.paths.append(path)
                 agent.logger.write_video(progress.step, path)
 

@@ -6,6 +6,7 @@ import copy
 import json
 import re
 import warnings
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -79,7 +80,7 @@ class Recording:
 
     def __str__(self) -> str:
         if not self.episodes:
-            return f"{self.folder}: nothing was played, nothing is recorded"
+            return self._writes.summary() or f"{self.folder}: nothing was played, nothing is recorded"
         return (
             f"{self.folder}: {counted(self.episodes, 'episode')}{f' in {VIDEO_NAME} and' if self._video else ''} "
             f"for MINARI_DATASETS_PATH={self.folder}, minari.load_dataset({self.dataset_id!r})"
@@ -106,8 +107,8 @@ class Recording:
         """Completes dataset and video. Nothing is written if nothing was played."""
         try:
             self._end()
-            if self._writes.retry() and self.episodes:
-                self._writes.attempt("the dataset", lambda: dataset.merge(self._data), retry=False)
+            if self.episodes:
+                self._writes.attempt("the dataset", lambda: dataset.merge(self._data))
         except BaseException:
             if self._video is not None:
                 self._video.discard()
@@ -121,8 +122,8 @@ class Recording:
         *most, terminated, truncated = steps[-1]
         steps[-1] = (*most, terminated, truncated or not terminated)
         content = dataset.episode(self.episodes, steps, self._seed, {} if self.episodes else self._metadata)
-        self._writes.put("episodes of the recording", self._write, self.episodes, content)
-        self.episodes += 1
+        write = partial(self._write, self.episodes, content)
+        self.episodes += self._writes.attempt("episodes of the recording", write, is_row=True)
         if self._video is not None:
             self._show(*[self._frame] * round(HOLD_SECONDS * self._video.fps))
 

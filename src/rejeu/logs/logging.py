@@ -6,7 +6,6 @@ import csv
 import io
 import json
 import math
-import operator
 import os
 import re
 import secrets
@@ -15,17 +14,17 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from queue import Empty, SimpleQueue
+from queue import SimpleQueue
 from typing import Any, Protocol
 
 import numpy as np
 
 from rejeu.core import atomic
 from rejeu.core.errors import requires
-from rejeu.core.failed_writes import MAX_ROWS, RETRY_SECONDS, FailedWrites
+from rejeu.core.failed_writes import FailedWrites
 from rejeu.logs import trackers
 from rejeu.logs.formatting import LOGS, Display
 from rejeu.logs.history import csv_lines
@@ -35,6 +34,8 @@ from rejeu.logs.trackers import MLflow, Tracker, Trackio, WandB
 TRACKERS = ("wandb", "mlflow", "trackio")
 CLOSE_SECONDS = 60.0
 """Longest wait at the end of training for what a tracker has not yet written."""
+MAX_ROWS = 10_000
+"""Upper limit on the rows that wait for a slow tracker; beyond it new ones are lost."""
 MAX_LOG_BYTES = 2**30
 """Upper limit on the size of a log that is continued."""
 NUMBERS = re.compile(rb"[0-9]{1,18}(,[-+.\w]{0,64})*\r?\n", re.ASCII)
@@ -468,31 +469,28 @@ def next_folder(root: str | Path, name: str) -> Path:
     return root / f"{name}_{k}"
 
 
-class RetryingSink:
-    """A sink whose rows wait while they cannot be written; failures are reported and retried, in order.
+class GuardedSink:
+    """A sink whose failures are reported instead of raised; a row that fails is lost.
 
     Args:
         sink: the sink.
         failed: where its failures are reported.
         closes: whether :meth:`close` also closes the sink.
         in_background: write in a thread, so that a slow or lost connection neither delays nor ends training. What fails is
-            retried after ``RETRY_SECONDS``, and reported with the next row. Other threads may not use the sink until
-            :meth:`close` returns.
+            reported with the next row. Other threads may not use the sink until :meth:`close` returns.
     """
 
     def __init__(self, sink: Sink, failed: FailedWrites, closes: bool = True, in_background: bool = False) -> None:
         self.sink, self.closes, self.in_background = sink, closes, in_background
-        self._what, self._failed = f"rows of {sink}", failed
+        self._name, self._failed = f"rows of {sink}", failed
         self._jobs: SimpleQueue[Callable[[], object] | None] = SimpleQueue()
-        self._closing = threading.Event()
         self._error: Exception | None = None
-        self._n_dropped = 0
         self._thread = threading.Thread(target=self._work, name=f"rejeu, {sink}", daemon=True)
         if in_background:
             self._thread.start()
 
     def write(self, step: int, metrics: Mapping[str, float]) -> None:
-        """Writes the metrics of environment step ``step``, or lets them wait."""
+        """Writes the metrics of environment step ``step``."""
         self._put(partial(self.sink.write, step, dict(metrics)))
 
     def write_config(self, config: Mapping[str, Any]) -> None:
@@ -506,55 +504,42 @@ class RetryingSink:
             self._put(partial(self.sink.write_video, step, path))
 
     def close(self) -> None:
-        """Closes the sink. A thread gets up to ``CLOSE_SECONDS`` for what waits, and one more attempt if that failed."""
+        """Closes the sink. A thread gets up to ``CLOSE_SECONDS`` for the rows that wait."""
         if not self.in_background:
-            self._failed.attempt(self._what, self.sink.close, retry=False)
+            self._failed.attempt(self._name, self.sink.close, is_row=True)
             return
         if self.closes:
             self._jobs.put(self.sink.close)
         self._jobs.put(None)
-        self._closing.set()
         self._thread.join(CLOSE_SECONDS)
         if self._thread.is_alive() and self._error is None:
             self._error = TimeoutError(f"not done {CLOSE_SECONDS:.0f} seconds after the end of training")
-        self._failed.attempt(self._what, self._raise_error, retry=False)
+        self._failed.attempt(self._name, self._raise_error, is_row=True)
 
     def _put(self, job: Callable[[], object]) -> None:
         if not self.in_background:
-            self._failed.put(self._what, operator.call, job)
+            self._failed.attempt(self._name, job, is_row=True)
             return
-        if self._jobs.qsize() >= MAX_ROWS:
-            with suppress(Empty):
-                self._jobs.get_nowait()
-                self._n_dropped += 1
-        self._jobs.put(job)
-        self._failed.attempt(self._what, self._raise_error, retry=False)
+        if self._jobs.qsize() < MAX_ROWS:
+            self._jobs.put(job)
+        else:
+            self._error = OverflowError(f"{MAX_ROWS:,} rows wait, and no more can")
+        self._failed.attempt(self._name, self._raise_error, is_row=True)
 
     def _raise_error(self) -> None:
         if self._error is not None:
             raise OSError(f"{type(self._error).__name__}: {self._error}"[:500])
-        if self._n_dropped:
-            raise OSError(f"{self._n_dropped:,} were dropped: at most {MAX_ROWS:,} can wait")
 
     def _work(self) -> None:
         while (job := self._jobs.get()) is not None:
-            while not self._is_done(job):
-                if self._closing.is_set():
-                    return
-                self._closing.wait(RETRY_SECONDS)
-
-    def _is_done(self, job: Callable[[], object]) -> bool:
-        try:
-            job()
-        except Exception as error:  # of any kind, as each library has its own
-            self._error = error
-            return False
-        self._error = None
-        return True
+            try:
+                job()
+            except Exception as error:  # of any kind, as each library has its own
+                self._error = error
 
 
-def guarded(sink: Sink, failed: FailedWrites, closes: bool = False) -> RetryingSink:
-    """Returns a sink whose failures are reported and retried instead of raised; trackers are written to in the background."""
-    if isinstance(sink, RetryingSink):
+def guarded(sink: Sink, failed: FailedWrites, closes: bool = False) -> GuardedSink:
+    """Returns a sink whose failures are reported instead of raised; trackers are written to in the background."""
+    if isinstance(sink, GuardedSink):
         return sink
-    return RetryingSink(sink, failed, closes, in_background=isinstance(sink, WandB | MLflow | Trackio))
+    return GuardedSink(sink, failed, closes, in_background=isinstance(sink, WandB | MLflow | Trackio))

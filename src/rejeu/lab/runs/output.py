@@ -105,7 +105,7 @@ def as_dict(
         "training": {"episodes": last.n, **{name: getattr(last, name) for name in means}},
         "best": None if best is None else {"step": best.step, **best.evaluation.to_dict()},
         "files": sorted(path.name for path in folder.path.iterdir()),
-        "not_written": [output for output, failure in agent.failed_writes.failures.items() if not failure.written],
+        "not_written": [*agent.failed_writes.failures],
     }
 
 

@@ -29,7 +29,7 @@ from rejeu.lab.runs.requests import Requests, ask
 from rejeu.logs import plots, video
 from rejeu.logs.formatting import counted, quoted
 from rejeu.logs.history import EpisodeTable
-from rejeu.logs.logging import CsvFile, RetryingSink, Sink, check_logs, guarded, open_log, require
+from rejeu.logs.logging import CsvFile, GuardedSink, Sink, check_logs, guarded, open_log, require
 from rejeu.logs.video import ffmpeg
 from rejeu.training.run import Progress
 
@@ -75,7 +75,7 @@ class Learning(NamedTuple):
     evaluate: Evaluate
     callbacks: list[Any]
     """All of them, with ``evaluate``."""
-    sinks: list[RetryingSink]
+    sinks: list[GuardedSink]
     """The outputs of the rows of statistics, of episodes and of the video."""
 
     def close(self) -> None:
@@ -151,7 +151,6 @@ class Session(NamedTuple):
         agent, folder, environment, evaluate = self.agent, self.folder, self.environment, learning.evaluate
         is_complete = not stop.requested and has_reached_goal(agent)
         try:
-            agent.failed_writes.retry()
             if is_complete:
                 with leaving(f"interrupted after training; the models are saved in {folder.path}"):
                     evaluate_now(evaluate, agent)
@@ -169,6 +168,7 @@ class Session(NamedTuple):
             raise
         finally:
             learning.close()
+        agent.failed_writes.retry()
         self.write_report()
         result = as_dict(agent, folder, evaluate, stop.signal, is_complete, stopwatch)
         echo(summary(result, agent, folder, environment, evaluate))
@@ -178,7 +178,7 @@ class Session(NamedTuple):
             return 128 + stop.signal, result
         return (0 if agent.failed_writes.complete else 2), result
 
-    def outputs(self) -> list[RetryingSink]:
+    def outputs(self) -> list[GuardedSink]:
         """Returns the outputs of the rows of statistics, and the table of episodes."""
         agent, up_to = self.agent, None if self.is_new else self.agent.num_timesteps
         sinks: list[Sink] = [
@@ -209,7 +209,7 @@ class Session(NamedTuple):
         """Returns the callback that evaluates, and all callbacks of the run."""
         agent, config, folder = self.agent, self.config, self.folder
         table = CsvFile(folder.evaluations, None if self.is_new else agent.num_timesteps)
-        report = reporter(agent, RetryingSink(table, agent.failed_writes), folder.models, self.label)
+        report = reporter(agent, GuardedSink(table, agent.failed_writes), folder.models, self.label)
         every, episodes = config.evaluate_every, config.evaluate_episodes
         evaluate = Evaluate(self.evaluation_env, every, episodes, folder.best, report=report)
         is_pause_due = pause(agent, self.limits)
@@ -302,9 +302,9 @@ def saved_at_exit(agent: Agent, folder: RunFolder, evaluate: Evaluate) -> Iterat
         raise
     finally:
         write = partial(agent.history.write_csv, folder.episodes)
-        agent.failed_writes.attempt(f"table {folder.episodes}", write)
+        agent.failed_writes.attempt(f"rows of {folder.episodes}", write)
 
 
 def save_model(agent: Agent, path: Path) -> None:
     """Saves a model, or warns and tries again at the end of the command."""
-    agent.failed_writes.attempt(f"model {path}", agent.snapshot(path))
+    agent.failed_writes.attempt(f"model {path}", agent.snapshot(path), is_model=True)

@@ -88,10 +88,10 @@ class CheckpointCallback(BaseCallback):
         return True
 
     def _write(self, save: Callable[[Path], Any], kind: str) -> None:
-        """Saves one file, or warns. It is not written later: the next one has another name."""
+        """Saves one file, or warns."""
         suffix = ".pkl" if kind else ".zip"
         path = self.save_path / f"{self.name_prefix}_{kind}{self.num_timesteps}_steps{suffix}"
-        is_saved = self.model.failed_writes.attempt(str(path), lambda: save(path), retry=False)
+        is_saved = self.model.failed_writes.attempt(str(path), lambda: save(path))
         if is_saved and self.verbose >= 2:
             print(f"Saved {path}")
 
@@ -210,7 +210,7 @@ class EvalCallback(EventCallback):
                 print("New best mean reward!")
             if self.best_model_save_path is not None:
                 path = Path(self.best_model_save_path) / "best_model.zip"
-                self.model.failed_writes.attempt(f"best model {path}", self.model.snapshot(path))
+                self.model.failed_writes.attempt(f"best model {path}", self.model.snapshot(path), is_model=True)
             if self.callback_on_new_best is not None:
                 continues = self.callback_on_new_best.on_step()
         return continues and self._on_event()

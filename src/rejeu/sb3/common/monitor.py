@@ -31,7 +31,7 @@ class Monitor(gym.Wrapper, gym.utils.RecordConstructorArgs):
 
     Agents do not need a Monitor; it is for scripts that read its attributes or its file. The file is CSV: one line
     ``#{"t_start": ..., "env_id": ...}``, then the columns ``r,l,t`` and the keywords. It is opened for each row and closed
-    again. Rows that cannot be written are kept, with a warning, and written later.
+    again. Rows that cannot be written are lost, with a warning.
 
     Args:
         env: the environment.
@@ -166,7 +166,7 @@ class Monitor(gym.Wrapper, gym.utils.RecordConstructorArgs):
 
 
 class ResultsWriter:
-    """The CSV file of a monitor. Rows that cannot be written are kept, with a warning, and written later.
+    """The CSV file of a monitor. Rows that cannot be written are lost, with a warning.
 
     Args:
         filename: as for :class:`Monitor`.
@@ -194,12 +194,11 @@ class ResultsWriter:
         """Writes the row of an episode."""
         text = io.StringIO()
         csv.DictWriter(text, self.columns).writerow(epinfo)
-        self._failed_writes.put(f"rows of {self.path}", partial(atomic.append, self.path), text.getvalue().encode())
+        line = text.getvalue().encode()
+        self._failed_writes.attempt(f"rows of {self.path}", partial(atomic.append, self.path, line), is_row=True)
 
     def close(self) -> None:
-        """Writes rows that could not be written before, if possible."""
-        self._failed_writes.retry()
-        self._failed_writes.warn()
+        """Does nothing, because rows are not buffered."""
 
 
 def keywords_of(info: Mapping[str, Any], keywords: Sequence[str]) -> dict[str, Any]:
