@@ -24,7 +24,7 @@ BLOCK = 2**20
 MOST_STEPS = 500_000
 """Environment steps after which a log is full. Replaying takes 10 to 60 microseconds per step."""
 MOST_IMAGE_STEPS = 100_000
-"""The same for environments with image observations, which take about ten times as long."""
+"""Environment steps after which a log with image observations is full. Replaying one takes about ten times as long."""
 MOST_BYTES = 2**24
 """Bytes of actions after which a log is full, regardless of the number of steps."""
 MANY_OPERATIONS = 20_000
@@ -34,7 +34,7 @@ MANY_OPERATIONS = 20_000
 class LoggedOperation(NamedTuple):
     """One step or reset of the environments."""
 
-    which: np.ndarray | None
+    indices: np.ndarray | None
     """Indices of the environments, ``int32 (k,)``; None for all."""
     action: np.ndarray | None
     """Their actions ``(k, ...)`` in the range of the action space; None for a reset."""
@@ -70,32 +70,32 @@ class ActionLog:
         """Whether recording has stopped: the environments were not reset for a long time after the log was full."""
         return self.n_steps >= 2 * self._most_steps
 
-    def step(self, action: np.ndarray, which: np.ndarray | None = None) -> np.ndarray:
+    def step(self, action: np.ndarray, indices: np.ndarray | None = None) -> np.ndarray:
         """Records a step and returns the actions as they are recorded, ``(k, ...)``.
 
         Args:
-            action: actions of all environments, or of those in ``which``.
-            which: indices of the environments that are stepped; None for all.
+            action: actions of all environments, or of those in ``indices``.
+            indices: indices of the environments that are stepped; None for all.
         """
-        rows = self.n_envs if which is None else len(which)
+        rows = self.n_envs if indices is None else len(indices)
         action = np.ascontiguousarray(action, self._dtype).reshape(rows, *self._shape)
-        self._add(STEP if which is None else STEP_SOME, which, action.tobytes())
+        self._add(STEP if indices is None else STEP_SOME, indices, action.tobytes())
         self.n_steps += rows
         return action
 
-    def reset(self, which: np.ndarray | None = None) -> None:
-        """Records a reset of all environments, or of those in ``which``."""
-        self._add(RESET if which is None else RESET_SOME, which, b"")
+    def reset(self, indices: np.ndarray | None = None) -> None:
+        """Records a reset of all environments, or of those in ``indices``."""
+        self._add(RESET if indices is None else RESET_SOME, indices, b"")
 
-    def _add(self, kind: int, which: np.ndarray | None, action: bytes) -> None:
+    def _add(self, operation: int, indices: np.ndarray | None, action: bytes) -> None:
         if self.is_dropped:
             self._blocks, self._open = [], bytearray()
             return
         self.n_operations += 1
-        self._open.append(kind)
-        if which is not None:
+        self._open.append(operation)
+        if indices is not None:
             flags = np.zeros(self.n_envs, bool)
-            flags[which] = True
+            flags[indices] = True
             self._open += np.packbits(flags).tobytes()
         self._open += action
         if len(self._open) >= BLOCK:
@@ -117,22 +117,22 @@ class ActionLog:
         for block in saved["blocks"]:
             data, at = _expanded(block, longest), 0
             while at < len(data):
-                kind = data[at]
+                operation = data[at]
                 at += 1
-                if kind > RESET_SOME:
-                    raise ValueError(f"{kind} is no kind of operation")
-                which = None
-                if kind in (STEP_SOME, RESET_SOME):
+                if operation > RESET_SOME:
+                    raise ValueError(f"{operation} is no kind of operation")
+                indices = None
+                if operation in (STEP_SOME, RESET_SOME):
                     flags = np.unpackbits(_part(data, at, n_flags).view(np.uint8), count=self.n_envs)
-                    which = np.flatnonzero(flags).astype(np.int32)
+                    indices = np.flatnonzero(flags).astype(np.int32)
                     at += n_flags
                 action = None
-                if kind in (STEP, STEP_SOME):
-                    rows = self.n_envs if which is None else len(which)
+                if operation in (STEP, STEP_SOME):
+                    rows = self.n_envs if indices is None else len(indices)
                     action = _part(data, at, rows * self._row_bytes).view(self._dtype).reshape(rows, *self._shape)
                     check_env_actions(self._space, action, "the record of actions")
                     at += rows * self._row_bytes
-                yield LoggedOperation(which, action)
+                yield LoggedOperation(indices, action)
 
 
 def replay(log: ActionLog, saved: dict[str, Any], title: str) -> Iterator[LoggedOperation]:

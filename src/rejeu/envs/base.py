@@ -116,7 +116,7 @@ class VectorEnv(ABC):
     vec_normalize: Any = None
     """The wrapper that normalizes what the vector returns by running statistics, if there is one."""
     info: Any = None
-    """What the last step said besides, as :attr:`Step.info`."""
+    """The info of the last step, as :attr:`Step.info`."""
     _obs: Any
     """The observations returned last."""
 
@@ -198,7 +198,7 @@ class VectorEnv(ABC):
         return each_info(self.info, self.n_envs, begun)
 
     def call(self, name: str) -> list[Any]:
-        """Returns what a method without arguments returns in each environment, also in worker processes.
+        """Returns the result of a method without arguments in each environment, also in worker processes.
 
         Raises:
             AttributeError: if there is no such method, or the environments cannot be accessed.
@@ -256,8 +256,8 @@ def describe_spec(env: gym.Env | gym.vector.VectorEnv) -> tuple[str, int | None,
     if limit is None and env.spec.id.startswith("parking-"):  # which ends its episodes itself, after so many seconds
         config = env.unwrapped.config  # type: ignore[union-attr]
         limit = round(config["duration"] * config["policy_frequency"])
-    elif limit is None and isinstance(own := getattr(env.unwrapped, "max_episode_steps", None), int):
-        limit = own
+    elif limit is None and isinstance(declared := getattr(env.unwrapped, "max_episode_steps", None), int):
+        limit = declared
     return env.spec.id, limit, env.spec.reward_threshold
 
 
@@ -271,22 +271,22 @@ def each_info(info: Any, n_envs: int, begun: bool = False) -> list[dict[str, Any
     """
     if isinstance(info, list):
         return info
-    found: list[dict[str, Any]] = [{} for _ in range(n_envs)]
+    infos: list[dict[str, Any]] = [{} for _ in range(n_envs)]
     for key, values in info.items() if isinstance(info, dict) else ():
         each = each_info(values, n_envs) if isinstance(values, dict) else values
         if not key.startswith("_") and np.shape(each)[:1] == (n_envs,):
             for i in np.flatnonzero(info.get(f"_{key}", np.ones(n_envs))).tolist():
-                found[i][key] = each[i]
-    return found if begun else [one.get("final_info", one) for one in found]
+                infos[i][key] = each[i]
+    return infos if begun else [each.get("final_info", each) for each in infos]
 
 
-def success_by(own: float, episode_return: float, threshold: float | None) -> float:
-    """Returns whether an episode succeeded: what the environment says, ``own``, or by its return if that is NaN.
+def success_by(reported: float, episode_return: float, threshold: float | None) -> float:
+    """Returns whether an episode succeeded: as ``reported`` by the environment, or by its return if that is NaN.
 
     >>> success_by(0.0, 500.0, 475.0), success_by(math.nan, 500.0, 475.0), success_by(math.nan, 500.0, None)
     (0.0, 1.0, nan)
     """
-    return own if threshold is None or not math.isnan(own) else float(episode_return >= threshold)
+    return reported if threshold is None or not math.isnan(reported) else float(episode_return >= threshold)
 
 
 def success_of(info: dict[str, Any]) -> float:
@@ -308,17 +308,19 @@ def step_whole(step_all: Callable[[np.ndarray], Step], before: Any, action: np.n
 
     The others get an action of one that is active, and keep their observations ``before``, ``(n_envs, ...)``.
     """
-    rest = ~active
-    kept = jax.tree.map(lambda leaf: leaf[rest], before)
-    of_active = lambda part: np.where(active.reshape(-1, *[1] * (part.ndim - 1)), part, part[np.argmax(active)])  # noqa: E731
+    of_active = lambda leaf: np.where(active.reshape(-1, *[1] * (leaf.ndim - 1)), leaf, leaf[np.argmax(active)])  # noqa: E731
+    unchanged = jax.tree.map(lambda leaf: leaf[~active], before)
     step = step_all(jax.tree.map(of_active, action))
     reward = np.where(active, step.reward, np.float32(0.0))
     terminated, truncated = step.terminated & active, step.truncated & active
-    return step._replace(obs=replaced(step.obs, rest, kept), reward=reward, terminated=terminated, truncated=truncated)
+    return step._replace(
+        obs=with_rows(step.obs, ~active, unchanged), reward=reward, terminated=terminated, truncated=truncated
+    )
 
 
-def replaced(batch: Any, rows: np.ndarray, part: Any) -> Any:
-    """Returns a copy of a batch in which ``rows``, indices or a mask, are those of ``part``."""
+def with_rows(batch: Any, rows: np.ndarray, values: Any) -> Any:
+    """Returns a copy of a batch of arrays whose ``rows``, indices or a mask, are ``values``."""
     batch = jax.tree.map(np.copy, batch)
-    jax.tree.map(lambda whole, new: whole.__setitem__(rows, new), batch, part)
+    for array, array_values in zip(jax.tree.leaves(batch), jax.tree.leaves(values), strict=True):
+        array[rows] = array_values
     return batch

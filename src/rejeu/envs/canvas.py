@@ -11,7 +11,7 @@ from rejeu.core.errors import requires
 
 
 class Scene(NamedTuple):
-    """What there is to draw."""
+    """The states of an episode to draw."""
 
     states: list[Any]
     """The states of the episode up to now, as NumPy arrays."""

@@ -69,7 +69,7 @@ class Finding(NamedTuple):
 
     level: Level
     text: str
-    """What was received, what was expected, and the fix."""
+    """The received value, the expected one, and the fix."""
 
 
 class SeenStep(NamedTuple):
@@ -105,12 +105,12 @@ def check_env(env: gym.Env | FunctionalEnv, warn: bool = True, skip_render_check
 
     >>> check_env(gym.make("Pendulum-v1"), warn=False)
     """
-    found = findings(env, skip_render_check)
+    problems = findings(env, skip_render_check)
     if warn:
-        for finding in found:
+        for finding in problems:
             if finding.level == "warning":
                 warnings.warn(finding.text, UserWarning, stacklevel=2)
-    errors = [finding.text for finding in found if finding.level == "error"]
+    errors = [finding.text for finding in problems if finding.level == "error"]
     if errors:
         name = type(env).__name__ if isinstance(env, FunctionalEnv) else validation.id_of(env)
         raise BadEnvironmentError(f"{name}: " + "\n".join(errors))
@@ -130,23 +130,23 @@ def findings(env: gym.Env | FunctionalEnv, skip_render_check: bool = True) -> li
             env = GymnasiumEnv(env)
         except BadEnvironmentError as error:  # of what it traces
             return [Finding("error", str(error))]
-    found = _played(env, Effort(seconds=MOST_SECONDS))
-    if all(finding.level == "warning" for finding in found.values()):
+    problems = _played(env, Effort(seconds=MOST_SECONDS))
+    if all(finding.level == "warning" for finding in problems.values()):
         for text in _gymnasium_messages(env, skip_render_check):
-            found[text] = Finding("warning", text)
+            problems[text] = Finding("warning", text)
     for text in (*advice_on_observations(env.observation_space), *advice_on_actions(env.action_space)):
-        found[text] = Finding("warning", text)
-    return [*found.values()]
+        problems[text] = Finding("warning", text)
+    return [*problems.values()]
 
 
 def quick_findings(env: gym.Env, keeps_infos: bool = False) -> list[Finding]:
     """Returns the errors that :func:`findings` returns, and whether episodes never end, from few steps (:class:`Effort`)."""
-    found = _played(env, QUICK._replace(keeps_infos=keeps_infos))
-    return [finding for key, finding in found.items() if finding.level == "error" or key == "endless"]
+    problems = _played(env, QUICK._replace(keeps_infos=keeps_infos))
+    return [finding for key, finding in problems.items() if finding.level == "error" or key == "endless"]
 
 
 def _played(env: gym.Env, effort: Effort) -> dict[str, Finding]:
-    """Returns what random steps show, by kind."""
+    """Returns the problems that random steps show, by kind."""
     if (fault := validation.environment_fault(env)) is not None:
         raise TypeError(fault)
     try:
@@ -159,14 +159,14 @@ def _played(env: gym.Env, effort: Effort) -> dict[str, Finding]:
             check_action(env.action_space, "every algorithm")
     except (TypeError, ValueError) as error:
         return {"space": Finding("error", str(error))}
-    found: dict[str, Finding] = {}
-    seen = _play(env, found, effort)
-    if seen and isinstance(env.observation_space, spaces.Dict) and "desired_goal" in env.observation_space.spaces:
-        found |= {finding.text: finding for finding in goal_findings(env, seen, effort.keeps_infos)}
-    return found
+    problems: dict[str, Finding] = {}
+    steps = _play(env, problems, effort)
+    if steps and isinstance(env.observation_space, spaces.Dict) and "desired_goal" in env.observation_space.spaces:
+        problems |= {finding.text: finding for finding in goal_findings(env, steps, effort.keeps_infos)}
+    return problems
 
 
-def _play(env: gym.Env, found: dict[str, Finding], effort: Effort) -> list[SeenStep] | None:
+def _play(env: gym.Env, problems: dict[str, Finding], effort: Effort) -> list[SeenStep] | None:
     """Takes random steps and records each kind of problem once. Returns the steps, None if they had to stop."""
     space = env.observation_space
     env.action_space.seed(SEED)
@@ -174,47 +174,47 @@ def _play(env: gym.Env, found: dict[str, Finding], effort: Effort) -> list[SeenS
         for seed in (SEEDS_END - 1, SEED):  # the largest that a run may choose is taken too
             validation.called_reset(env, seed)
     except BadEnvironmentError as error:
-        found["seed"] = Finding("error", str(error))
+        problems["seed"] = Finding("error", str(error))
         env = env.unwrapped if validation.arguments_fault(env) else env  # wrappers pass a seed on
-    if (begun := _reset(env, found)) is None:
+    if (begun := _reset(env, problems)) is None:
         with suppress(Exception):  # whatever step raises after a wrong reset
-            _check_step(env.step(env.action_space.sample()), space, found)
+            _check_step(env.step(env.action_space.sample()), space, problems)
         return None
-    seen: list[SeenStep] = []
+    steps: list[SeenStep] = []
     functions = _functions_of_goals(env)
     seeks_end = effort.is_patient and _lacks_terminated(env)
     limit, length = known_limit(env), 0
     lengths: list[int] = []
     at_limit: list[bool] = []
     until, info = time.monotonic() + effort.seconds, begun[1]
-    while len(seen) < effort.most_steps:
-        if len(seen) >= effort.enough_steps and len(lengths) >= ENOUGH_EPISODES and not seeks_end:
+    while len(steps) < effort.most_steps:
+        if len(steps) >= effort.enough_steps and len(lengths) >= ENOUGH_EPISODES and not seeks_end:
             break
         is_endless = effort.is_patient and not lengths and limit is None
-        if len(seen) >= effort.enough_steps and time.monotonic() > until and not is_endless:
+        if len(steps) >= effort.enough_steps and time.monotonic() > until and not is_endless:
             break
         action = env.action_space.sample()
         with suppress(BadEnvironmentError):  # of a mask that is none
             action = masks.sampled(env, info)
-        answer = env.step(action)
-        if not _check_step(answer, space, found):
+        result = env.step(action)
+        if not _check_step(result, space, problems):
             return None
-        obs, reward, terminated, truncated, info = validation.convert_step(answer)
-        kept = jax.tree.map(np.array, plain(space, obs))
+        obs, reward, terminated, truncated, info = validation.convert_step(result)
+        obs_copy = jax.tree.map(np.array, plain(space, obs))
         is_next = effort.is_patient and length > 0
-        if is_next and (lost := validation.lost_change(space, seen[-1].obs, kept)) is not None:
-            found.setdefault("resolution", Finding("warning", lost))
-        seen.append(SeenStep(kept, reward, terminated, truncated, copy.deepcopy(info), {}))
-        seeks_end = seeks_end and not terminated and success_of(info) != 1.0 and len(seen) < QUICK.most_steps
-        for name, function in functions.items() if len(seen) <= MOST_GOALS else ():
-            seen[-1].judged[name] = [_attempt(function, *pair, info) for pair in _pairs(seen[0], seen[-1])]
+        if is_next and (lost := validation.lost_change(space, steps[-1].obs, obs_copy)) is not None:
+            problems.setdefault("resolution", Finding("warning", lost))
+        steps.append(SeenStep(obs_copy, reward, terminated, truncated, copy.deepcopy(info), {}))
+        seeks_end = seeks_end and not terminated and success_of(info) != 1.0 and len(steps) < QUICK.most_steps
+        for name, function in functions.items() if len(steps) <= MOST_GOALS else ():
+            steps[-1].judged[name] = [_attempt(function, *pair, info) for pair in _pairs(steps[0], steps[-1])]
         length += 1
         if terminated or truncated:
             lengths.append(length)
             if length == limit:
                 at_limit.append(terminated)
             length = 0
-            if (begun := _reset(env, found)) is None:
+            if (begun := _reset(env, problems)) is None:
                 return None
             info = begun[1]
     if len(at_limit) >= ENOUGH_EPISODES and all(at_limit):
@@ -223,67 +223,67 @@ def _play(env: gym.Env, found: dict[str, Finding], effort: Effort) -> list[SeenS
             "that is the limit and not the task, return terminated=False, truncated=True there, or what comes after is "
             "learned to have no value"
         )
-        found["limit"] = Finding("warning", text)
-    if len(seen) >= effort.most_steps and not lengths and limit is None:
+        problems["limit"] = Finding("warning", text)
+    if len(steps) >= effort.most_steps and not lengths and limit is None:
         text = (
             f"no episode ended in {effort.most_steps:,} steps; it declares no time limit, so give it one: "
             "gymnasium.register(..., max_episode_steps=1000), or gymnasium.wrappers.TimeLimit(env, 1000)"
         )
-        found["endless"] = Finding("warning", text)
-    return seen
+        problems["endless"] = Finding("warning", text)
+    return steps
 
 
-def _reset(env: gym.Env, found: dict[str, Finding]) -> tuple[Any, dict[str, Any]] | None:
+def _reset(env: gym.Env, problems: dict[str, Finding]) -> tuple[Any, dict[str, Any]] | None:
     """Resets the environment and checks its observation, which is returned with the info; None if it is unusable."""
     space = env.observation_space
-    answer = env.reset()
-    if (fault := validation.reset_fault(answer, space)) is not None:
-        found.setdefault("reset", Finding("error", fault))
-    has_info = isinstance(answer, tuple) and len(answer) == 2 and isinstance(answer[1], dict)
-    obs = answer[0] if has_info else answer
+    result = env.reset()
+    if (fault := validation.reset_fault(result, space)) is not None:
+        problems.setdefault("reset", Finding("error", fault))
+    has_info = isinstance(result, tuple) and len(result) == 2 and isinstance(result[1], dict)
+    obs = result[0] if has_info else result
     if validation.observation_fault(space, obs) is not None:
         return None
-    _check_observation(obs, space, found, "reset")
-    return obs, answer[1] if has_info else {}
+    _check_observation(obs, space, problems, "reset")
+    return obs, result[1] if has_info else {}
 
 
-def _check_step(answer: Any, space: gym.Space, found: dict[str, Finding]) -> bool:
+def _check_step(result: Any, space: gym.Space, problems: dict[str, Finding]) -> bool:
     """Checks the values of a step, and returns whether training could go on after it."""
-    faults = dict(validation.step_faults(answer, space, strict=True))
-    for kind, text in faults.items():
-        found.setdefault(kind, Finding("error", text))
-    if not isinstance(answer, tuple) or len(answer) != 5:
+    faults = dict(validation.step_faults(result, space, strict=True))
+    for name, text in faults.items():
+        problems.setdefault(name, Finding("error", text))
+    if not isinstance(result, tuple) or len(result) != 5:
         return False
-    obs, _, terminated, truncated, info = answer
+    obs, _, terminated, truncated, info = result
     if "step" not in faults:
-        _check_observation(obs, space, found, "step")
+        _check_observation(obs, space, problems, "step")
     success = info.get("is_success", info.get("success")) if isinstance(info, dict) else None
     if success is not None and (np.size(success) != 1 or np.asarray(success).dtype.kind not in "biuf"):
         text = (
             f"step returned the info {{'is_success': {success!r:.80}}}, expected one bool; an array counts as a success "
             "where all its numbers are at least 1, and what is no number as unknown"
         )
-        found.setdefault("success", Finding("warning", text))
+        problems.setdefault("success", Finding("warning", text))
     if isinstance(info, dict) and info.get("TimeLimit.truncated") and not truncated:
         text = (
             f"step returned info['TimeLimit.truncated']={info['TimeLimit.truncated']!r} with terminated={terminated} and "
             "truncated=False; return truncated=True where a time limit ended the episode"
         )
-        found.setdefault("folded", Finding("error", text))
-    return validation.step_fault(answer, space) is None
+        problems.setdefault("folded", Finding("error", text))
+    return validation.step_fault(result, space) is None
 
 
-def _check_observation(obs: Any, space: gym.Space, found: dict[str, Finding], said: str) -> None:
+def _check_observation(obs: Any, space: gym.Space, problems: dict[str, Finding], method: str) -> None:
     fault = validation.observation_fault(space, obs, strict=True)
     if fault is not None:
-        found.setdefault("observation", Finding("error", f"{said} returned {fault}"))
+        problems.setdefault("observation", Finding("error", f"{method} returned {fault}"))
     fault = validation.nonfinite_fault(space, obs)
     if fault is not None:
-        found.setdefault("finite", Finding("error", f"{said} returned {fault}"))
+        problems.setdefault("finite", Finding("error", f"{method} returned {fault}"))
     elif (outside := validation.bounds_fault(space, obs)) is not None:
         # Networks never see the bounds of a Box, but a choice that does not exist has no place in them.
         level, fault = outside
-        found.setdefault("bounds", Finding(level, f"{said} returned {fault}"))
+        problems.setdefault("bounds", Finding(level, f"{method} returned {fault}"))
 
 
 def known_limit(env: gym.Env) -> int | None:
@@ -309,16 +309,16 @@ def _gymnasium_messages(env: gym.Env, skip_render_check: bool) -> list[str]:
             check_gymnasium_env(env, skip_render_check=skip_render_check)
         except Exception as error:  # whatever it refuses by, such as its own mask, which that checker does not ask for
             refused = [] if attribute(env, masks.METHOD) or masks.MASK in env.reset()[1] else [f"{error}"]
-    said = [re.sub(r"\x1b\[[\d;]*m|WARN: ", "", str(one.message)) for one in caught] + refused
+    messages = [re.sub(r"\x1b\[[\d;]*m|WARN: ", "", str(warning.message)) for warning in caught] + refused
     return [
-        f"gymnasium.utils.env_checker: {' '.join(one.split())}"
-        for one in dict.fromkeys(said)
-        if "different from the unwrapped version" not in one
-        and "symmetric and normalized" not in one  # rejeu scales actions
+        f"gymnasium.utils.env_checker: {' '.join(message.split())}"
+        for message in dict.fromkeys(messages)
+        if "different from the unwrapped version" not in message
+        and "symmetric and normalized" not in message  # rejeu scales actions
     ]
 
 
-def goal_findings(env: gym.Env, seen: Sequence[SeenStep], keeps_infos: bool = False) -> list[Finding]:
+def goal_findings(env: gym.Env, steps: Sequence[SeenStep], keeps_infos: bool = False) -> list[Finding]:
     """Returns the problems with the goals of an environment, from some of its steps: the first of each function."""
     try:
         check_goal_space(env.observation_space)
@@ -331,8 +331,8 @@ def goal_findings(env: gym.Env, seen: Sequence[SeenStep], keeps_infos: bool = Fa
             "there is none; add it, for hindsight replay"
         )
         return [Finding("error", text)]
-    ended = [one for one in seen if one.terminated][: MOST_GOALS // 4]
-    rows = [*seen[:MOST_GOALS], *ended]
+    ended = [step for step in steps if step.terminated][: MOST_GOALS // 4]
+    rows = [*steps[:MOST_GOALS], *ended]
     env.reset()  # to another state than that of any step
     first = [next(_goal_faults(name, f, rows, keeps_infos), None) for name, f in functions.items()]
     if _lacks_terminated(env):
@@ -377,8 +377,8 @@ def _goal_faults(
     """Yields the problems with ``compute_reward`` or ``compute_terminated``, the worst first."""
     for row in rows:
         goals = copy.deepcopy(_goals(row))
-        own = one_number(function(*goals, row.info))
-        if (fault := _result_fault(name, own)) is not None:
+        result = one_number(function(*goals, row.info))
+        if (fault := _result_fault(name, result)) is not None:
             yield "error", f"{name} of one goal returned {fault}"
         if not all(map(np.array_equal, goals, _goals(row))):
             yield "error", f"{name} changes its arguments in place; compute new arrays: achieved_goal - desired_goal"
@@ -390,28 +390,28 @@ def _goal_faults(
                     f"{name} of the same two goals gave {before} after one step and {after} later: it reads something else, "
                     "such as the state of the environment; compute it from its arguments alone",
                 )
-        yield from _against_step(name, own, row)
-        alone = own if keeps_infos else _attempt(function, *_goals(row), {})
-        if not _agree(own, one_number(alone)):
+        yield from _against_step(name, result, row)
+        alone = result if keeps_infos else _attempt(function, *_goals(row), {})
+        if not _agree(result, one_number(alone)):
             yield (
                 "error",
-                f"{name} gave {own} with the info of the step, and {_describe_result(alone)} with an empty info; let it "
+                f"{name} gave {result} with the info of the step, and {_describe_result(alone)} with an empty info; let it "
                 "depend on the goals alone, or keep infos with replay_buffer_kwargs={'copy_info_dict': True}",
             )
     if not keeps_infos:
         yield from _against_batches(name, function, rows)
 
 
-def _against_step(name: str, own: Any, row: SeenStep) -> Iterator[tuple[Level, str]]:
+def _against_step(name: str, result: Any, row: SeenStep) -> Iterator[tuple[Level, str]]:
     """Yields the difference between a step and the function for one goal."""
-    if name == "compute_terminated" and own and not row.terminated:  # it may end otherwise, as in a crash
+    if name == "compute_terminated" and result and not row.terminated:  # it may end otherwise, as in a crash
         yield (
             "error",
             "compute_terminated gave True where step gave terminated=False; hindsight replay goes by the former: let step "
             "return it too",
         )
-    if name == "compute_reward" and not _agree(own, row.reward):
-        text = f"step gave the reward {row.reward}, and compute_reward of the same goals {own}"
+    if name == "compute_reward" and not _agree(result, row.reward):
+        text = f"step gave the reward {row.reward}, and compute_reward of the same goals {result}"
         if row.terminated:
             yield "warning", f"{text}, where the episode ended; hindsight replay will not know of the difference"
         yield "error", f"{text}; they must agree: let step call compute_reward"
@@ -422,8 +422,8 @@ def _against_batches(name: str, function: Callable[..., Any], rows: Sequence[See
     achieved, desired = (np.array([_goals(row)[k] for row in rows]) for k in range(2))
     achieved, desired = np.concatenate([achieved] * 2), np.concatenate([np.roll(desired, 1, axis=0), achieved])
     single = [one_number(_attempt(function, a, d, {})) for a, d in zip(achieved, desired, strict=True)]
-    for one in single:
-        if (fault := _result_fault(name, one)) is not None:
+    for result in single:
+        if (fault := _result_fault(name, result)) is not None:
             yield "error", f"{name} of goals of other steps returned {fault}; it must take any goals of the space"
     if name == "compute_reward" and _agree(single, single[0]):
         yield (
@@ -433,10 +433,10 @@ def _against_batches(name: str, function: Callable[..., Any], rows: Sequence[See
         )
     whole = _attempt(function, achieved, desired, {})
     if isinstance(whole, Exception) or not is_batch(whole, len(achieved)):
-        what = _describe_result(whole) if isinstance(whole, Exception) else f"gave {validation.describe_value(whole)}"
+        got = _describe_result(whole) if isinstance(whole, Exception) else f"gave {validation.describe_value(whole)}"
         yield (
             "warning",
-            f"{name} of {len(achieved)} goals at once {what}, expected numbers ({len(achieved)},); rejeu then calls it row by "
+            f"{name} of {len(achieved)} goals at once {got}, expected numbers ({len(achieved)},); rejeu then calls it row by "
             "row, which is slow: compute over the last axis, as np.linalg.norm(achieved - desired, axis=-1) does",
         )
     elif not _agree(whole, np.array(single)):
@@ -469,11 +469,11 @@ def _attempt(function: Callable[..., Any], *arguments: Any) -> Any:
         return error
 
 
-def _agree(one: Any, two: Any) -> bool:
+def _agree(a: Any, b: Any) -> bool:
     try:
-        first, second = np.asarray(one, np.float64), np.asarray(two, np.float64)
+        first, second = np.asarray(a, np.float64), np.asarray(b, np.float64)
     except (TypeError, ValueError):  # of errors, and of what is no number
-        return type(one) is type(two)
+        return type(a) is type(b)
     return bool(np.allclose(first, second, rtol=1e-4, atol=1e-5, equal_nan=True))
 
 
@@ -483,8 +483,8 @@ def _describe_result(result: Any) -> str:
 
 def advice_on_actions(space: spaces.Space) -> Iterator[str]:
     """Yields advice on unbounded actions, which only some algorithms take."""
-    for part in members(space) if isinstance(space, spaces.Dict | spaces.Tuple) else ():
-        yield from advice_on_actions(part)
+    for subspace in members(space) if isinstance(space, spaces.Dict | spaces.Tuple) else ():
+        yield from advice_on_actions(subspace)
     if isinstance(space, spaces.Box) and not bounded(space).all():
         yield (
             f"the actions {space} have no bounds, or practically none; SAC, TD3 and others refuse them, and PPO does not "
@@ -499,11 +499,11 @@ def advice_on_observations(space: spaces.Space, path: str = "", dtypes: bool = T
     """
     where = f" under {path!r}" if path else ""
     if isinstance(space, spaces.Dict | spaces.Tuple):
-        for key, part in space.spaces.items() if isinstance(space, spaces.Dict) else enumerate(space.spaces):
+        for key, subspace in space.spaces.items() if isinstance(space, spaces.Dict) else enumerate(space.spaces):
             name = f"{path}.{key}".lstrip(".")
-            if isinstance(part, spaces.Dict | spaces.Tuple):
+            if isinstance(subspace, spaces.Dict | spaces.Tuple):
                 yield f"the observation under {name!r} is nested; rejeu takes it, Stable-Baselines3 takes one level only"
-            yield from advice_on_observations(part, name, dtypes)
+            yield from advice_on_observations(subspace, name, dtypes)
     elif not isinstance(space, spaces.Box):
         return
     elif len(space.shape) == 3:

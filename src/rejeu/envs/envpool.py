@@ -15,7 +15,7 @@ from rejeu.core.spaces import cast, leaves
 from rejeu.core.validation import whole
 from rejeu.envs import goals as goals_module
 from rejeu.envs.action_log import MOST_IMAGE_STEPS, MOST_STEPS, ActionLog, replay
-from rejeu.envs.base import SEEDS_END, SUCCESS_KEYS, Seed, Step, VectorEnv, checked_seed, replaced, success_of
+from rejeu.envs.base import SEEDS_END, SUCCESS_KEYS, Seed, Step, VectorEnv, checked_seed, success_of, with_rows
 from rejeu.envs.goals import PARKED, GoalFunctions, parking_reward
 from rejeu.envs.registry import (
     import_envpool,
@@ -55,10 +55,10 @@ class EnvPool(VectorEnv):
     def _make(self, seed: int | Sequence[int]) -> Any:
         self._seed = seed
         # Environment i gets seed + i, an int32 in EnvPool.
-        taken = seed % (2**31 - self.n_envs) if isinstance(seed, int) else list(seed)
+        seeds = seed % (2**31 - self.n_envs) if isinstance(seed, int) else list(seed)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # the declared bounds of its spaces are rounded to float32
-            pool = import_envpool().make_gymnasium(self.env_id, num_envs=self.n_envs, seed=taken)
+            pool = import_envpool().make_gymnasium(self.env_id, num_envs=self.n_envs, seed=seeds)
             pool.observation_space, pool.action_space  # noqa: B018 - cached at the first access
         return pool
 
@@ -88,21 +88,21 @@ class EnvPool(VectorEnv):
         ids = np.flatnonzero(active).astype(np.int32)
         action = self._log.step(np.asarray(action)[ids], ids)
         obs, reward, terminated, truncated, info = self._pool.step(action, ids)  # rows in order of ids
-        self._obs = replaced(self._obs, ids, cast(self.observation_space, self._leaves, obs))
+        self._obs = with_rows(self._obs, ids, cast(self.observation_space, self._leaves, obs))
 
-        def spread(part: np.ndarray, dtype: Any) -> np.ndarray:
+        def spread(values: np.ndarray, dtype: Any) -> np.ndarray:
             whole = np.zeros(self.n_envs, dtype)
-            whole[ids] = part
+            whole[ids] = values
             return whole
 
-        said = {key: spread(info[key], info[key].dtype) for key in SUCCESS_KEYS if key in info}
-        return Step(self._obs, spread(reward, np.float32), spread(terminated, bool), spread(truncated, bool), said)
+        successes = {key: spread(info[key], info[key].dtype) for key in SUCCESS_KEYS if key in info}
+        return Step(self._obs, spread(reward, np.float32), spread(terminated, bool), spread(truncated, bool), successes)
 
     def reset_done(self, done: np.ndarray) -> Any:
         ended = np.flatnonzero(done).astype(np.int32)
         self._log.reset(ended)
         fresh = cast(self.observation_space, self._leaves, self._pool.reset(ended)[0])
-        self._obs = replaced(self._obs, ended, fresh)
+        self._obs = with_rows(self._obs, ended, fresh)
         return self._obs
 
     def snapshot(self) -> dict[str, Any] | None:
@@ -116,8 +116,8 @@ class EnvPool(VectorEnv):
             raise ValueError("the record of actions is not one of EnvPool")
         self._pool.close()
         self._pool, self._log = self._make(_saved_seed(saved["seed"], self.n_envs)), self._new_log()
-        for which, action in replay(self._log, saved, self.env_id):
-            active = np.isin(np.arange(self.n_envs), which) if which is not None else None
+        for indices, action in replay(self._log, saved, self.env_id):
+            active = np.isin(np.arange(self.n_envs), indices) if indices is not None else None
             if action is None:
                 self.reset() if active is None else self.reset_done(active)
             elif active is None:
@@ -149,7 +149,7 @@ def next_seed(seed: int | Sequence[int]) -> int | Sequence[int]:
     """Returns the seed of the next pool."""
     if isinstance(seed, int):
         return int(np.random.SeedSequence([seed, 1]).generate_state(1)[0])
-    return tuple(int(np.random.SeedSequence([one, 1]).generate_state(1)[0]) % SEEDS_END for one in seed)
+    return tuple(int(np.random.SeedSequence([env_seed, 1]).generate_state(1)[0]) % SEEDS_END for env_seed in seed)
 
 
 def _saved_seed(seed: Any, n_envs: int) -> int | Sequence[int]:
@@ -199,7 +199,7 @@ def reward_threshold(env_id: str, declared: float | None) -> float | None:
 def _corrected_bounds(space: gym.Space) -> gym.Space:
     """Returns a space with infinite bounds where EnvPool declares the smallest positive and the largest float."""
     if isinstance(space, gym.spaces.Dict):
-        return gym.spaces.Dict({key: _corrected_bounds(part) for key, part in space.spaces.items()})
+        return gym.spaces.Dict({key: _corrected_bounds(subspace) for key, subspace in space.spaces.items()})
     if isinstance(space, gym.spaces.Box) and space.dtype.kind == "f":
         limits = np.finfo(space.dtype)
         if (space.low == limits.tiny).all() and (space.high == limits.max).all():

@@ -55,14 +55,14 @@ def goal_functions(env: Any) -> GoalFunctions | None:
 def attribute(env: Any, name: str) -> Any:
     """Returns an attribute of an environment or of one of its wrappers, or None if there is none, or an abstract method."""
     try:
-        found = env.get_wrapper_attr(name)
+        value = env.get_wrapper_attr(name)
     except AttributeError:
         return None
-    return None if getattr(found, "__isabstractmethod__", False) else found
+    return None if getattr(value, "__isabstractmethod__", False) else value
 
 
 def goal_fault(name: str, error: Exception, goal: np.ndarray) -> BadEnvironmentError:
-    """Returns what to raise where a function of goals raises an error of one goal."""
+    """Returns the error to raise where a function of goals raises one of one goal."""
     if isinstance(error, KeyError):
         return BadEnvironmentError(
             f"{name} found no key {error}: the info is empty in hindsight replay; let it depend on the goals alone, or "

@@ -48,13 +48,13 @@ class GymnasiumVector(VectorEnv):
         self.observation_space = env.single_observation_space
         self.action_space = env.single_action_space
         self.backend = "gymnasium-async" if isinstance(unwrapped, AsyncVectorEnv) else "gymnasium"
-        one = unwrapped.envs[0] if env.spec is None and isinstance(unwrapped, gym.vector.SyncVectorEnv) else env
-        self.env_id, self.max_episode_steps, self.reward_threshold = describe_spec(one)
+        single_env = unwrapped.envs[0] if env.spec is None and isinstance(unwrapped, gym.vector.SyncVectorEnv) else env
+        self.env_id, self.max_episode_steps, self.reward_threshold = describe_spec(single_env)
         self._seed = seed
         self._leaves = leaves(self.observation_space)
         self._after_reset: Any = None
         self._reset_info: Any = None
-        """What the last reset said besides, or the last step that contained one."""
+        """The info of the last reset, or of the last step that contained one."""
         self._flags = (np.zeros(self.n_envs, bool),) * 2
         """Flags of terminated and of truncated environments that await a reset. All False with automatic resets."""
         self._desynced = np.zeros(self.n_envs, bool)
@@ -66,24 +66,24 @@ class GymnasiumVector(VectorEnv):
         seed = self._seed if seed is None else seed
         self._seed = None
         # Other classes of vector environments may not accept a list.
-        given = seed if seed is None or isinstance(seed, int) else each_seed(seed, self.n_envs)
-        self._obs = self._after_reset = self._reset(seed=given)
+        seeds = seed if seed is None or isinstance(seed, int) else each_seed(seed, self.n_envs)
+        self._obs = self._after_reset = self._reset(seed=seeds)
         self._flags = (np.zeros(self.n_envs, bool),) * 2
         self._desynced = np.zeros(self.n_envs, bool)
         return self._obs
 
     def _step_all(self, action: np.ndarray) -> Step:
         self.n_steps += 1
-        answer = self._called(self.env.step, action)
+        result = self._called(self.env.step, action)
         try:
-            obs, reward, terminated, truncated, info = answer
+            obs, reward, terminated, truncated, info = result
             obs = validation.to_batch(self.observation_space, self._leaves, self.n_envs, obs)
             reward = validation.to_vector("rewards", reward, self.n_envs, np.float32)
             terminated = validation.to_vector("terminated", terminated, self.n_envs, bool)
             truncated = validation.to_vector("truncated", truncated, self.n_envs, bool)
         except ValueError:
             raise self._bad(
-                None, f"step returned {validation.describe_value(answer)}, expected {validation.STEP_VALUES}"
+                None, f"step returned {validation.describe_value(result)}, expected {validation.STEP_VALUES}"
             ) from None
         except BadEnvironmentError as error:
             raise self._bad(None, f"step returned {error}") from error.__cause__
@@ -94,8 +94,8 @@ class GymnasiumVector(VectorEnv):
                 obs = jax.tree.map(np.copy, obs)
                 for i in done.tolist():
                     final = plain(self.observation_space, info["final_obs"][i])
-                    for store, part in zip(jax.tree.leaves(obs), jax.tree.leaves(final), strict=True):
-                        store[i] = part
+                    for store, final_leaf in zip(jax.tree.leaves(obs), jax.tree.leaves(final), strict=True):
+                        store[i] = final_leaf
         else:
             self._flags = terminated, truncated
         self._obs = obs
@@ -144,12 +144,12 @@ class GymnasiumVector(VectorEnv):
             pending = vars(vector)["_state"]
             if pending != AsyncState.DEFAULT:  # an interrupted call has asked for something
                 getattr(vector, f"{pending.value}_wait")()
-        answer = self._called(self.env.reset, **arguments)
-        if not isinstance(answer, tuple) or len(answer) != 2:
-            raise self._bad(None, f"reset returned {validation.describe_value(answer)}, expected (obs, info)")
-        self._reset_info = answer[1]
+        result = self._called(self.env.reset, **arguments)
+        if not isinstance(result, tuple) or len(result) != 2:
+            raise self._bad(None, f"reset returned {validation.describe_value(result)}, expected (obs, info)")
+        self._reset_info = result[1]
         try:
-            return validation.to_batch(self.observation_space, self._leaves, self.n_envs, answer[0])
+            return validation.to_batch(self.observation_space, self._leaves, self.n_envs, result[0])
         except BadEnvironmentError as error:
             raise self._bad(None, f"reset returned {error}") from error.__cause__
 
@@ -183,8 +183,8 @@ class GymnasiumVector(VectorEnv):
 
     def success(self, step: Step, env: int) -> float:
         info = step.info.get("final_info", step.info) if self._same_step else step.info
-        known = [key for key in base.SUCCESS_KEYS if key in info and info.get(f"_{key}", np.ones(self.n_envs))[env]]
-        return base.success_of({key: info[key][env] for key in known})
+        keys = [key for key in base.SUCCESS_KEYS if key in info and info.get(f"_{key}", np.ones(self.n_envs))[env]]
+        return base.success_of({key: info[key][env] for key in keys})
 
     def goals(self) -> GoalFunctions | None:
         unwrapped = self.env.unwrapped

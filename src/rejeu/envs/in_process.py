@@ -76,35 +76,35 @@ class InProcess(VectorEnv):
 
     def _reset(self, i: int, seed: int | None = None) -> None:
         try:
-            answer = validation.called_reset(self.envs[i], seed)
+            result = validation.called_reset(self.envs[i], seed)
         except BadEnvironmentError as error:
             raise self._bad(i, str(error), error) from error.__cause__
         try:
-            obs, info = answer
-            if type(answer) is not tuple or not isinstance(info, dict):
+            obs, info = result
+            if type(result) is not tuple or not isinstance(info, dict):
                 raise TypeError("not a tuple of an observation and a dict")
             self._put(i, obs)
         except Exception as error:  # any exception of NumPy for a value of the wrong type or shape
-            raise self._bad(i, validation.reset_fault(answer, self.observation_space), error) from error
+            raise self._bad(i, validation.reset_fault(result, self.observation_space), error) from error
 
     def _step_some(self, action: np.ndarray, active: np.ndarray) -> Step:
         return self._step_all(action, np.flatnonzero(active).tolist())
 
-    def _step_all(self, action: np.ndarray, which: Sequence[int] | None = None) -> Step:
-        """Steps the environments with the indices ``which``, None for all."""
+    def _step_all(self, action: np.ndarray, indices: Sequence[int] | None = None) -> Step:
+        """Steps the environments with these ``indices``, None for all."""
         reward = np.zeros(self.n_envs, np.float32)
         terminated = np.zeros(self.n_envs, bool)
         truncated = np.zeros(self.n_envs, bool)
         info: list[dict[str, Any]] = [{}] * self.n_envs
         self.n_steps += 1
         action = rows(action)
-        for i in range(self.n_envs) if which is None else which:
-            answer = self.envs[i].step(action[i])
+        for i in range(self.n_envs) if indices is None else indices:
+            result = self.envs[i].step(action[i])
             try:
-                obs, reward[i], terminated[i], truncated[i], info[i] = convert_step(answer)
+                obs, reward[i], terminated[i], truncated[i], info[i] = convert_step(result)
                 self._put(i, obs)
             except Exception as error:  # any exception of NumPy for a value of the wrong type or shape
-                raise self._bad(i, validation.step_fault(answer, self.observation_space), error) from error
+                raise self._bad(i, validation.step_fault(result, self.observation_space), error) from error
         return Step(self._obs, reward, terminated, truncated, info)
 
     def _bad(self, i: int, fault: str | None, error: Exception) -> BadEnvironmentError:
@@ -123,12 +123,12 @@ class InProcess(VectorEnv):
 
     def snapshot(self) -> list[Any] | None:
         states = [snapshot.state_of(env) for env in self.envs]
-        return None if any(one is None for one in states) else states
+        return None if any(state is None for state in states) else states
 
     def restore(self, saved: Any, obs: Any) -> list[int]:
         snapshot.check_count(saved, self.n_envs)
-        for env, one in zip(self.envs, saved, strict=True):
-            snapshot.restore(env, one)
+        for env, state in zip(self.envs, saved, strict=True):
+            snapshot.restore(env, state)
         for store, leaf in zip(self._stores, jax.tree.leaves(obs), strict=True):
             store[...] = leaf
         self._seed = None  # they were reset in another process

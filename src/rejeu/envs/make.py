@@ -27,7 +27,7 @@ from rejeu.envs.workers.remote import Actors
 from rejeu.envs.workers.vector import InWorkers as InWorkers
 
 KINDS = "an id, a Gymnasium environment, a function that makes one or a vector environment"
-"""What the functions that make vector environments take."""
+"""The values that the functions that make vector environments take."""
 Backend = Literal["auto", "envpool", "gymnasium", "gymnasium-async", "jax", "ray"]
 BACKENDS: tuple[Backend, ...] = ("auto", "envpool", "gymnasium", "gymnasium-async", "jax", "ray")
 WORKERS: tuple[Backend, ...] = ("gymnasium-async", "ray")
@@ -41,14 +41,14 @@ Adapter = Callable[[Any, Any], VectorEnv]
 _adapters: dict[type, Adapter] = {}
 
 
-def register_adapter(kind: type, adapter: Adapter) -> None:
+def register_adapter(env_class: type, adapter: Adapter) -> None:
     """Lets :func:`make_vector`, and so the agents, accept vector environments of another package's class."""
-    _adapters[kind] = adapter
+    _adapters[env_class] = adapter
 
 
 def adapter_of(env: Any) -> Adapter | None:
     """Returns the adapter for an object, or None if none is registered for its class."""
-    return next((adapter for kind, adapter in _adapters.items() if isinstance(env, kind)), None)
+    return next((adapter for env_class, adapter in _adapters.items() if isinstance(env, env_class)), None)
 
 
 class WorkerOptions(NamedTuple):
@@ -124,7 +124,7 @@ make_vec = make_vector
 def _made(
     env: Any, n_envs: int, backend: Backend, seed: Seed, workers: WorkerOptions, env_kwargs: dict[str, Any]
 ) -> VectorEnv:
-    """Returns what :func:`make_vector` does, for arguments that were checked."""
+    """Returns the vector environment of :func:`make_vector`, for arguments that were checked."""
     if isinstance(env, VectorEnv):
         return env
     if (adapter := adapter_of(env)) is not None:

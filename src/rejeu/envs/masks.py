@@ -81,23 +81,23 @@ class MaskInObservation(gym.Wrapper[Any, Any, Any, Any]):
         method = None if MASK in info else attribute(self.env, METHOD)
         if MASK not in info and method is None:
             raise BadEnvironmentError(f"{id_of(self.env)} {NO_MASKS}")
-        given = info[MASK] if method is None else method()  # an AttributeError in it is the environment's own
-        return flat_mask(given, self.action_space, id_of(self.env), over)
+        mask = info[MASK] if method is None else method()  # an AttributeError in it is the environment's own
+        return flat_mask(mask, self.action_space, id_of(self.env), over)
 
 
-def flat_mask(given: Any, space: spaces.Space, env_id: str, over: bool) -> np.ndarray:
+def flat_mask(mask: Any, space: spaces.Space, env_id: str, over: bool) -> np.ndarray:
     """Returns the mask that an environment gave, an array or a list of arrays, as ``int8 (n_choices,)``.
 
     Raises:
         BadEnvironmentError: if it has another length or, unless the episode is ``over``, allows no action.
     """
     n = n_choices(space, env_id)
-    mask = np.concatenate([np.asarray(part).ravel() for part in given]) if isinstance(given, list | tuple) else given
-    mask = np.asarray(mask).ravel().astype(np.int8)
+    masks = mask if isinstance(mask, list | tuple) else [mask]
+    mask = np.concatenate([np.asarray(choices).ravel() for choices in masks]).astype(np.int8)
     if mask.shape != (n,):
         raise BadEnvironmentError(f"{env_id} gave a mask of {mask.size} entries, expected {n} for {space}")
     sizes = space.nvec.ravel() if isinstance(space, spaces.MultiDiscrete) else [n]
-    is_some_allowed = all(part.any() for part in np.split(mask, np.cumsum(sizes)[:-1]))
+    is_some_allowed = all(choices.any() for choices in np.split(mask, np.cumsum(sizes)[:-1]))
     if not (over or is_some_allowed or isinstance(space, spaces.MultiBinary)):
         raise BadEnvironmentError(f"{env_id} allows no action: its mask is {mask.tolist()}")
     return mask
@@ -110,15 +110,15 @@ def sampled(env: gym.Env, info: Any) -> Any:
         BadEnvironmentError: if its mask is invalid.
     """
     space, method = env.action_space, attribute(env, METHOD)
-    given = info[MASK] if isinstance(info, dict) and MASK in info else method() if callable(method) else None
-    if given is None or not isinstance(space, spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary):
+    env_mask = info[MASK] if isinstance(info, dict) and MASK in info else method() if callable(method) else None
+    if env_mask is None or not isinstance(space, spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary):
         return space.sample()
-    mask = flat_mask(given, space, id_of(env), over=False)
+    mask = flat_mask(env_mask, space, id_of(env), over=False)
     if not isinstance(space, spaces.MultiDiscrete):
         return space.sample() * mask.reshape(space.shape) if space.shape else space.sample(mask=mask)
     masks = np.split(mask, np.cumsum(space.nvec.ravel())[:-1])
-    chosen = np.reshape([space.np_random.choice(np.flatnonzero(one)) for one in masks], space.shape)
-    return (chosen + space.start).astype(space.dtype)
+    action = np.reshape([space.np_random.choice(np.flatnonzero(choices)) for choices in masks], space.shape)
+    return (action + space.start).astype(space.dtype)
 
 
 snapshot.REMEMBERED[MaskInObservation] = {}
@@ -160,25 +160,25 @@ class MaskedVector(VectorEnv):
     def _step_some(self, action: np.ndarray, active: np.ndarray) -> Step:
         return self._after(self.inner.step(action, active), np.flatnonzero(active))
 
-    def _after(self, step: Step, which: np.ndarray) -> Step:
-        return step._replace(obs=self._masked(step.obs, which, step.terminated | step.truncated))
+    def _after(self, step: Step, indices: np.ndarray) -> Step:
+        return step._replace(obs=self._masked(step.obs, indices, step.terminated | step.truncated))
 
     def reset_done(self, done: np.ndarray) -> Masked:
         return self._masked(self.inner.reset_done(done), np.flatnonzero(done))
 
-    def _masked(self, obs: Any, which: np.ndarray, over: np.ndarray | None = None) -> Masked:
-        """Returns observations with their masks, of which those of ``which`` are new; ``over`` is None after a reset."""
+    def _masked(self, obs: Any, indices: np.ndarray, over: np.ndarray | None = None) -> Masked:
+        """Returns observations with their masks, of which those of ``indices`` are new; ``over`` is None after a reset."""
         if self._mask is None:
             return masked(obs)
         infos, ended = self.inner.infos(begun=over is None), np.zeros(self.n_envs, bool) if over is None else over
-        asked = [i for i in which.tolist() if MASK not in infos[i] and not ended[i]]
+        asked = [i for i in indices.tolist() if MASK not in infos[i] and not ended[i]]
         try:
             called = self.inner.call(METHOD) if asked else []
         except AttributeError as error:
             raise BadEnvironmentError(f"{self.env_id} {NO_MASKS}") from error
-        for i in which.tolist():
-            given = called[i] if i in asked else infos[i].get(MASK)
-            self._mask[i] = True if given is None else flat_mask(given, self.action_space, self.env_id, ended[i])
+        for i in indices.tolist():
+            mask = called[i] if i in asked else infos[i].get(MASK)
+            self._mask[i] = True if mask is None else flat_mask(mask, self.action_space, self.env_id, ended[i])
         return Masked(obs, self._mask.copy())
 
     def success(self, step: Step, env: int) -> float:
@@ -206,7 +206,7 @@ class MaskedVector(VectorEnv):
 
 
 def masked(obs: dict[str, Any]) -> Masked:
-    """Returns what :class:`MaskInObservation` shows as an observation with its mask, ``bool (n_envs, n)``."""
+    """Returns observations of :class:`MaskInObservation` with their masks, ``bool (n_envs, n)``."""
     return Masked(obs[OBSERVATION], obs[MASK].astype(bool))
 
 
@@ -276,9 +276,9 @@ def make_masked(
         env = maker(env)
     if not callable(env):
         raise TypeError(f"env must be an id, an environment or a function that makes one, got {type(env).__name__}")
-    chosen: Backend = "gymnasium" if backend in ("auto", "envpool") else backend
+    backend = "gymnasium" if backend in ("auto", "envpool") else backend
     vector = make_vector(
-        partial(with_mask, env), n_envs, chosen, seed, worker_timeout=worker_timeout, restart_workers=restart_workers
+        partial(with_mask, env), n_envs, backend, seed, worker_timeout=worker_timeout, restart_workers=restart_workers
     )
     masked = MaskedVector(vector)
     masked.made_from = made_from
@@ -312,8 +312,8 @@ class FunctionalMask(FunctionalEnv):
         return state, self._observe(state, obs)
 
     def step(self, key: Array, state: Any, action: Array) -> tuple[Any, Any, Array, Array, Array]:
-        state, obs, *rest = self.env.step(key, state, action)
-        return state, self._observe(state, obs), *rest
+        state, obs, *result = self.env.step(key, state, action)
+        return state, self._observe(state, obs), *result
 
     def success(self, state: Any) -> Array | None:
         return self.env.success(state)

@@ -18,8 +18,8 @@ class GoalObservation(KinematicsGoalObservation):
 
     def observe(self) -> dict[str, np.ndarray]:
         car = self.observer_vehicle
-        found = [[one.to_dict()[feature] for feature in self.features] for one in (car, car.goal)]
-        achieved, desired = np.array(found) / self.scales
+        features = [[vehicle.to_dict()[feature] for feature in self.features] for vehicle in (car, car.goal)]
+        achieved, desired = np.array(features) / self.scales
         return {"observation": achieved, "achieved_goal": achieved.copy(), "desired_goal": desired}
 
 

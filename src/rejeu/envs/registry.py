@@ -95,9 +95,9 @@ def register(env_id: str) -> bool:
 def _compare_joints() -> None:
     """Lets Gymnasium-Robotics tell kinds of joints, which equal no NumPy integer any more in MuJoCo 3.12 and later."""
     mujoco = importlib.import_module("mujoco")
-    kinds = SimpleNamespace(**{name: int(kind) for name, kind in mujoco.mjtJoint.__members__.items()})
+    joint_types = SimpleNamespace(**{name: int(joint) for name, joint in mujoco.mjtJoint.__members__.items()})
     utils = importlib.import_module("gymnasium_robotics.utils.mujoco_utils")
-    utils.mujoco = SimpleNamespace(**{**vars(mujoco), "mjtJoint": kinds})  # type: ignore[attr-defined]
+    utils.mujoco = SimpleNamespace(**{**vars(mujoco), "mjtJoint": joint_types})  # type: ignore[attr-defined]
 
 
 def _without_notice(module: str) -> None:
@@ -200,8 +200,8 @@ def unknown_environment(env_id: str) -> str:
         return "; ".join(filter(None, (text, elsewhere)))
     if elsewhere:
         return f"Gymnasium has no {env_id}, so it cannot be drawn or stepped by Gymnasium; {elsewhere}"
-    known = {*gym.registry, "parking-v0", "FetchReach-v4", "FetchPush-v4"}
-    near = difflib.get_close_matches(env_id, known, n=3, cutoff=0.5)
+    env_ids = {*gym.registry, "parking-v0", "FetchReach-v4", "FetchPush-v4"}
+    near = difflib.get_close_matches(env_id, env_ids, n=3, cutoff=0.5)
     hint = f"did you mean {' or '.join(near)}?" if near else "rejeu list shows the environments that have presets"
     return f"no environment is called {env_id!r}; {hint}"
 
@@ -264,10 +264,10 @@ def _tables_of_envpool() -> dict[str, Path]:
     if entry is None or not entry.is_file():
         return {}
     statements = ast.parse(entry.read_text(encoding="utf-8")).body[1:]  # the first is the docstring
-    names = [alias.name for one in statements if isinstance(one, ast.Import) for alias in one.names]
+    names = [alias.name for statement in statements if isinstance(statement, ast.Import) for alias in statement.names]
     files = {name: entry.parents[1].joinpath(*name.split(".")).with_suffix(".py") for name in names}
     are_tables = all(path.name == "registration.py" and path.is_file() for path in files.values())
-    return files if are_tables and all(isinstance(one, ast.Import) for one in statements) else {}
+    return files if are_tables and all(isinstance(statement, ast.Import) for statement in statements) else {}
 
 
 def is_envpool_installed() -> bool:

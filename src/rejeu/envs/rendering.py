@@ -137,14 +137,14 @@ def explain_mujoco_errors(env: gym.Env) -> Iterator[None]:
             warnings.filterwarnings("ignore", r"\(\d+\) b'")  # GLFW's, which the error below explains
             yield
     except Exception as error:
-        kind = type(error)
-        if (kind.__module__, kind.__name__) != ("mujoco", "FatalError"):
+        error_type = type(error)
+        if (error_type.__module__, error_type.__name__) != ("mujoco", "FatalError"):
             raise
-        chosen = os.environ.get("MUJOCO_GL")
+        opengl = os.environ.get("MUJOCO_GL")
         fix = "set the environment variable MUJOCO_GL=egl (or osmesa) before starting Python"
-        if chosen is None:
+        if opengl is None:
             fix = f"install EGL (on Debian and Ubuntu libegl1) or OSMesa (libosmesa6), or {fix}"
         raise ValueError(
-            f"{env} cannot be rendered: MuJoCo has no OpenGL context with MUJOCO_GL={chosen or '(unset)'}, expected a display "
+            f"{env} cannot be rendered: MuJoCo has no OpenGL context with MUJOCO_GL={opengl or '(unset)'}, expected a display "
             f"or an offscreen renderer; {fix}"
         ) from error

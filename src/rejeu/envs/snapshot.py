@@ -118,7 +118,7 @@ def _state(layer: Any) -> Any:
 
 
 def _answer(get: Callable[[], Any]) -> dict[str, Any] | None:
-    """Returns what a method of the environment says of its state; None, with a warning, if it is no dict of plain data.
+    """Returns the state of an environment by its method; None, with a warning, if that is no dict of plain data.
 
     Some environments have a method of that name for other purposes.
     """
@@ -139,13 +139,13 @@ def restore(env: gym.Env, layers: list[Any]) -> None:
         DivergedError: if the environment's own method fails.
         ValueError: if the environment has other layers, or the state is invalid.
     """
-    own = [*layers_of(env)]
-    if len(layers) != len(own) or not all(isinstance(state, dict) for state in layers):
+    env_layers = [*layers_of(env)]
+    if len(layers) != len(env_layers) or not all(isinstance(state, dict) for state in layers):
         raise ValueError(f"the state is of another environment than {env}")
-    for layer, state in zip(own, layers, strict=True):
+    for layer, state in zip(env_layers, layers, strict=True):
         _restore(layer, state)
-    if not answers_for_itself(own[-1]) and layers[-1]["rng"] is not None:
-        own[-1].np_random.bit_generator.state = layers[-1]["rng"]
+    if not answers_for_itself(env_layers[-1]) and layers[-1]["rng"] is not None:
+        env_layers[-1].np_random.bit_generator.state = layers[-1]["rng"]
 
 
 def _restore(layer: Any, state: dict[str, Any]) -> None:
@@ -199,9 +199,9 @@ def check_types(layer: gym.Env, state: Mapping[str, Any], types: Mapping[str, An
     """
     if {*state} != {*types}:
         raise ValueError(f"the state of {type(layer).__name__} has {sorted(state)}, expected {sorted(types)}")
-    for name, kind in types.items():
+    for name, value_type in types.items():
         try:
-            msgspec.convert(np.asarray(state[name]).tolist(), kind)
+            msgspec.convert(np.asarray(state[name]).tolist(), value_type)
         except msgspec.ValidationError as error:
             value = str(state[name])[:40]
             raise ValueError(f"{name} of {type(layer).__name__} cannot be {value!r}: {error}") from None
@@ -227,22 +227,22 @@ def is_mujoco(layer: gym.Env) -> bool:
 def _mujoco_state(env: Any) -> dict[str, Any]:
     import mujoco
 
-    kind = mujoco.mjtState.mjSTATE_INTEGRATION
-    state = np.zeros(mujoco.mj_stateSize(env.model, kind))
-    mujoco.mj_getState(env.model, env.data, state, kind)
+    spec = mujoco.mjtState.mjSTATE_INTEGRATION
+    state = np.zeros(mujoco.mj_stateSize(env.model, spec))
+    mujoco.mj_getState(env.model, env.data, state, spec)
     return {"integration": state}
 
 
 def _put_mujoco(env: Any, state: dict[str, Any]) -> None:
     import mujoco
 
-    kind = mujoco.mjtState.mjSTATE_INTEGRATION
-    given = state.get("integration")
-    if not isinstance(given, np.ndarray) or given.shape != (mujoco.mj_stateSize(env.model, kind),):
+    spec = mujoco.mjtState.mjSTATE_INTEGRATION
+    numbers = state.get("integration")
+    if not isinstance(numbers, np.ndarray) or numbers.shape != (mujoco.mj_stateSize(env.model, spec),):
         raise ValueError(f"the state is of another model than {type(env).__name__}'s")
-    mujoco.mj_setState(env.model, env.data, given, kind)
+    mujoco.mj_setState(env.model, env.data, numbers, spec)
     mujoco.mj_forward(env.model, env.data)
-    mujoco.mj_setState(env.model, env.data, given, kind)  # mj_forward changed the warm start of the solver
+    mujoco.mj_setState(env.model, env.data, numbers, spec)  # mj_forward changed the warm start of the solver
 
 
 def fingerprint(env: Any) -> int:
@@ -251,17 +251,17 @@ def fingerprint(env: Any) -> int:
     It is computed from all numbers, strings and arrays within the Python objects that are reached from ``env``, the nearest
     ones first. What only objects of other languages hold is not seen; counters of wrappers such as ``TimeLimit`` are.
     """
-    seen, waiting, digest = dict[int, Any](), deque([env]), 0  # seen keeps objects, so that no other gets their id
-    while waiting and len(seen) < MOST_OBJECTS:
+    visited, waiting, digest = dict[int, Any](), deque([env]), 0  # seen keeps objects, so that no other gets their id
+    while waiting and len(visited) < MOST_OBJECTS:
         value, content = waiting.popleft(), b""
         if isinstance(value, bool | int | float | str | bytes | np.generic | None):
             content = repr(value).encode()
         elif isinstance(value, np.ndarray) and value.dtype.kind != "O":
             content = value.ravel()[:: 1 + value.size // MOST_NUMBERS].tobytes()
-        elif id(value) not in seen and not isinstance(
+        elif id(value) not in visited and not isinstance(
             value, type | types.ModuleType | gym.Space
         ):  # no step changes these
-            seen[id(value)], content = value, type(value).__qualname__.encode()
+            visited[id(value)], content = value, type(value).__qualname__.encode()
             items = [len(value), *value] if isinstance(value, dict | list | tuple | set | deque) else []
             items += value.values() if isinstance(value, dict) else []
             inside = (

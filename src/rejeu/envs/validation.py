@@ -1,4 +1,4 @@
-"""What environments may return: what is accepted, how it is converted and written into batches, what is wrong with the rest.
+"""The values that environments may return: what is accepted, how it is converted and written into batches, and faults.
 
 Every function named ``*_fault`` returns one sentence that says what was received, what was expected and how to fix it, or
 None where nothing is wrong. Those functions run once something has failed, and in :func:`rejeu.check_env`; while all is well,
@@ -51,12 +51,12 @@ def to_array(value: Any, leaf: Leaf) -> np.ndarray:
     return as_stored(array, leaf)
 
 
-def convert_step(answer: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+def convert_step(result: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
     """Returns the five values that ``step`` returned, with reward and flags as Python scalars.
 
     Raises any exception if they are invalid; :func:`step_fault` then describes what is wrong.
     """
-    obs, reward, terminated, truncated, info = answer
+    obs, reward, terminated, truncated, info = result
     # A copy of the info, because an environment may empty its only dict at the next reset.
     return obs, to_reward(reward), to_bool(terminated), to_bool(truncated), {**info}
 
@@ -103,8 +103,8 @@ def make_writer(space: spaces.Space, stores: Sequence[np.ndarray]) -> Callable[[
     observation; :func:`observation_fault` then describes what is wrong.
     """
     slots = [
-        (store, leaf, math.prod(leaf.shape), part.dtype if is_free(leaf, part) else None, np.ndarray)
-        for store, leaf, part in zip(stores, leaves(space), parts(space, space), strict=True)
+        (store, leaf, math.prod(leaf.shape), subspace.dtype if is_free(leaf, subspace) else None, np.ndarray)
+        for store, leaf, subspace in zip(stores, leaves(space), parts(space, space), strict=True)
     ]
     store, leaf, size, dtype, array = slots[0]
 
@@ -115,10 +115,10 @@ def make_writer(space: spaces.Space, stores: Sequence[np.ndarray]) -> Callable[[
         store[i] = obs
 
     def put_parts(i: int, obs: Any) -> None:
-        for (store, leaf, size, dtype, array), part in zip(slots, parts(space, obs), strict=True):
-            if type(part) is not array or part.size != size or part.dtype is not dtype:
-                part = to_array(part, leaf)
-            store[i] = part
+        for (store, leaf, size, dtype, array), value in zip(slots, parts(space, obs), strict=True):
+            if type(value) is not array or value.size != size or value.dtype is not dtype:
+                value = to_array(value, leaf)
+            store[i] = value
 
     return put_parts if isinstance(space, spaces.Dict | spaces.Tuple) else put_array
 
@@ -129,7 +129,7 @@ def is_free(leaf: Leaf, space: spaces.Space) -> bool:
 
 
 def called_reset(env: gym.Env, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
-    """Returns what ``reset`` returns, given ``seed`` and ``options`` only if they are not None.
+    """Returns the result of ``reset``, given ``seed`` and ``options`` only if they are not None.
 
     Raises:
         BadEnvironmentError: if it does not accept a seed, or not this one.
@@ -175,10 +175,10 @@ def reset_env(
     Raises:
         BadEnvironmentError: if it does not accept a seed, or does not return an observation of its space and a dict.
     """
-    answer = called_reset(env, seed, options)
-    if (fault := reset_fault(answer, env.observation_space)) is not None:
+    result = called_reset(env, seed, options)
+    if (fault := reset_fault(result, env.observation_space)) is not None:
         raise BadEnvironmentError(fault)
-    return answer
+    return result
 
 
 def step_env(env: gym.Env, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -187,18 +187,18 @@ def step_env(env: gym.Env, action: Any) -> tuple[Any, float, bool, bool, dict[st
     Raises:
         BadEnvironmentError: if ``step`` does not return the five values, or the observation does not match its space.
     """
-    answer = env.step(action)
-    if (fault := step_fault(answer, env.observation_space)) is not None:
+    result = env.step(action)
+    if (fault := step_fault(result, env.observation_space)) is not None:
         raise BadEnvironmentError(fault)
-    return convert_step(answer)
+    return convert_step(result)
 
 
 def copy_observation(space: spaces.Space, obs: Any) -> Any:
     """Returns a copy of a valid observation, in which every leaf can be cast to the declared dtype."""
     if isinstance(space, spaces.Dict):
-        return {key: copy_observation(part, obs[key]) for key, part in space.spaces.items()}
+        return {key: copy_observation(subspace, obs[key]) for key, subspace in space.spaces.items()}
     if isinstance(space, spaces.Tuple):
-        return tuple(copy_observation(part, one) for part, one in zip(space.spaces, obs, strict=True))
+        return tuple(copy_observation(subspace, value) for subspace, value in zip(space.spaces, obs, strict=True))
     dtype = np.dtype(space.dtype)
     if isinstance(obs, np.ndarray) and np.can_cast(obs.dtype, dtype, "same_kind"):
         return obs.copy()
@@ -234,15 +234,15 @@ def to_vector(name: str, values: Any, n_envs: int, dtype: Any) -> np.ndarray:
     """
     array = np.asarray(values)
     if array.shape != (n_envs,) or array.dtype.kind not in ("fiub" if dtype == np.float32 else "iub"):
-        kind = "numbers" if dtype == np.float32 else "bools"
-        raise BadEnvironmentError(f"{name} as {describe_value(values)}, expected {kind} of shape ({n_envs},)")
+        wanted = "numbers" if dtype == np.float32 else "bools"
+        raise BadEnvironmentError(f"{name} as {describe_value(values)}, expected {wanted} of shape ({n_envs},)")
     with np.errstate(over="ignore"):
-        kept = array.astype(dtype, copy=False)
-    if dtype == np.float32 and not math.isfinite(np.vdot(kept, kept)):
-        large = array[np.isinf(kept) & np.isfinite(array)]
+        vector = array.astype(dtype, copy=False)
+    if dtype == np.float32 and not math.isfinite(np.vdot(vector, vector)):
+        large = array[np.isinf(vector) & np.isfinite(array)]
         if large.size:
             raise BadEnvironmentError(reward_fault(large[0].item()))
-    return kept
+    return vector
 
 
 def environment_fault(env: Any, expected: str = "a gymnasium.Env") -> str | None:
@@ -280,7 +280,7 @@ def arguments_fault(env: gym.Env) -> str | None:
         parameters = inspect.signature(layer.reset).parameters
         needed = ("seed",) if layer is env else ("seed", "options")  # of which wrappers pass on both
         missing = [name for name in needed if name not in parameters]
-        if missing and all(one.kind is not one.VAR_KEYWORD for one in parameters.values()):
+        if missing and all(parameter.kind is not parameter.VAR_KEYWORD for parameter in parameters.values()):
             return (
                 f"{type(layer).__name__}.reset({', '.join(parameters)}) takes no {missing[0]}, expected "
                 "reset(*, seed=None, options=None); add the arguments, and call super().reset(seed=seed) in it"
@@ -289,32 +289,32 @@ def arguments_fault(env: gym.Env) -> str | None:
     return None
 
 
-def reset_fault(answer: Any, space: spaces.Space) -> str | None:
+def reset_fault(result: Any, space: spaces.Space) -> str | None:
     """Describes what is wrong with what ``reset`` returned."""
-    if not isinstance(answer, tuple) or len(answer) != 2 or not isinstance(answer[1], dict):
-        only = observation_fault(space, answer) is None
-        what = "the observation only" if only else f"{describe_value(answer)}"
-        return f"reset returned {what}, expected (obs, info); return obs, {{}} if there is nothing to say"
-    fault = observation_fault(space, answer[0])
+    if not isinstance(result, tuple) or len(result) != 2 or not isinstance(result[1], dict):
+        only = observation_fault(space, result) is None
+        got = "the observation only" if only else f"{describe_value(result)}"
+        return f"reset returned {got}, expected (obs, info); return obs, {{}} if there is nothing to say"
+    fault = observation_fault(space, result[0])
     return None if fault is None else f"reset returned {fault}"
 
 
-def step_fault(answer: Any, space: spaces.Space) -> str | None:
+def step_fault(result: Any, space: spaces.Space) -> str | None:
     """Describes what is wrong with what ``step`` returned."""
-    return next((fault for _, fault in step_faults(answer, space)), None)
+    return next((fault for _, fault in step_faults(result, space)), None)
 
 
-def step_faults(answer: Any, space: spaces.Space, strict: bool = False) -> Iterator[tuple[str, str]]:
+def step_faults(result: Any, space: spaces.Space, strict: bool = False) -> Iterator[tuple[str, str]]:
     """Yields everything that is wrong with what ``step`` returned, after the name of the value that it is in.
 
     ``step`` stands for the observation and for the whole. For ``strict`` see :func:`reward_fault` and :func:`flag_fault`.
     """
-    if not isinstance(answer, tuple) or len(answer) != 5:
-        what = f"{len(answer)} values" if isinstance(answer, tuple) else describe_value(answer)
-        old = " as in the old package gym" if isinstance(answer, tuple) and len(answer) == 4 else ""
-        yield "step", f"step returned {what}{old}, expected {STEP_VALUES}; {TERMINATED_AND_TRUNCATED}"
+    if not isinstance(result, tuple) or len(result) != 5:
+        got = f"{len(result)} values" if isinstance(result, tuple) else describe_value(result)
+        old = " as in the old package gym" if isinstance(result, tuple) and len(result) == 4 else ""
+        yield "step", f"step returned {got}{old}, expected {STEP_VALUES}; {TERMINATED_AND_TRUNCATED}"
         return
-    obs, reward, terminated, truncated, info = answer
+    obs, reward, terminated, truncated, info = result
     for name, fault in (
         ("step", observation_fault(space, obs)),
         ("reward", reward_fault(reward, strict)),
@@ -378,45 +378,45 @@ def observation_fault(space: spaces.Space, obs: Any, path: str = "", strict: boo
         strict: whether anything else than the declared dtype, a key too many or a list for an array is wrong as well; in
             training these are cast, ignored and turned into arrays.
     """
-    what = leaf_name(path)
+    name = leaf_name(path)
     if isinstance(space, spaces.Dict):
         keys = sorted(space.spaces)
         if not isinstance(obs, Mapping):
-            return f"{what} as {describe_value(obs)}, expected a dict with the keys {', '.join(keys)}"
+            return f"{name} as {describe_value(obs)}, expected a dict with the keys {', '.join(keys)}"
         missing = [key for key in keys if key not in obs]
         extra = [str(key) for key in obs if key not in space.spaces] if strict else []
         if missing or extra:
             fix = f"add {', '.join(missing)}" if missing else f"declare or leave out {', '.join(extra)}"
-            return f"{what} with the keys {', '.join(sorted(map(str, obs)))}, expected {', '.join(keys)}; {fix}"
+            return f"{name} with the keys {', '.join(sorted(map(str, obs)))}, expected {', '.join(keys)}; {fix}"
         inner = [(key, space.spaces[key], obs[key]) for key in keys]
     elif isinstance(space, spaces.Tuple):
         n = len(space.spaces)
         if not isinstance(obs, tuple | list) or len(obs) != n:
             got = f"{len(obs)} parts" if isinstance(obs, tuple | list) else describe_value(obs)
-            return f"{what} as {got}, expected a tuple of {n} parts"
-        inner = [(str(i), part, one) for i, (part, one) in enumerate(zip(space.spaces, obs, strict=True))]
+            return f"{name} as {got}, expected a tuple of {n} parts"
+        inner = [(str(i), subspace, value) for i, (subspace, value) in enumerate(zip(space.spaces, obs, strict=True))]
     else:
-        return _array_fault(space, obs, what, strict)
-    faults = (observation_fault(part, one, f"{path}.{key}".lstrip("."), strict) for key, part, one in inner)
+        return _array_fault(space, obs, name, strict)
+    faults = (observation_fault(subspace, value, f"{path}.{key}".lstrip("."), strict) for key, subspace, value in inner)
     return next((fault for fault in faults if fault is not None), None)
 
 
-def _array_fault(space: spaces.Space, obs: Any, what: str, strict: bool) -> str | None:
+def _array_fault(space: spaces.Space, obs: Any, name: str, strict: bool) -> str | None:
     """Describes what is wrong with one array of an observation."""
     (leaf,) = leaves(space)
     try:
         array = np.asarray(obs)
     except ValueError:
-        return f"{what} as {describe_value(obs)}, expected an array of shape {leaf.shape}"
+        return f"{name} as {describe_value(obs)}, expected an array of shape {leaf.shape}"
     if array.dtype.kind not in "fiub":
-        return f"{what} as {describe_value(obs)}, expected numbers of shape {leaf.shape} and dtype {space.dtype}"
+        return f"{name} as {describe_value(obs)}, expected numbers of shape {leaf.shape} and dtype {space.dtype}"
     if array.shape != leaf.shape:
         fix = (
             f"return it with .reshape({leaf.shape})"
             if array.size == math.prod(leaf.shape)
             else "return the declared shape"
         )
-        return f"{what} of shape {array.shape}, expected {leaf.shape}; {fix}, or declare {array.shape} in the space"
+        return f"{name} of shape {array.shape}, expected {leaf.shape}; {fix}, or declare {array.shape} in the space"
     if not keeps_values(array, leaf.dtype):
         with np.errstate(invalid="ignore", over="ignore"):
             at = tuple(np.argwhere(array.astype(leaf.dtype) != array)[0].tolist())
@@ -424,14 +424,14 @@ def _array_fault(space: spaces.Space, obs: Any, what: str, strict: bool) -> str 
         fix += f"declare Box(..., dtype=np.{'float32' if array.dtype.kind == 'f' else array.dtype})"
         if array.dtype == space.dtype:
             fix = "declare the bounds that it really has"
-        held = f"{what} of dtype {array.dtype}, expected {leaf.dtype if array.dtype == space.dtype else space.dtype}"
+        held = f"{name} of dtype {array.dtype}, expected {leaf.dtype if array.dtype == space.dtype else space.dtype}"
         return f"{held}, which cannot hold {array[at]}{_place(at)}; {fix}"
     if not strict and leaf.kind in ("categorical", "binary") and (outside := bounds_fault(space, obs)) is not None:
-        return outside[1].replace(leaf_name(""), what, 1)
+        return outside[1].replace(leaf_name(""), name, 1)
     if strict and isinstance(space, spaces.Box) and array.dtype != space.dtype:
-        return f"{what} of dtype {array.dtype}, expected {space.dtype}; return it with .astype(np.{space.dtype})"
+        return f"{name} of dtype {array.dtype}, expected {space.dtype}; return it with .astype(np.{space.dtype})"
     if strict and not isinstance(space, spaces.Discrete) and not isinstance(obs, np.ndarray | np.generic):
-        return f"{what} as {describe_value(obs)}, expected an array; return np.array(..., np.{space.dtype})"
+        return f"{name} as {describe_value(obs)}, expected an array; return np.array(..., np.{space.dtype})"
     return None
 
 
@@ -441,8 +441,8 @@ def nonfinite_fault(space: spaces.Space, obs: Any) -> str | None:
         array = np.asarray(value)
         if array.dtype.kind == "f" and not np.isfinite(array).all():
             at = tuple(np.argwhere(~np.isfinite(array))[0].tolist())
-            what = f"{leaf_name(leaf.path)} with {array[at]}{_place(at)}"
-            return f"{what}, expected finite numbers; look for divisions by zero and overflows"
+            number = f"{leaf_name(leaf.path)} with {array[at]}{_place(at)}"
+            return f"{number}, expected finite numbers; look for divisions by zero and overflows"
     return None
 
 
@@ -451,10 +451,10 @@ def bounds_fault(space: spaces.Space, obs: Any) -> tuple[Literal["error", "warni
 
     A warning for a Box, whose bounds networks never see; an error for choices and bits, which would have no place in one.
     """
-    for leaf, part, value in zip(leaves(space), parts(space, space), parts(space, obs), strict=True):
+    for leaf, subspace, value in zip(leaves(space), parts(space, space), parts(space, obs), strict=True):
         array = np.asarray(value)
-        if isinstance(part, spaces.Box):
-            low, high = part.low, part.high
+        if isinstance(subspace, spaces.Box):
+            low, high = subspace.low, subspace.high
         else:
             low, high = limits(leaf)
         outside = np.argwhere((array < low) | (array > high))
@@ -473,11 +473,11 @@ def far_outside(space: spaces.Space, obs: Any) -> str | None:
 
     Far is ``FAR`` times the distance of the two bounds. Images cannot lie outside, and what is unbounded is not looked at.
     """
-    for leaf, part, array in zip(leaves(space), parts(space, space), parts(space, obs), strict=True):
+    for leaf, subspace, array in zip(leaves(space), parts(space, space), parts(space, obs), strict=True):
         if leaf.kind != "continuous":
             continue
-        assert isinstance(part, spaces.Box)
-        low, high = part.low.astype(np.float64), part.high.astype(np.float64)
+        assert isinstance(subspace, spaces.Box)
+        low, high = subspace.low.astype(np.float64), subspace.high.astype(np.float64)
         with np.errstate(over="ignore", invalid="ignore"):
             width = high - low
             outside = np.argwhere(((array < low - FAR * width) | (array > high + FAR * width)) & (width > 0))
@@ -486,7 +486,7 @@ def far_outside(space: spaces.Space, obs: Any) -> str | None:
             where = tuple(at)
             return (
                 f"{leaf_name(leaf.path)} with {array[env, *where]:.4g}{_place(where)} in environment {env}, far outside of "
-                f"the declared bounds [{part.low[where]:.4g}, {part.high[where]:.4g}]"
+                f"the declared bounds [{subspace.low[where]:.4g}, {subspace.high[where]:.4g}]"
             )
     return None
 
@@ -537,9 +537,9 @@ def with_location(env_id: str, env: int | None, n_steps: int, fault: str) -> str
     >>> with_location("Walk", 2, 7, "step returned 4 values")
     'Walk, environment 2, step 7: step returned 4 values'
     """
-    which = "one of the environments" if env is None else f"environment {env}"
+    where = "one of the environments" if env is None else f"environment {env}"
     when = f"step {n_steps}" if n_steps else "the first reset"
-    return f"{env_id}, {which}, {when}: {fault}"
+    return f"{env_id}, {where}, {when}: {fault}"
 
 
 def id_of(env: gym.Env) -> str:

@@ -82,12 +82,12 @@ def unflat(space: gym.Space, flat: np.ndarray) -> Any:
     """
     if isinstance(space, gym.spaces.Dict | gym.spaces.Tuple):
         spaces = [*space.spaces.values()] if isinstance(space, gym.spaces.Dict) else [*space.spaces]
-        split = np.split(flat, np.cumsum([gym.spaces.flatdim(part) for part in spaces])[:-1], axis=-1)
-        parts = [unflat(part, numbers) for part, numbers in zip(spaces, split, strict=True)]
+        split = np.split(flat, np.cumsum([gym.spaces.flatdim(subspace) for subspace in spaces])[:-1], axis=-1)
+        parts = [unflat(subspace, numbers) for subspace, numbers in zip(spaces, split, strict=True)]
         return dict(zip(space.spaces, parts, strict=True)) if isinstance(space, gym.spaces.Dict) else (*parts,)
     if isinstance(space, gym.spaces.Box):
         return flat.reshape(*flat.shape[:-1], *space.shape).astype(space.dtype)
-    return np.apply_along_axis(lambda one: np.asarray(gym.spaces.unflatten(space, one)), -1, flat)
+    return np.apply_along_axis(lambda row: np.asarray(gym.spaces.unflatten(space, row)), -1, flat)
 
 
 class OldEnvironment(gym.Env):

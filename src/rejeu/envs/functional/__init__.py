@@ -29,7 +29,7 @@ MakeDrawing = Callable[["FunctionalEnv", str], "Drawing"]
 class FunctionalSpec(NamedTuple):
     """A registered environment."""
 
-    kind: str | Callable[..., FunctionalEnv]
+    entry_point: str | Callable[..., FunctionalEnv]
     """Its class, or module and name of one of rejeu's, which is imported when it is made."""
     max_episode_steps: int | None = None
     """The time limit with default arguments, if it only truncates: Gymnasium's wrapper then applies it. None if the
@@ -75,8 +75,8 @@ def make(env_id: str, **kwargs: Any) -> FunctionalEnv:
         near = difflib.get_close_matches(env_id, REGISTRY, n=2, cutoff=0.4)
         hint = f"did you mean {' or '.join(near)}?" if near else f"there are {', '.join(REGISTRY)}"
         raise ValueError(f"no environment in JAX is called {env_id!r}; {hint}")
-    kind = imported(REGISTRY[env_id].kind)
-    return kind(**kwargs)
+    entry_point = imported(REGISTRY[env_id].entry_point)
+    return entry_point(**kwargs)
 
 
 def imported(value: Any) -> Any:

@@ -83,8 +83,8 @@ def converted(space: Any) -> gym.Space:
     parts = getattr(space, "spaces", None)
     if parts is not None:
         if isinstance(parts, dict):
-            return spaces.Dict({key: converted(part) for key, part in parts.items()})
-        return spaces.Tuple([converted(part) for part in parts])
+            return spaces.Dict({key: converted(subspace) for key, subspace in parts.items()})
+        return spaces.Tuple([converted(subspace) for subspace in parts])
     return to_space(space)
 
 
@@ -107,7 +107,7 @@ def from_brax(env: Any, max_episode_steps: int | None = 1000) -> BraxEnv:
         max_episode_steps: the time limit, None for none.
     """
     obs = jax.eval_shape(env.reset, jax.ShapeDtypeStruct((2,), np.uint32)).obs
-    shapes = {key: part.shape for key, part in obs.items()} if isinstance(obs, dict) else {"": obs.shape}
+    shapes = {key: array.shape for key, array in obs.items()} if isinstance(obs, dict) else {"": obs.shape}
     return BraxEnv(env=env, shapes=tuple(sorted(shapes.items())), max_episode_steps=max_episode_steps)
 
 

@@ -45,7 +45,7 @@ class Panel(NamedTuple):
     bottom: float
     low: float
     high: float
-    """What is at the left and the right edge."""
+    """The values at the left and the right edge."""
     coordinate: int | None = None
     """The coordinate that is plotted against time, None for the plane."""
 
@@ -152,11 +152,11 @@ class BallDrawing(Canvas):
         for i, strip in enumerate(self.strips):
             self._text(f"x{i + 1}", (strip.left - 9, strip.place(0, 0)[1]), FAINT, "right")
         for share in (0.0, 0.5, 1.0):
-            place = self.strips[-1].place(share * self.n_steps, 0)[0], below
-            self._text(_number(share * self.n_steps), place, FAINT, "center")
+            position = self.strips[-1].place(share * self.n_steps, 0)[0], below
+            self._text(_number(share * self.n_steps), position, FAINT, "center")
         if self.dimension > len(self.strips):
-            said = f"{len(self.strips)} of {self.dimension} coordinates"
-            self._text(said, (self.strips[0].right, 30), FAINT, "right")
+            label = f"{len(self.strips)} of {self.dimension} coordinates"
+            self._text(label, (self.strips[0].right, 30), FAINT, "right")
 
     def _draw_trail(self, points: list[Point]) -> None:
         """Draws the trail. In the plane, the older part has a single faint color and is below the rest."""
@@ -205,12 +205,12 @@ class BallDrawing(Canvas):
         """Returns the caption. In more than two dimensions, it names the coordinates in which the ball left the box."""
         if not lost:
             return f"held for {step} steps" if over and step else f"step {step}"
-        left = [f"x{i + 1}" for i in np.flatnonzero(np.abs(trail[-1]) > WALL)]
-        return f"lost in step {step}" + (f" by {', '.join(left)}" if self.dimension > 2 else "")
+        beyond = [f"x{i + 1}" for i in np.flatnonzero(np.abs(trail[-1]) > WALL)]
+        return f"lost in step {step}" + (f" by {', '.join(beyond)}" if self.dimension > 2 else "")
 
-    def _draw_caption(self, said: str, step: int, ink: Color, color: Color) -> None:
+    def _draw_caption(self, caption: str, step: int, ink: Color, color: Color) -> None:
         left, right = self.main.left, self.main.right
-        self._text(said, (left, 30), ink, "left", self.large_font)
+        self._text(caption, (left, 30), ink, "left", self.large_font)
         self._text(f"of {self.n_steps}", (right, 30), FAINT, "right")
         self._rectangle((left, 50), (right, 55), GRID)
         self._rectangle((left, 50), (left + (right - left) * min(step / self.n_steps, 1.0), 55), color)
@@ -230,11 +230,11 @@ class BallDrawing(Canvas):
     def _disc(self, center: Point, radius: float, color: Color) -> None:
         self.pygame.draw.circle(self.surface, color, (center[0] * FINE, center[1] * FINE), max(radius * FINE, 1.0))
 
-    def _text(self, text: str, place: Point, color: Color, side: str, font: Any = None) -> None:
-        """Writes ``text``, vertically centered. ``place`` is its ``side``: ``"left"``, ``"right"`` or ``"center"``."""
+    def _text(self, text: str, position: Point, color: Color, side: str, font: Any = None) -> None:
+        """Writes ``text``, vertically centered. ``position`` is its ``side``: ``"left"``, ``"right"`` or ``"center"``."""
         drawn = (font or self.font).render(text, True, color)
-        x = place[0] * FINE - {"left": 0.0, "center": 0.5, "right": 1.0}[side] * drawn.get_width()
-        self.surface.blit(drawn, (round(x), round(place[1] * FINE - 0.5 * drawn.get_height())))
+        x = position[0] * FINE - {"left": 0.0, "center": 0.5, "right": 1.0}[side] * drawn.get_width()
+        self.surface.blit(drawn, (round(x), round(position[1] * FINE - 0.5 * drawn.get_height())))
 
 
 def _mix(first: Color, second: Color, share: float) -> Color:

@@ -28,7 +28,7 @@ class Original(Drawing):
 
     def draw(self, scene: Scene) -> np.ndarray | None:
         state = scene.states[-1]
-        self.env.state = np.concatenate([np.ravel(part) for part in state[:-1]], dtype=np.float64)  # without the time
+        self.env.state = np.concatenate([np.ravel(array) for array in state[:-1]], dtype=np.float64)  # without the time
         self.env.last_u = None if scene.action is None else float(np.ravel(scene.action)[0])  # only Pendulum reads it
         return self.env.render()
 
@@ -36,11 +36,11 @@ class Original(Drawing):
         self.env.close()
 
 
-def original(kind: Callable[..., gym.Env], *fields: str) -> Callable[[Any, str], Drawing]:
+def original(env_class: Callable[..., gym.Env], *fields: str) -> Callable[[Any, str], Drawing]:
     """Returns the drawing of an environment by one of Gymnasium, which gets these fields of ours."""
 
     def make(env: Any, render_mode: str) -> Drawing:
-        return Original(kind(render_mode=render_mode, **{name: getattr(env, name) for name in fields}))
+        return Original(env_class(render_mode=render_mode, **{name: getattr(env, name) for name in fields}))
 
     return make
 
@@ -103,7 +103,7 @@ class Maze(Canvas):
         draw.circle(self.surface, FAINT, self._place(state.goal), TOLERANCE * cell)
         draw.circle(self.surface, GOAL, self._place(state.goal), 0.1 * cell)
         if len(scene.states) > 1:
-            draw.aalines(self.surface, AGENT, False, [self._place(one.position) for one in scene.states])
+            draw.aalines(self.surface, AGENT, False, [self._place(visited.position) for visited in scene.states])
         draw.circle(self.surface, AGENT, self._place(state.position), RADIUS * cell)
 
     def _place(self, position: np.ndarray) -> tuple[float, float]:
@@ -126,7 +126,7 @@ class Bits(Canvas):
         self.surface.fill(PAPER)
         for row, (bits, color) in enumerate([(state.bits, AGENT), (state.goal, GOAL)]):
             for i, bit in enumerate(bits.tolist()):
-                place = ((i + 0.5) * side, (0.75 + 1.5 * row) * side, side - 4, side - 4)
-                self.pygame.draw.rect(self.surface, color if bit else FAINT, place)
+                square = ((i + 0.5) * side, (0.75 + 1.5 * row) * side, side - 4, side - 4)
+                self.pygame.draw.rect(self.surface, color if bit else FAINT, square)
                 if bool(bit) != bool(state.goal[i]) and row == 0:
-                    self.pygame.draw.rect(self.surface, INK, place, width=3)
+                    self.pygame.draw.rect(self.surface, INK, square, width=3)

@@ -102,7 +102,7 @@ class GymnasiumEnv(gym.Env[Any, Any]):
         Raises:
             gymnasium.error.ResetNeeded: if no episode has begun.
         """
-        step = self._vector.step(jax.tree.map(lambda part: np.asarray(part)[None], action))
+        step = self._vector.step(jax.tree.map(lambda array: np.asarray(array)[None], action))
         terminated, truncated = bool(step.terminated[0]), bool(step.truncated[0])
         self.over = terminated or truncated
         self._show(action)

@@ -28,7 +28,7 @@ N_FRAMES, TIME_STEP = 3, 1.0 / 15.0
 SCALES = np.array([100.0, 100.0, 5.0, 5.0, 1.0, 1.0])
 """Divisors of x, y, vx, vy, cos h and sin h in observations."""
 COLLISION_REWARD = -5.0
-"""What is added in a collision."""
+"""The reward that is added in a collision."""
 
 N_COLUMNS = 14
 """Parking spots in each of the two rows."""
@@ -176,12 +176,12 @@ def collide(state: State) -> tuple[Array, Array, Array]:
         jnp.asarray(a, state.position.dtype) for a in (WALL_CENTERS, WALL_HALF_SIZES, WALL_REACH)
     )
     forward = jnp.stack([jnp.cos(state.heading), jnp.sin(state.heading)])
-    left = jnp.stack([-forward[1], forward[0]])
-    axes = jnp.stack([forward, left, jnp.array([1.0, 0.0]), jnp.array([0.0, 1.0])])  # (4, 2)
+    sideways = jnp.stack([-forward[1], forward[0]])
+    axes = jnp.stack([forward, sideways, jnp.array([1.0, 0.0]), jnp.array([0.0, 1.0])])  # (4, 2)
 
     apart = state.position[None] - centers  # (n_walls, 2)
     middle = project(apart, axes)  # of the vehicle's center, from those of the walls'; (n_walls, 4)
-    course, width = project(forward[None], axes), project(left[None], axes)
+    course, width = project(forward[None], axes), project(sideways[None], axes)
     vehicle = 0.5 * LENGTH * jnp.abs(course) + 0.5 * WIDTH * jnp.abs(width)
     wall = project(half_sizes, jnp.abs(axes))
     low, high = middle - vehicle, middle + vehicle

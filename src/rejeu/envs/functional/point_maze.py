@@ -124,10 +124,10 @@ class PointMaze(GoalEnv):
         cells = np.argwhere(~self.walls)[:, ::-1]
         start = jax.random.randint(start_key, (), 0, len(cells))
         goal = jax.random.randint(goal_key, (), 0, len(cells) - 1)
-        chosen = jnp.stack([start, goal + (goal >= start)])
+        ends = jnp.stack([start, goal + (goal >= start)])
         off = jax.random.uniform(spread_key, (2, 2), minval=-SPREAD, maxval=SPREAD)
         middle = jnp.asarray(cells - np.array(self.walls.shape[::-1]) / 2 + 0.5, off.dtype)
-        position, goal = middle[chosen] + off
+        position, goal = middle[ends] + off
         state = State(position, jnp.zeros(2), goal, jnp.zeros((), jnp.int32))
         return state, observe(state)
 
@@ -165,17 +165,17 @@ def observe(state: State) -> dict[str, Array]:
     return {"observation": observation, "achieved_goal": state.position, "desired_goal": state.goal}
 
 
-def advance(place: Array, speed: Array, is_blocked: Callable[[Array, float], Array]) -> tuple[Array, Array]:
+def advance(coordinate: Array, speed: Array, is_blocked: Callable[[Array, float], Array]) -> tuple[Array, Array]:
     """Returns one coordinate and its speed after a step. The way is shorter than a cell.
 
     ``is_blocked`` tells whether the front edge is in a wall, given its coordinate and an offset across the motion.
     """
     side = jnp.sign(speed)
-    edge = place + TIME_STEP * speed + side * RADIUS
+    edge = coordinate + TIME_STEP * speed + side * RADIUS
     blocked = is_blocked(edge, -RADIUS) | is_blocked(edge, RADIUS)
     surface = jnp.where(side > 0, jnp.floor(edge), jnp.ceil(edge))  # of the wall that the edge is in
-    place = jnp.where(blocked, surface - side * (RADIUS + MARGIN), place + TIME_STEP * speed)
-    return place, jnp.where(blocked, 0.0, speed)
+    coordinate = jnp.where(blocked, surface - side * (RADIUS + MARGIN), coordinate + TIME_STEP * speed)
+    return coordinate, jnp.where(blocked, 0.0, speed)
 
 
 def is_wall(walls: Array, x: Array, y: Array) -> Array:

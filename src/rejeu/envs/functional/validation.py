@@ -16,9 +16,9 @@ from rejeu.core.validation import whole
 from rejeu.envs.functional.protocol import FunctionalEnv, GoalEnv, of_two_goals
 
 UNTRACEABLE = (jax.errors.JAXTypeError, jax.errors.JAXIndexError)
-"""What JAX raises where Python needs a value that is not known yet."""
+"""Errors of JAX where Python needs a value that is not known yet."""
 MISTAKES = (TypeError, ValueError, FrozenInstanceError)
-"""What other mistakes raise, such as writing into an array or a field, or adding arrays whose shapes do not fit."""
+"""Errors of other mistakes, such as writing into an array or a field, or adding arrays whose shapes do not fit."""
 N_GOALS = 3
 """Number of goals with which goal functions are checked."""
 
@@ -39,17 +39,17 @@ def check(env: FunctionalEnv) -> None:
     key = jax.eval_shape(lambda: jax.random.key(0))
     examples = [jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves(env.action_space)]
     action = jax.tree.unflatten(structure(env.action_space), examples)
-    said = f"{name}.reset"
-    state, obs = _unpack(_traced(said, env.reset, key), said, ("state", "obs"))
-    _check_obs(said, env.observation_space, obs)
-    said = f"{name}.step"
-    values = _traced(said, env.step, key, state, action)
-    after, obs, reward, *flags = _unpack(values, said, ("state", "obs", "reward", "terminated", "truncated"))
-    _check_obs(said, env.observation_space, obs)
-    _check_tree(said, "state", after, state, "as from reset")
-    _check_array(said, "reward", reward, (), "f")
-    for what, flag in zip(("terminated", "truncated"), flags, strict=True):
-        _check_array(said, what, flag, (), "b")
+    method = f"{name}.reset"
+    state, obs = _unpack(_traced(method, env.reset, key), method, ("state", "obs"))
+    _check_obs(method, env.observation_space, obs)
+    method = f"{name}.step"
+    values = _traced(method, env.step, key, state, action)
+    after, obs, reward, *flags = _unpack(values, method, ("state", "obs", "reward", "terminated", "truncated"))
+    _check_obs(method, env.observation_space, obs)
+    _check_tree(method, "state", after, state, "as from reset")
+    _check_array(method, "reward", reward, (), "f")
+    for flag_name, flag in zip(("terminated", "truncated"), flags, strict=True):
+        _check_array(method, flag_name, flag, (), "b")
     success = _traced(f"{name}.success", env.success, after)
     if success is not None:
         _check_array(f"{name}.success", "success", success, (), "b")
@@ -65,18 +65,18 @@ def check(env: FunctionalEnv) -> None:
         )
 
 
-def _traced(said: str, function: Callable[..., Any], *arguments: Any) -> Any:
+def _traced(method: str, function: Callable[..., Any], *arguments: Any) -> Any:
     try:
         return jax.eval_shape(function, *arguments)
     except UNTRACEABLE as error:
         raise BadEnvironmentError(
-            f"{said} cannot be compiled ({_line(error)}); it needs a value before there is one: use jnp instead of np, "
+            f"{method} cannot be compiled ({_line(error)}); it needs a value before there is one: use jnp instead of np, "
             "jnp.where instead of if, and no float(), int() or bool() of arrays"
         ) from error
     except MISTAKES as error:
         writes = isinstance(error, FrozenInstanceError) or "immutable" in str(error)
         fix = "; nothing may be changed in place: return new arrays" if writes else ""
-        raise BadEnvironmentError(f"{said} cannot be compiled ({_line(error)}){fix}") from error
+        raise BadEnvironmentError(f"{method} cannot be compiled ({_line(error)}){fix}") from error
 
 
 def _line(error: Exception) -> str:
@@ -85,48 +85,48 @@ def _line(error: Exception) -> str:
     return f"{type(error).__name__}: {reason[:150]}"
 
 
-def _unpack(answer: Any, said: str, names: tuple[str, ...]) -> tuple[Any, ...]:
-    if not isinstance(answer, tuple) or len(answer) != len(names):
-        kind = "array" if isinstance(answer, jax.ShapeDtypeStruct) else type(answer).__name__
-        what = f"{len(answer)} values" if isinstance(answer, tuple) else f"one {kind}"
-        raise BadEnvironmentError(f"{said} returned {what}, expected ({', '.join(names)})")
-    return answer
+def _unpack(result: Any, method: str, names: tuple[str, ...]) -> tuple[Any, ...]:
+    if not isinstance(result, tuple) or len(result) != len(names):
+        type_name = "array" if isinstance(result, jax.ShapeDtypeStruct) else type(result).__name__
+        got = f"{len(result)} values" if isinstance(result, tuple) else f"one {type_name}"
+        raise BadEnvironmentError(f"{method} returned {got}, expected ({', '.join(names)})")
+    return result
 
 
-def _check_obs(said: str, space: spaces.Space, obs: Any) -> None:
+def _check_obs(method: str, space: spaces.Space, obs: Any) -> None:
     """Compares an observation with its space, but accepts 64-bit numbers, which occur with ``jax_enable_x64``."""
     declared = [jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves(space)]
     narrowed = jax.tree.map(lambda a: a if a.dtype == bool else jax.ShapeDtypeStruct(a.shape, narrow(a.dtype)), obs)
     expected = jax.tree.unflatten(structure(space), declared)
-    _check_tree(said, "observation", narrowed, expected, "as in observation_space")
+    _check_tree(method, "observation", narrowed, expected, "as in observation_space")
 
 
-def _check_tree(said: str, what: str, found: Any, expected: Any, source: str) -> None:
+def _check_tree(method: str, name: str, returned: Any, expected: Any, source: str) -> None:
     """Compares the structures of trees, in which every array is an asterisk, and the shapes and dtypes of their arrays."""
-    structures: list[Any] = [jax.tree.structure(tree) for tree in (found, expected)]
+    structures: list[Any] = [jax.tree.structure(tree) for tree in (returned, expected)]
     if structures[0] != structures[1]:
-        texts = [str(one).removeprefix("PyTreeDef(").removesuffix(")") for one in structures]
+        texts = [str(tree).removeprefix("PyTreeDef(").removesuffix(")") for tree in structures]
         got, wanted = ("one array" if text == "*" else text[:200] for text in texts)
-        raise BadEnvironmentError(f"{said} returned the {what} {got}, expected {wanted} {source}")
-    pairs = zip(jax.tree_util.tree_leaves_with_path(expected), jax.tree.leaves(found), strict=True)
-    for (path, one), other in pairs:
-        if (one.shape, one.dtype) != (other.shape, other.dtype):
+        raise BadEnvironmentError(f"{method} returned the {name} {got}, expected {wanted} {source}")
+    pairs = zip(jax.tree_util.tree_leaves_with_path(expected), jax.tree.leaves(returned), strict=True)
+    for (path, declared), array in pairs:
+        if (declared.shape, declared.dtype) != (array.shape, array.dtype):
             raise BadEnvironmentError(
-                f"{said} returned the {what}{jax.tree_util.keystr(path)} as {_shown(other)}, expected {_shown(one)} "
+                f"{method} returned the {name}{jax.tree_util.keystr(path)} as {_shown(array)}, expected {_shown(declared)} "
                 f"{source}: index it, or convert it with .astype"
             )
 
 
-def _check_array(said: str, what: str, value: Any, shape: tuple[int, ...], kinds: str) -> None:
+def _check_array(method: str, name: str, value: Any, shape: tuple[int, ...], dtype_kinds: str) -> None:
     """Checks the shape of an array, and that its dtype is of one of these kinds."""
     array = jax.eval_shape(lambda: value) if isinstance(value, bool | float | int) else value
-    if getattr(array, "shape", None) != shape or np.dtype(array.dtype).kind not in kinds:
-        kind, axes = (
-            "a float" if kinds == "f" else "a bool",
+    if getattr(array, "shape", None) != shape or np.dtype(array.dtype).kind not in dtype_kinds:
+        dtype, axes = (
+            "a float" if dtype_kinds == "f" else "a bool",
             "for each action, with one axis" if shape else "without axes",
         )
         raise BadEnvironmentError(
-            f"{said} returned {what} as {_shown(array)}, expected {kind} {axes}: index or convert it"
+            f"{method} returned {name} as {_shown(array)}, expected {dtype} {axes}: index or convert it"
         )
 
 
@@ -143,16 +143,16 @@ def _check_goals(env: GoalEnv, name: str) -> None:
     goal = env.observation_space["achieved_goal"]  # type: ignore[index]
     goals = jax.ShapeDtypeStruct((N_GOALS, *goal.shape), narrow(goal.dtype))
     for function, may_be_none in ((env.compute_reward, False), (env.compute_terminated, True)):
-        said = f"{name}.{function.__name__}"
+        method = f"{name}.{function.__name__}"
         try:
-            result = _traced(said, of_two_goals(function), goals, goals)
+            result = _traced(method, of_two_goals(function), goals, goals)
         except KeyError as error:
             raise BadEnvironmentError(
-                f"{said} found no key {error}: environments in JAX have no infos; let it depend on the goals alone"
+                f"{method} found no key {error}: environments in JAX have no infos; let it depend on the goals alone"
             ) from error
         if getattr(result, "shape", None) != (N_GOALS,) and not (result is None and may_be_none):
             got = f"the shape {result.shape}" if hasattr(result, "shape") else f"{result!r:.60}"
             raise BadEnvironmentError(
-                f"{said} of {N_GOALS} goals returned {got}, expected the shape ({N_GOALS},): compute over the last axis, "
+                f"{method} of {N_GOALS} goals returned {got}, expected the shape ({N_GOALS},): compute over the last axis, "
                 "and return an array"
             )

@@ -92,9 +92,9 @@ def reset_done(env: FunctionalEnv, vstate: VectorState, done: Array) -> tuple[Ve
     return vstate, vstate.obs
 
 
-def select(which: Array, new: Any, old: Any) -> Any:
-    """Returns the rows of ``new`` where ``which``, ``bool (n,)``, else those of ``old``, for pytrees of ``(n, ...)``."""
-    return jax.tree.map(lambda a, b: jnp.where(jnp.expand_dims(which, range(1, a.ndim)), a, b), new, old)
+def select(mask: Array, new: Any, old: Any) -> Any:
+    """Returns the rows of ``new`` where ``mask``, ``bool (n,)``, else those of ``old``, for pytrees of ``(n, ...)``."""
+    return jax.tree.map(lambda a, b: jnp.where(jnp.expand_dims(mask, range(1, a.ndim)), a, b), new, old)
 
 
 def _next_keys(keys: Array, counts: Array) -> Array:
@@ -103,8 +103,8 @@ def _next_keys(keys: Array, counts: Array) -> Array:
 
 def split(env: FunctionalEnv) -> tuple[Any, Any]:
     """Returns the arrays of an environment, and the rest as a static argument that equal environments share."""
-    arrays, rest = eqx.partition(env, lambda leaf: isinstance(leaf, jax.Array | np.ndarray))
-    leaves, tree = jax.tree.flatten(rest)
+    arrays, static = eqx.partition(env, lambda leaf: isinstance(leaf, jax.Array | np.ndarray))
+    leaves, tree = jax.tree.flatten(static)
     return arrays, (tuple(leaves), tree)
 
 
@@ -256,7 +256,7 @@ def streams_of(seed: Seed, n: int) -> Array:
     if seed is None or isinstance(seed, int):
         number = int(np.random.SeedSequence().generate_state(1)[0]) if seed is None else seed
         return streams(jax.random.key(number), n)
-    return jnp.concatenate([streams(jax.random.key(one), 1) for one in seed])
+    return jnp.concatenate([streams(jax.random.key(env_seed), 1) for env_seed in seed])
 
 
 def goal_functions(env: FunctionalEnv) -> GoalFunctions | None:

@@ -77,27 +77,27 @@ def connect(address: str | None = None, purpose: str = "backend='ray'", shows_ou
     except ImportError as error:
         raise MissingExtra(purpose, "ray", "ray") from error
     if not ray.is_initialized():
-        given = address or os.environ.get("RAY_ADDRESS") or None
-        if given == "auto":
-            given = os.environ.get("RAY_ADDRESS") or current_address() or "auto"
-        if given is not None and given != "auto":
-            check_reachable(as_ray_resolves(given, ray))
+        address = address or os.environ.get("RAY_ADDRESS") or None
+        if address == "auto":
+            address = os.environ.get("RAY_ADDRESS") or current_address() or "auto"
+        if address is not None and address != "auto":
+            check_reachable(as_ray_resolves(address, ray))
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # a cluster that is started here reports nothing
         try:
             with signals_kept(), warnings.catch_warnings():
                 # Ray starts its own programs so, at once and without Python in between.
                 warnings.filterwarnings("ignore", "os.fork", RuntimeWarning)
                 ray.init(
-                    given or "local",  # else Ray would join any cluster that somebody started on this machine
-                    include_dashboard=None if given else False,
+                    address or "local",  # else Ray would join any cluster that somebody started on this machine
+                    include_dashboard=None if address else False,
                     logging_level=logging.ERROR,
                     configure_logging=False,
                     log_to_driver=shows_output,
                 )
         except (ConnectionError, RuntimeError, ValueError, TimeoutError) as error:
-            where = "a cluster on this machine" if given is None else f"the Ray cluster {given!r}"
+            where = "a cluster on this machine" if address is None else f"the Ray cluster {address!r}"
             raise ClusterError(f"cannot connect to {where}: {one_line(error)}") from error
-        _is_ours, _is_local = True, given is None
+        _is_ours, _is_local = True, address is None
     return Connection(ray)
 
 
@@ -107,8 +107,8 @@ def current_address() -> str | None:
         from ray._private.utils import read_ray_address  # there is no public way to ask
     except ImportError:
         return None
-    found = read_ray_address()
-    return found or None
+    address = read_ray_address()
+    return address or None
 
 
 def as_ray_resolves(address: str, ray: Any) -> str:
@@ -174,9 +174,9 @@ def check_versions(there: Mapping[str, str], where: str, here: Mapping[str, str]
     """
     here = versions() if here is None else here
     wrong = [
-        f"{name} {there.get(name) or 'of no version'} and not {own}"
-        for name, own in here.items()
-        if there.get(name) != own
+        f"{name} {there.get(name) or 'of no version'} and not {version}"
+        for name, version in here.items()
+        if there.get(name) != version
     ]
     if wrong:
         raise ClusterError(f"{where} has {', '.join(wrong)} as here; install the same versions on all machines")

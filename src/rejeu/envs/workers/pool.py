@@ -56,7 +56,7 @@ class Worker(ABC):
     @property
     @abstractmethod
     def place(self) -> str:
-        """What error messages call it."""
+        """The name of the worker in error messages."""
 
     @property
     @abstractmethod
@@ -109,14 +109,14 @@ class Worker(ABC):
     def receive(self) -> Any:
         """Returns the answer, which has arrived; errors are those of :meth:`answer`."""
         try:
-            answer = process.receive(self.pipe)
+            reply = process.receive(self.pipe)
         except (EOFError, OSError):
             raise self._lost() from None
         except Exception as error:  # unpickling an object of an unknown class can raise anything
             self.asked = None
             raise WorkerError(f"what environment {self.number} sent cannot be read in this process: {error}") from error
         self.asked = None
-        return answer
+        return reply
 
     def _lost(self) -> Lost:
         return Lost(f"{self.place} ended by itself at {self.asked!r} ({self.end()})")
@@ -133,8 +133,8 @@ class Listener:
         """Waits for at most so many seconds, and returns the indices of workers whose connection has an answer, or an end."""
         pipes = [worker.pipe for worker in workers]
         if sys.platform == "win32":  # where selectors take sockets only
-            found = {*connection.wait(pipes, seconds)}
-            return [i for i, pipe in enumerate(pipes) if pipe in found]
+            ready = {*connection.wait(pipes, seconds)}
+            return [i for i, pipe in enumerate(pipes) if pipe in ready]
         if pipes != self._pipes or self._selector is None:
             self.close()
             self._pipes, self._selector = pipes, selectors.DefaultSelector()
@@ -154,7 +154,7 @@ class Starter(ABC):
     """Starts workers. Abstract."""
 
     advice: str
-    """What an error message adds if a worker cannot be started."""
+    """The end of an error message if a worker cannot be started."""
 
     @abstractmethod
     def start(self, number: int, make: Callable[[], gym.Env]) -> Worker:
@@ -165,9 +165,9 @@ class Starter(ABC):
         """Releases what workers share, after all have ended. Further calls do nothing."""
 
 
-def seconds_until(deadline: float | None, most: float) -> float:
-    """Returns the seconds until a deadline, None for never, but not more than ``most``."""
-    return most if deadline is None else min(max(deadline - time.monotonic(), 0.0), most)
+def seconds_until(deadline: float | None, limit: float) -> float:
+    """Returns the seconds until a deadline, None for never, but not more than ``limit``."""
+    return limit if deadline is None else min(max(deadline - time.monotonic(), 0.0), limit)
 
 
 TIMEOUT = 300.0
@@ -247,9 +247,9 @@ class Workers:
             answers = [worker.answer(deadline) for worker in workers]
         except Lost as lost:
             raise WorkerError(f"{lost}; what it printed says why. {self._starter.advice}") from None
-        for worker, made in zip(workers, answers, strict=True):
-            if isinstance(made, WorkerFailure):
-                raise WorkerError(f"environment {worker.number} could not be made in a worker process:\n{made.trace}")
+        for worker, reply in zip(workers, answers, strict=True):
+            if isinstance(reply, WorkerFailure):
+                raise WorkerError(f"environment {worker.number} could not be made in a worker process:\n{reply.trace}")
         return answers
 
     def ask(self, requests: Mapping[int, tuple[Any, ...]]) -> dict[int, Any]:
@@ -279,23 +279,23 @@ class Workers:
         Raises:
             WorkerError: if a worker was lost and cannot be replaced. All workers are then terminated.
         """
-        waiting, found = {*numbers}, dict[int, Any]()
+        waiting, replies = {*numbers}, dict[int, Any]()
         while waiting:  # all answers, otherwise the next request would receive the remaining ones
-            found |= self._arrived(waiting)
-            waiting -= found.keys()
-        return self._without_lost(dict(sorted(found.items())))
+            replies |= self._arrived(waiting)
+            waiting -= replies.keys()
+        return self._without_lost(dict(sorted(replies.items())))
 
     def _arrived(self, numbers: Collection[int]) -> dict[int, Any]:
         """Returns the answers that arrive within :data:`LOOK_SECONDS`, and :class:`Lost` for workers without one."""
         ready = self._listener.ready(self.workers, seconds_until(self._look_at, LOOK_SECONDS))
-        found = {number: self._answer(number) for number in ready if number in numbers}
-        if ready and not found:  # those that have ended while nothing was asked of them would be ready for ever
+        replies = {number: self._answer(number) for number in ready if number in numbers}
+        if ready and not replies:  # those that have ended while nothing was asked of them would be ready for ever
             time.sleep(IDLE_SECONDS)
         if time.monotonic() >= self._look_at:
-            overdue = [number for number in numbers if number not in found and self._is_overdue(number)]
-            found |= {number: self._answer(number, 0.0) for number in overdue}
+            overdue = [number for number in numbers if number not in replies and self._is_overdue(number)]
+            replies |= {number: self._answer(number, 0.0) for number in overdue}
             self._look_at = time.monotonic() + LOOK_SECONDS
-        return found
+        return replies
 
     def _is_overdue(self, number: int) -> bool:
         worker = self.workers[number]
@@ -310,15 +310,15 @@ class Workers:
         except Lost as lost:
             return lost
 
-    def _without_lost(self, found: dict[int, Any]) -> dict[int, Any]:
-        lost = {number: answer for number, answer in found.items() if isinstance(answer, Lost)}
-        replaced = {number: self._replaced(number, answer) for number, answer in lost.items()}
+    def _without_lost(self, replies: dict[int, Any]) -> dict[int, Any]:
+        lost = {number: reply for number, reply in replies.items() if isinstance(reply, Lost)}
+        replaced = {number: self._replaced(number, reply) for number, reply in lost.items()}
         try:
             self._made([self.workers[number] for number in replaced])
         except BaseException:
             self.end()
             raise
-        return found | replaced
+        return replies | replaced
 
     def _replaced(self, number: int, lost: Lost) -> Restarted:
         """Starts a worker again. Raises ``WorkerError`` if no restarts are left."""
@@ -436,7 +436,7 @@ class ProcessWorker(Worker):
                 stop()
                 process.join(CLOSE_SECONDS)
         code = process.exitcode
-        names = {-one: one.name for one in signal.Signals}
+        names = {-sig: sig.name for sig in signal.Signals}
         self._ended = f"exit code {code}" + (f", {names[code]}" if code in names else "")
         if code is not None:
             process.close()

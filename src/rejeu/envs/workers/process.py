@@ -37,7 +37,7 @@ SAFE_PATH, OURS = "PYTHONSAFEPATH", "rejeu"
 class WorkerFailure(NamedTuple):
     """An error in a worker, as text, since not every exception can be pickled."""
 
-    kind: Literal["raised", "bad answer", "no attribute"]
+    cause: Literal["raised", "bad answer", "no attribute"]
     message: str
     trace: str
 
@@ -51,23 +51,23 @@ class WorkerDescription(NamedTuple):
     render_mode: str | None
 
 
-def send(pipe: Connection, what: Any) -> None:
+def send(pipe: Connection, message: Any) -> None:
     """Sends an object, which may contain lambdas and classes of the main script.
 
     A closed pipe is ignored, so that the last message of a process that exited can still be received.
     """
     try:
-        data = ForkingPickler.dumps(what)
+        data = ForkingPickler.dumps(message)
     except Exception:  # pickling its parts can raise anything
-        data = ForkingPickler.dumps(CloudpickleWrapper(what))
+        data = ForkingPickler.dumps(CloudpickleWrapper(message))
     with suppress(BrokenPipeError, ConnectionResetError):
         pipe.send_bytes(data)
 
 
 def receive(pipe: Connection) -> Any:
     """Waits for an object from the other process and returns it."""
-    what = pipe.recv()
-    return what.fn if isinstance(what, CloudpickleWrapper) else what
+    message = pipe.recv()
+    return message.fn if isinstance(message, CloudpickleWrapper) else message
 
 
 def rows(space: gym.Space, buffers: Sequence[Any], n_envs: int) -> list[np.ndarray]:
@@ -202,10 +202,10 @@ def receive_exactly(connected: socket.socket, n: int) -> bytes:
     """
     data = b""
     while len(data) < n:
-        part = connected.recv(n - len(data))
-        if not part:
+        chunk = connected.recv(n - len(data))
+        if not chunk:
             raise ConnectionError("the connection has ended")
-        data += part
+        data += chunk
     return data
 
 
@@ -216,15 +216,15 @@ def _answered(env: gym.Env, request: Any, encode: Encode) -> Any:
     except BadEnvironmentError as error:
         return WorkerFailure("bad answer", str(error), traceback.format_exc())
     except Exception as error:  # the environment can raise anything
-        kind: Literal["raised", "no attribute"] = "no attribute" if isinstance(error, AttributeError) else "raised"
-        return WorkerFailure(kind, str(error), traceback.format_exc())
+        cause: Literal["raised", "no attribute"] = "no attribute" if isinstance(error, AttributeError) else "raised"
+        return WorkerFailure(cause, str(error), traceback.format_exc())
 
 
 def _answer(env: gym.Env, encode: Encode, name: str, *arguments: Any) -> Any:
     """Returns the answer of an environment to one request."""
     if name == "step":
-        obs, *rest = validation.step_env(env, *arguments)
-        return encode(obs), *rest
+        obs, *result = validation.step_env(env, *arguments)
+        return encode(obs), *result
     if name == "step_and_reset":
         return step_and_reset(env, encode, *arguments)
     if name == "reset":
@@ -238,8 +238,7 @@ def _answer(env: gym.Env, encode: Encode, name: str, *arguments: Any) -> Any:
         snapshot.restore(env, *arguments)
         return snapshot.is_over(env)
     assert name == "call", name
-    function, *rest = arguments
-    return function(env, *rest)
+    return arguments[0](env, *arguments[1:])
 
 
 def seed_globals(seed: int | None) -> None:

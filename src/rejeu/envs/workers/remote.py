@@ -37,7 +37,7 @@ TOKEN_SECONDS = 5.0
 
 @dataclass(frozen=True)
 class RayOptions:
-    """What an environment in an actor reserves, and where."""
+    """The resources that an environment in an actor reserves, and the cluster."""
 
     address: str | None = None
     """``"HOST:PORT"`` of the cluster, or ``"auto"``; see :func:`rejeu.envs.workers.cluster.connect`."""
@@ -59,7 +59,7 @@ class RayOptions:
         if not isinstance(self.resources, Mapping):
             raise TypeError(f"resources={self.resources!r} must be a dict of numbers by name")
         resources = {
-            str(key): validation.number(f"resources[{key!r}]", one, least=0) for key, one in self.resources.items()
+            str(key): validation.number(f"resources[{key!r}]", need, least=0) for key, need in self.resources.items()
         }
         validation.assign(self, resources=resources)
 
@@ -93,7 +93,7 @@ class Actors(Starter):
         self._connection = cluster.connect(self.options.address)
         self.ray = self._connection.ray
         self.reserved = self.options.reserved(self._connection.is_local)
-        """What each worker reserves, as options of a Ray actor."""
+        """The resources that each worker reserves, as options of a Ray actor."""
         try:
             self._class = self.ray.remote(RemoteWorker)
             self._server = socket.create_server((self.ray.util.get_node_ip_address(), 0), backlog=1024)
@@ -125,15 +125,15 @@ class Actors(Starter):
         with suppress(OSError):
             connected.settimeout(TOKEN_SECONDS)
             token = process.receive_exactly(connected, TOKEN_BYTES)
-            known = next((one for one in self._waiting if hmac.compare_digest(one, token)), None)
-            if known is not None:
-                self._waiting.pop(known).connected(process.as_connection(connected))
+            expected = next((candidate for candidate in self._waiting if hmac.compare_digest(candidate, token)), None)
+            if expected is not None:
+                self._waiting.pop(expected).connected(process.as_connection(connected))
                 return
         connected.close()
 
     def forget(self, worker: ActorWorker) -> None:
         """Accepts no connection of a worker anymore."""
-        self._waiting = {token: one for token, one in self._waiting.items() if one is not worker}
+        self._waiting = {token: waiting for token, waiting in self._waiting.items() if waiting is not worker}
 
     def close(self) -> None:
         self._server.close()
@@ -203,9 +203,9 @@ class ActorWorker(Worker):
         self._actor, self._served = self._actors.launch(self)
 
     def _needs(self) -> str:
-        given = {key: value for key, value in self._actors.reserved.items() if value}
-        found = self._actors.ray.cluster_resources()
-        return f"of which each environment reserves {given}, and which has {found.get('CPU', 0):g} CPUs in all"
+        reserved = {key: value for key, value in self._actors.reserved.items() if value}
+        resources = self._actors.ray.cluster_resources()
+        return f"of which each environment reserves {reserved}, and which has {resources.get('CPU', 0):g} CPUs in all"
 
     def stop(self) -> None:
         if not self._ended:

@@ -49,12 +49,12 @@ class InWorkers(VectorEnv):
         restart_workers: int = 0,
         starter: Starter | None = None,
     ) -> None:
-        one = make_one()
-        if (fault := validation.environment_fault(one)) is not None:
+        env = make_one()
+        if (fault := validation.environment_fault(env)) is not None:
             raise TypeError(fault)
-        self.observation_space, self.action_space = one.observation_space, one.action_space
-        self.env_id, self.max_episode_steps, self.reward_threshold = describe_spec(one)
-        one.close()
+        self.observation_space, self.action_space = env.observation_space, env.action_space
+        self.env_id, self.max_episode_steps, self.reward_threshold = describe_spec(env)
+        env.close()
         self.backend = "gymnasium-async" if starter is None else "ray"
         self.n_envs = n_envs
         self.n_steps = 0
@@ -75,11 +75,11 @@ class InWorkers(VectorEnv):
         """Shared memory for the observations of all environments, None if workers send them."""
         starter = Processes(handovers=self._share) if starter is None else starter
         self.workers = Workers([make_one] * n_envs, starter, worker_timeout, restart_workers)
-        for i, made in enumerate(self.workers.descriptions):
-            if (made.observation_space, made.action_space) != (self.observation_space, self.action_space):
+        for i, theirs in enumerate(self.workers.descriptions):
+            if (theirs.observation_space, theirs.action_space) != (self.observation_space, self.action_space):
                 self.close()
                 raise BadEnvironmentError(
-                    f"{self.env_id}, environment {i}: its spaces are {made.observation_space} and {made.action_space}, "
+                    f"{self.env_id}, environment {i}: its spaces are {theirs.observation_space} and {theirs.action_space}, "
                     f"those of the first are {self.observation_space} and {self.action_space}; all must be the same"
                 )
 
@@ -107,11 +107,11 @@ class InWorkers(VectorEnv):
                 self._seeds[i] = seed
         waiting = {i: ("reset", self._next_seed(i) if seed is None else seed) for i, seed in seeds.items()}
         while waiting:
-            said = self._heard(self.workers.ask(waiting), "reset")
-            done = [i for i, answer in said.items() if not isinstance(answer, Restarted)]
-            self._take({i: said[i] for i in done})
-            self._reset_infos |= {i: said[i][1] for i in done}
-            waiting = {i: ("reset", self._next_seed(i)) for i in said if i not in done}
+            replies = self._heard(self.workers.ask(waiting), "reset")
+            done = [i for i, reply in replies.items() if not isinstance(reply, Restarted)]
+            self._take({i: replies[i] for i in done})
+            self._reset_infos |= {i: replies[i][1] for i in done}
+            waiting = {i: ("reset", self._next_seed(i)) for i in replies if i not in done}
         return self._obs
 
     def _next_seed(self, i: int) -> int | None:
@@ -131,59 +131,57 @@ class InWorkers(VectorEnv):
     def _step_some(self, action: np.ndarray, active: np.ndarray) -> Step:
         return self._step_each(np.flatnonzero(active).tolist(), action)
 
-    def _step_each(self, which: Sequence[int], action: np.ndarray) -> Step:
+    def _step_each(self, indices: Sequence[int], action: np.ndarray) -> Step:
         reward = np.zeros(self.n_envs, np.float32)
         terminated, truncated = np.zeros(self.n_envs, bool), np.zeros(self.n_envs, bool)
         info: list[dict[str, Any]] = [{}] * self.n_envs
         self.n_steps += 1
-        lost = {i: self._lost.pop(i) for i in which if i in self._lost}
+        lost = {i: self._lost.pop(i) for i in indices if i in self._lost}
         action = rows(action)
-        asked = {i: ("step", action[i]) for i in which if i not in lost}
-        said = {**self._heard(self.workers.ask(asked), "step"), **lost}
+        asked = {i: ("step", action[i]) for i in indices if i not in lost}
+        replies = {**self._heard(self.workers.ask(asked), "step"), **lost}
         stepped = {}
-        for i, answer in said.items():
-            if isinstance(answer, Restarted):
-                truncated[i], info[i] = True, {RESTARTED: answer.why}
+        for i, reply in replies.items():
+            if isinstance(reply, Restarted):
+                truncated[i], info[i] = True, {RESTARTED: reply.why}
             else:
-                _, reward[i], terminated[i], truncated[i], info[i] = stepped[i] = answer
+                _, reward[i], terminated[i], truncated[i], info[i] = stepped[i] = reply
         self._take(stepped)
         return Step(self._obs, reward, terminated, truncated, info)
 
-    def _take(self, answers: Mapping[int, Any]) -> None:
+    def _take(self, replies: Mapping[int, Any]) -> None:
         """Writes the observations of answers, or copies them out of shared memory, which a lost worker may still change."""
         if self._rows is None:
-            for i, answer in answers.items():
-                for store, leaf in zip(self._stores, answer[0], strict=True):
+            for i, reply in replies.items():
+                for store, leaf in zip(self._stores, reply[0], strict=True):
                     store[i] = leaf
             return
-        rows: Any = slice(None) if len(answers) == self.n_envs else [*answers]
+        rows: Any = slice(None) if len(replies) == self.n_envs else [*replies]
         for store, shared in zip(self._stores, self._rows, strict=True):
             store[rows] = shared[rows]
 
-    def _heard(self, said: dict[int, Any], what: str) -> dict[int, Any]:
+    def _heard(self, replies: dict[int, Any], method: str) -> dict[int, Any]:
         """Returns the answers. Raises if one of them is a failure."""
-        self._restarted.update(i for i, answer in said.items() if isinstance(answer, Restarted))
-        failed = {i: answer for i, answer in said.items() if isinstance(answer, WorkerFailure)}
+        self._restarted.update(i for i, reply in replies.items() if isinstance(reply, Restarted))
+        failed = {i: reply for i, reply in replies.items() if isinstance(reply, WorkerFailure)}
         if not failed:
-            return said
+            return replies
         first, failure = next(iter(failed.items()))
-        if failure.kind == "bad answer":
+        if failure.cause == "bad answer":
             raise BadEnvironmentError(validation.with_location(self.env_id, first, self.n_steps, failure.message))
-        which = f"environments {', '.join(map(str, failed))}" if len(failed) > 1 else f"environment {first}"
-        raise WorkerError(f"{which} failed in a worker process, at a {what}:\n{failure.trace}")
+        where = f"environments {', '.join(map(str, failed))}" if len(failed) > 1 else f"environment {first}"
+        raise WorkerError(f"{where} failed in a worker process, at a {method}:\n{failure.trace}")
 
     def infos(self, begun: bool = False) -> list[dict[str, Any]]:
         return [self._reset_infos[i] for i in range(self.n_envs)] if begun else super().infos()
 
     def call(self, name: str) -> list[Any]:
-        said = self.workers.ask(dict.fromkeys(range(self.n_envs), ("call", process.call_method, name, (), {})))
-        for answer in said.values():
-            if (
-                isinstance(answer, WorkerFailure) and answer.kind == "no attribute"
-            ):  # perhaps of something in the method
-                raise AttributeError(f"{name}:\n{answer.trace}")
-        self._lost |= {i: answer for i, answer in self._heard(said, name).items() if isinstance(answer, Restarted)}
-        return [None if i in self._lost else said[i] for i in range(self.n_envs)]
+        replies = self.workers.ask(dict.fromkeys(range(self.n_envs), ("call", process.call_method, name, (), {})))
+        for reply in replies.values():
+            if isinstance(reply, WorkerFailure) and reply.cause == "no attribute":  # perhaps of something in the method
+                raise AttributeError(f"{name}:\n{reply.trace}")
+        self._lost |= {i: reply for i, reply in self._heard(replies, name).items() if isinstance(reply, Restarted)}
+        return [None if i in self._lost else replies[i] for i in range(self.n_envs)]
 
     def success(self, step: Step, env: int) -> float:
         return success_of(step.info[env])
@@ -192,17 +190,17 @@ class InWorkers(VectorEnv):
         return goals_module.goal_functions(self._make_one())
 
     def snapshot(self) -> Any:
-        said = self._heard(self.workers.ask(dict.fromkeys(range(self.n_envs), ("snapshot",))), "snapshot")
-        self._lost |= {i: answer for i, answer in said.items() if isinstance(answer, Restarted)}
-        known = all(isinstance(one, list) for one in said.values())  # None: not supported
-        return [said[i] for i in range(self.n_envs)] if known else None
+        replies = self._heard(self.workers.ask(dict.fromkeys(range(self.n_envs), ("snapshot",))), "snapshot")
+        self._lost |= {i: reply for i, reply in replies.items() if isinstance(reply, Restarted)}
+        is_supported = all(isinstance(state, list) for state in replies.values())  # None: not supported
+        return [replies[i] for i in range(self.n_envs)] if is_supported else None
 
     def restore(self, saved: Any, obs: Any) -> list[int]:
         snapshot.check_count(saved, self.n_envs)
-        replies = self.workers.ask({i: ("restore", one) for i, one in enumerate(saved)})
-        for i, answer in replies.items():
-            if not isinstance(answer, bool):
-                why = answer.message if isinstance(answer, WorkerFailure) else answer.why
+        replies = self.workers.ask({i: ("restore", state) for i, state in enumerate(saved)})
+        for i, reply in replies.items():
+            if not isinstance(reply, bool):
+                why = reply.message if isinstance(reply, WorkerFailure) else reply.why
                 raise DivergedError(f"environment {i} cannot be restored: {why}")
         for store, leaf in zip(self._stores, jax.tree.leaves(obs), strict=True):
             store[...] = leaf

@@ -51,7 +51,7 @@ def find_id(name: str) -> str:
     module = import_source(source)
     new = set(gym.registry) - before
     new |= {key for key, spec in gym.registry.items() if module_of(spec.entry_point) == module.__name__}
-    new |= {key for key, entry in REGISTRY.items() if getattr(entry.kind, "__module__", None) == module.__name__}
+    new |= {key for key, entry in REGISTRY.items() if getattr(entry.entry_point, "__module__", None) == module.__name__}
     if env_id in gym.registry:
         return env_id
     names = " and ".join(sorted(new))

@@ -123,10 +123,10 @@ class SubprocVecEnv(SingleEnvs):
         replies = self.workers.answers(indices)
         for i, answer in replies.items():
             if isinstance(answer, WorkerFailure):
-                if attribute_errors and answer.kind == "no attribute":
+                if attribute_errors and answer.cause == "no attribute":
                     raise AttributeError(answer.message)
                 self.close()
-                if answer.kind == "bad answer":
+                if answer.cause == "bad answer":
                     raise BadEnvironmentError(with_location(type(self).__name__, i, self._n_steps, answer.message))
                 raise WorkerError(f"environment {i} raised an error:\n{answer.trace}")
         return replies
