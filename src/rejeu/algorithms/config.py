@@ -128,7 +128,7 @@ class AlgorithmConfig:
         coerce(self, "max_grad_norm", number, above=0, optional=True)
         assign(self, normalize=normalization.parse(self.normalize))
         coerce(self, "nonfinite", choice, among=("stop", "skip"))
-        coerce(self, "policy_kwargs", nested, kind=self.policy_kwargs_class)
+        coerce(self, "policy_kwargs", nested, config_class=self.policy_kwargs_class)
         coerce(self, "rnd", RndConfig.parse)
         coerce(self, "action_masks", flag)
         if self.action_masks and not self.can_mask:
@@ -213,7 +213,7 @@ class OffPolicyConfig(AlgorithmConfig):
         coerce(self, "train_freq", train_freq)
         coerce(self, "gradient_steps", whole, least=-1)
         coerce(self, "overlap", flag)
-        coerce(self, "priorities", nested, kind=PriorityConfig, optional=True)
+        coerce(self, "priorities", nested, config_class=PriorityConfig, optional=True)
         coerce(self, "demonstration_share", number, least=0, most=1)
         coerce(self, "offline", flag)
         if not isinstance(self.demonstrations, str | Path | None):

@@ -95,7 +95,7 @@ class Config(ppo.Config):
     }
 
     def __post_init__(self) -> None:
-        coerce(self, "policy_kwargs", nested, kind=RecurrentConfig)
+        coerce(self, "policy_kwargs", nested, config_class=RecurrentConfig)
         ppo.Config.__post_init__(self)
         if self.critic_learning_rate is not None:
             raise ValueError("critic_learning_rate: policy and value read through one encoder here; leave it out")

@@ -1,1 +1,1 @@
-"""What everything rests on: the parts of an algorithm, spaces, distributions, schedules, checks, files, devices, signals."""
+"""The foundation: the parts of an algorithm, spaces, distributions, schedules, checks, files, devices, signals."""

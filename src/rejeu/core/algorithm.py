@@ -74,7 +74,7 @@ def some_allowed(obs: PyTree) -> PyTree:
 
 
 class Remembered(NamedTuple):
-    """What networks with memory remember of the observations up to the present one, in place of it."""
+    """The memory that networks keep of the observations up to the present one, in place of it."""
 
     memory: Any
     """``(batch, n_numbers)``, of all networks of an algorithm."""
@@ -94,7 +94,7 @@ class Sequences(NamedTuple):
     n_absent: Any
     """How many of the first rows were no longer there and stand for nothing, ``int32 (n,)``."""
     memory: Any
-    """What was remembered before the first row that is there, ``(n, n_numbers)``."""
+    """The memory before the first row that is there, ``(n, n_numbers)``."""
     reads: Any
     """Which rows are read, ``int32 (n, n_reads)``."""
 
@@ -136,7 +136,7 @@ class Rollout(NamedTuple):
     started: Any
     """Where an episode began with the first step, ``bool (n_envs,)``."""
     carry: PyTree
-    """What a policy with memory remembered before the first step, leaves ``(n_envs, ...)``; ``()`` without memory."""
+    """The memory of a policy before the first step, leaves ``(n_envs, ...)``; ``()`` without memory."""
 
 
 class Clock(NamedTuple):
@@ -279,7 +279,7 @@ def descend(
 
 def _descend(params: PyTree, gradients: PyTree, optimizer_state: PyTree, optimizer: Any, rate: Any) -> Any:
     direction, optimizer_state = optimizer.update(gradients, optimizer_state, params)
-    step = lambda rate, part, d: jax.tree.map(lambda p, d: p - rate * d, part, d)  # noqa: E731
+    step = lambda rate, weights, d: jax.tree.map(lambda p, d: p - rate * d, weights, d)  # noqa: E731
     return jax.tree.map(step, rate, params, direction), optimizer_state
 
 
@@ -332,9 +332,9 @@ def tau_at(n_updates: Array, tau: float, interval: int) -> Any:
     return tau if interval == 1 else jnp.where(n_updates % interval == 0, tau, 0.0)
 
 
-def averaged_fields(kind: type) -> set[str]:
+def averaged_fields(state_class: type) -> set[str]:
     """Returns the names of the fields of a class of states that are declared :data:`AVERAGED`."""
-    return {field.name for field in dataclasses.fields(kind) if field.metadata.get("averaged", False)}
+    return {field.name for field in dataclasses.fields(state_class) if field.metadata.get("averaged", False)}
 
 
 def ensemble(init: Callable[[Array], PyTree], key: Array, size: int) -> PyTree:

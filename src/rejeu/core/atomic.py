@@ -36,7 +36,7 @@ ADVICE = {
     errno.EISDIR: "give a path that is not a folder",
     errno.ENAMETOOLONG: "give a shorter name",
 }
-"""What to do about each error."""
+"""The advice for each error."""
 
 
 def replace_patiently(source: Path, target: Path, waits: Iterable[float] = (0.01, 0.04, 0.2, 0.75)) -> None:
@@ -118,9 +118,9 @@ def append(path: Path, content: bytes) -> None:
         with open_file(path, "r+b", buffering=0) as file:
             end = file.seek(0, os.SEEK_END)
             try:
-                rest = memoryview(content)
-                while rest:
-                    rest = rest[file.write(rest) :]
+                remaining = memoryview(content)
+                while remaining:
+                    remaining = remaining[file.write(remaining) :]
             except BaseException:
                 file.truncate(end)
                 raise
@@ -178,11 +178,11 @@ def remove_stale(path: Path, age: float = STALE) -> None:
     """Removes temporary files of :func:`replacing` for ``path`` that were last written ``age`` seconds ago or earlier."""
     ours = re.compile(rf"\.{re.escape(path.name)}\.[0-9a-f]{{8}}\.tmp")
     with contextlib.suppress(OSError):
-        for other in path.parent.iterdir():
-            if ours.fullmatch(other.name):
+        for file in path.parent.iterdir():
+            if ours.fullmatch(file.name):
                 with contextlib.suppress(OSError):
-                    if time.time() - other.lstat().st_mtime > age:
-                        other.unlink()
+                    if time.time() - file.lstat().st_mtime > age:
+                        file.unlink()
 
 
 def shortened(path: str | Path) -> str:

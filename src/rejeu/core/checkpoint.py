@@ -146,20 +146,20 @@ def resolve(path: str | Path, suffix: str = SUFFIX) -> Path:
     Raises:
         ValueError: if it does not name a file, as ``""``, ``"."`` and ``"/"`` do not.
     """
-    if (given := Path(path)).name in ("", ".."):
+    if Path(path).name in ("", ".."):
         raise ValueError(f"{str(path)!r} is not the path of a file; give one, such as 'model{SUFFIX}'")
-    path = given
+    path = Path(path)
     return path if path.suffix else path.with_name(path.name + suffix)
 
 
-def write(path: str | Path, kind: str, arrays: Mapping[str, Any], header: Mapping[str, Any]) -> Path:
+def write(path: str | Path, file_type: str, arrays: Mapping[str, Any], header: Mapping[str, Any]) -> Path:
     """Writes a file and returns its path; an existing file is replaced only once the new one is on disk.
 
     Arrays are converted and written one at a time, so that no second copy of a replay buffer is made.
 
     Args:
         path: of the file; ``.safetensors`` is added if it has no suffix, and missing folders are created.
-        kind: the kind of content, which :func:`read` asks for.
+        file_type: of the content, which :func:`read` asks for.
         arrays: by name, of the dtypes in ``DTYPES``.
         header: JSON values by name; finite numbers only.
 
@@ -169,10 +169,10 @@ def write(path: str | Path, kind: str, arrays: Mapping[str, Any], header: Mappin
         TypeError: if a value of the header is not JSON, or for arrays of other dtypes.
     """
     path = resolve(path)
-    if taken := [key for key in RESERVED if key in header]:
-        raise ValueError(f"the header may not have a {taken[0]!r} of its own; choose another name")
+    if reserved := [key for key in RESERVED if key in header]:
+        raise ValueError(f"the header may not have a {reserved[0]!r} of its own; choose another name")
     sums = {name: _checksum(contiguous(name, value)) for name, value in arrays.items()}
-    text = json.dumps({"schema": SCHEMA, "kind": kind, **header, CHECKSUMS: sums}, allow_nan=False)
+    text = json.dumps({"schema": SCHEMA, "kind": file_type, **header, CHECKSUMS: sums}, allow_nan=False)
     start, names = table(arrays, {HEADER_KEY: text, CHECKSUM_KEY: _text_checksum(text)})
     with atomic.replacing(path) as file:
         file.write(start)
@@ -198,8 +198,8 @@ class Contents:
     @property
     def room(self) -> int:
         """Bytes of the file; of a sparse file, without its holes."""
-        found = self.path.stat()
-        return min(found.st_size, 512 * getattr(found, "st_blocks", found.st_size))
+        status = self.path.stat()
+        return min(status.st_size, 512 * getattr(status, "st_blocks", status.st_size))
 
     def read(self, prefix: str = "") -> dict[str, np.ndarray]:
         """Returns the arrays whose names begin with ``prefix``, by their full names.
@@ -221,8 +221,8 @@ class Contents:
 
 
 @contextlib.contextmanager
-def opened(path: str | Path, kind: str) -> Iterator[Contents]:
-    """Opens a file of that ``kind``.
+def opened(path: str | Path, file_type: str) -> Iterator[Contents]:
+    """Opens a file of that type.
 
     Instead of a missing ``model.zip``, ``model.safetensors`` is opened, and the other way round. No array is read: a loader
     first compares ``specs`` with what it expects (:func:`match`), so that a file cannot make it read more than the model
@@ -230,7 +230,7 @@ def opened(path: str | Path, kind: str) -> Iterator[Contents]:
 
     Raises:
         FileNotFoundError: if there is no such file.
-        CheckpointError: if it is not a complete rejeu file of that kind; it says what is wrong.
+        CheckpointError: if it is not a complete rejeu file of that type; it says what is wrong.
     """
     with contextlib.ExitStack() as stack:
         with explained(path):
@@ -238,36 +238,36 @@ def opened(path: str | Path, kind: str) -> Iterator[Contents]:
             check_table(path)
             file = stack.enter_context(safe_open(path, framework="numpy", backend="pread"))
             specs = specs_of(file)
-            header, sums = _head(path, file.metadata() or {}, {*specs}, kind)
+            header, sums = _head(path, file.metadata() or {}, {*specs}, file_type)
             size, memory = path.stat().st_size, physical_memory()
             if memory is not None and size > memory:
                 raise CheckpointError(f"{path} has {size / 2**30:.1f} GiB and the machine {memory / 2**30:.1f} GiB")
         yield Contents(path, file, header, specs, sums)
 
 
-def read(path: str | Path, kind: str) -> tuple[Header, dict[str, np.ndarray]]:
+def read(path: str | Path, file_type: str) -> tuple[Header, dict[str, np.ndarray]]:
     """Returns the header and all arrays, without comparing them with anything; loaders use :func:`opened`.
 
     Raises:
         FileNotFoundError: if there is no such file.
-        CheckpointError: if it is not a complete, undamaged rejeu file of that kind; it says what is wrong.
+        CheckpointError: if it is not a complete, undamaged rejeu file of that type; it says what is wrong.
     """
-    with opened(path, kind) as file:
+    with opened(path, file_type) as file:
         return file.header, file.read()
 
 
-def read_header(path: str | Path, kind: str) -> Header:
-    """Returns only the header of a file of that ``kind``; see :func:`opened`."""
-    with opened(path, kind) as file:
+def read_header(path: str | Path, file_type: str) -> Header:
+    """Returns only the header of a file of that type; see :func:`opened`."""
+    with opened(path, file_type) as file:
         return file.header
 
 
-def match(expected: PyTree, found: Mapping[str, Any], path: str | Path) -> None:
+def match(expected: PyTree, arrays: Mapping[str, Any], path: str | Path) -> None:
     """Raises ``CheckpointError``, naming the first difference, unless arrays or specs match a tree of shapes.
 
     Args:
         expected: a tree whose leaves have a shape and a dtype.
-        found: arrays or specs by name.
+        arrays: the arrays, or their specs, by name.
         path: of their file, for the message.
     """
     import jax  # here and below, so that a policy in NumPy starts without it
@@ -276,22 +276,22 @@ def match(expected: PyTree, found: Mapping[str, Any], path: str | Path) -> None:
 
     keys = names(expected)
     for key, leaf in zip(keys, jax.tree.leaves(expected), strict=True):
-        if key not in found:
+        if key not in arrays:
             raise CheckpointError(f"{path} has no {key}; it was saved with other networks or another algorithm")
-        if found[key].shape != leaf.shape or found[key].dtype != leaf.dtype:
+        if arrays[key].shape != leaf.shape or arrays[key].dtype != leaf.dtype:
             raise CheckpointError(
-                f"{path}: {key} is {found[key].dtype}{shown(list(found[key].shape))}, expected "
+                f"{path}: {key} is {arrays[key].dtype}{shown(list(arrays[key].shape))}, expected "
                 f"{leaf.dtype}{list(leaf.shape)}; it was saved with other networks or for another environment"
             )
-    if extra := sorted({*found} - {*keys}):
+    if extra := sorted({*arrays} - {*keys}):
         raise CheckpointError(
             f"{path} has {shown(extra[0])}, which this agent does not have; it was saved with another configuration"
         )
 
 
-def within(found: Mapping[str, Any], prefix: str) -> dict[str, Any]:
+def within(arrays: Mapping[str, Any], prefix: str) -> dict[str, Any]:
     """Returns the entries whose names begin with ``prefix``, which is removed."""
-    return {name.removeprefix(prefix): value for name, value in found.items() if name.startswith(prefix)}
+    return {name.removeprefix(prefix): value for name, value in arrays.items() if name.startswith(prefix)}
 
 
 @contextlib.contextmanager
@@ -325,7 +325,7 @@ def existing(path: str | Path) -> Path:
         path = resolve(path)
         if path.suffix in (SUFFIX, *FOREIGN) and not path.exists():
             others = (path.with_suffix(suffix) for suffix in (SUFFIX, *FOREIGN))
-            path = next((other for other in others if other.exists()), path)
+            path = next((candidate for candidate in others if candidate.exists()), path)
         if not path.exists():
             raise FileNotFoundError(f"there is no file {path}")
         if not path.is_file():
@@ -333,14 +333,14 @@ def existing(path: str | Path) -> Path:
         return path
 
 
-def _head(path: Path, metadata: Mapping[str, str], names: set[str], kind: str) -> tuple[Header, dict[str, int]]:
+def _head(path: Path, metadata: Mapping[str, str], names: set[str], file_type: str) -> tuple[Header, dict[str, int]]:
     """Returns the header and the arrays' checksums, both verified."""
     text = metadata.get(HEADER_KEY)
     if text is None:
         raise CheckpointError(f"{path} is a safetensors file, but not one that rejeu wrote: its header is missing")
     header = _header(path, text, metadata.get(CHECKSUM_KEY))
-    if header.get("kind") != kind:
-        raise CheckpointError(f"{path} holds {shown(header.get('kind'))!r}, expected {kind!r}")
+    if header.get("kind") != file_type:
+        raise CheckpointError(f"{path} holds {shown(header.get('kind'))!r}, expected {file_type!r}")
     sums = header.pop(CHECKSUMS, None)
     if not isinstance(sums, dict) or not all(type(value) is int for value in sums.values()):
         raise CheckpointError(f"{path}: the header holds no checksums; restore the file from a copy")
@@ -371,8 +371,8 @@ def _header(path: Path, text: str, checksum: str | None) -> Header:
 
 def _checksum(array: np.ndarray) -> int:
     """Returns the CRC-32 of an array's dtype, shape and contiguous bytes."""
-    kind = f"{array.dtype.name}{list(array.shape)}".encode()
-    return zlib.crc32(as_bytes(array), zlib.crc32(kind))
+    layout = f"{array.dtype.name}{list(array.shape)}".encode()
+    return zlib.crc32(as_bytes(array), zlib.crc32(layout))
 
 
 def _text_checksum(text: str) -> str:

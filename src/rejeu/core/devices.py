@@ -37,13 +37,13 @@ def named(device: Any, option: str = "device") -> str:
 
 def present() -> str:
     """Returns the devices that JAX has, in words."""
-    kinds: dict[str, int] = {}
+    counts: dict[str, int] = {}
     for platform in ("gpu", "tpu", "cpu"):
         try:
-            kinds[platform] = len(jax.local_devices(backend=platform))
+            counts[platform] = len(jax.local_devices(backend=platform))
         except RuntimeError:
             continue
-    return " and ".join(f"{n} {platform.upper()} device{'s' * (n > 1)}" for platform, n in kinds.items())
+    return " and ".join(f"{n} {platform.upper()} device{'s' * (n > 1)}" for platform, n in counts.items())
 
 
 @functools.cache

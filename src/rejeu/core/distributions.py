@@ -42,10 +42,10 @@ class Normal(NamedTuple):
         """Returns the most likely value, ``(..., action_dim)``."""
         return self.mean
 
-    def kl_divergence(self, other: Normal) -> Array:
-        """Returns the KL divergence of ``other`` from this distribution, ``(...)``, in nats."""
-        shift = jnp.square((self.mean - other.mean) * jnp.exp(-other.log_std))
-        log_ratio = other.log_std - self.log_std
+    def kl_divergence(self, q: Normal) -> Array:
+        """Returns the KL divergence of ``q`` from this distribution, ``(...)``, in nats."""
+        shift = jnp.square((self.mean - q.mean) * jnp.exp(-q.log_std))
+        log_ratio = q.log_std - self.log_std
         return jnp.sum(log_ratio + 0.5 * (jnp.exp(-2.0 * log_ratio) + shift - 1.0), axis=-1)
 
 
@@ -81,9 +81,9 @@ class TanhNormal(NamedTuple):
         """Returns the squashed mean, ``(..., action_dim)``."""
         return jnp.tanh(self.mean)
 
-    def kl_divergence(self, other: TanhNormal) -> Array:
-        """Returns the KL divergence of ``other`` from this distribution, ``(...)``, in nats: that before squashing."""
-        return Normal(self.mean, self.log_std).kl_divergence(Normal(other.mean, other.log_std))
+    def kl_divergence(self, q: TanhNormal) -> Array:
+        """Returns the KL divergence of ``q`` from this distribution, ``(...)``, in nats: that before squashing."""
+        return Normal(self.mean, self.log_std).kl_divergence(Normal(q.mean, q.log_std))
 
 
 class Categorical(NamedTuple):
@@ -111,10 +111,10 @@ class Categorical(NamedTuple):
         """Returns the most likely choice, ``int32 (...)``, the first of equals."""
         return jnp.argmax(self.logits, axis=-1).astype(jnp.int32)
 
-    def kl_divergence(self, other: Categorical) -> Array:
-        """Returns the KL divergence of ``other`` from this distribution, ``(...)``, in nats."""
-        own, others = jax.nn.log_softmax(self.logits), jax.nn.log_softmax(other.logits)
-        return jnp.sum(jnp.exp(own) * (own - others), axis=-1)
+    def kl_divergence(self, q: Categorical) -> Array:
+        """Returns the KL divergence of ``q`` from this distribution, ``(...)``, in nats."""
+        log_p, log_q = jax.nn.log_softmax(self.logits), jax.nn.log_softmax(q.logits)
+        return jnp.sum(jnp.exp(log_p) * (log_p - log_q), axis=-1)
 
 
 class MultiCategorical(NamedTuple):
@@ -126,23 +126,23 @@ class MultiCategorical(NamedTuple):
     def sample(self, key: Array) -> Array:
         """Returns one sample, ``int32 (..., n_choices)``."""
         keys = jax.random.split(key, len(self.parts))
-        return jnp.stack([part.sample(keys[i]) for i, part in enumerate(self.parts)], axis=-1)
+        return jnp.stack([choice.sample(keys[i]) for i, choice in enumerate(self.parts)], axis=-1)
 
     def log_prob(self, value: Array) -> Array:
         """Returns the log-probability of ``value``, ``int (..., n_choices)``, summed over the choices, in nats."""
-        return sum_of([part.log_prob(value[..., i]) for i, part in enumerate(self.parts)])
+        return sum_of([choice.log_prob(value[..., i]) for i, choice in enumerate(self.parts)])
 
     def entropy(self) -> Array:
         """Returns the entropy, ``(...)``, in nats."""
-        return sum_of([part.entropy() for part in self.parts])
+        return sum_of([choice.entropy() for choice in self.parts])
 
     def mode(self) -> Array:
         """Returns the most likely value, ``int32 (..., n_choices)``."""
-        return jnp.stack([part.mode() for part in self.parts], axis=-1)
+        return jnp.stack([choice.mode() for choice in self.parts], axis=-1)
 
-    def kl_divergence(self, other: MultiCategorical) -> Array:
-        """Returns the KL divergence of ``other`` from this distribution, ``(...)``, in nats."""
-        return sum_of([own.kl_divergence(theirs) for own, theirs in zip(self.parts, other.parts, strict=True)])
+    def kl_divergence(self, q: MultiCategorical) -> Array:
+        """Returns the KL divergence of ``q`` from this distribution, ``(...)``, in nats."""
+        return sum_of([a.kl_divergence(b) for a, b in zip(self.parts, q.parts, strict=True)])
 
 
 class Bernoulli(NamedTuple):
@@ -163,19 +163,19 @@ class Bernoulli(NamedTuple):
 
     def entropy(self) -> Array:
         """Returns the entropy, ``(...)``, in nats."""
-        one, zero = jax.nn.log_sigmoid(self.logits), jax.nn.log_sigmoid(-self.logits)
-        return -jnp.sum(jnp.exp(one) * one + jnp.exp(zero) * zero, axis=-1)
+        log_one, log_zero = jax.nn.log_sigmoid(self.logits), jax.nn.log_sigmoid(-self.logits)
+        return -jnp.sum(jnp.exp(log_one) * log_one + jnp.exp(log_zero) * log_zero, axis=-1)
 
     def mode(self) -> Array:
         """Returns the most likely bits, ``int32 (..., n)``."""
         return (self.logits > 0).astype(jnp.int32)
 
-    def kl_divergence(self, other: Bernoulli) -> Array:
-        """Returns the KL divergence of ``other`` from this distribution, ``(...)``, in nats."""
-        one = jax.nn.log_sigmoid(self.logits) - jax.nn.log_sigmoid(other.logits)
-        zero = jax.nn.log_sigmoid(-self.logits) - jax.nn.log_sigmoid(-other.logits)
+    def kl_divergence(self, q: Bernoulli) -> Array:
+        """Returns the KL divergence of ``q`` from this distribution, ``(...)``, in nats."""
+        log_one = jax.nn.log_sigmoid(self.logits) - jax.nn.log_sigmoid(q.logits)
+        log_zero = jax.nn.log_sigmoid(-self.logits) - jax.nn.log_sigmoid(-q.logits)
         share = jax.nn.sigmoid(self.logits)
-        return jnp.sum(share * one + (1.0 - share) * zero, axis=-1)
+        return jnp.sum(share * log_one + (1.0 - share) * log_zero, axis=-1)
 
 
 class Joint(NamedTuple):
@@ -187,30 +187,30 @@ class Joint(NamedTuple):
     def sample(self, key: Array) -> Array:
         """Returns one sample, ``float32 (..., width)``."""
         keys = jax.random.split(key, len(self.parts))
-        return self.joined([part.sample(keys[i]) for i, part in enumerate(self.parts)])
+        return self.joined([factor.sample(keys[i]) for i, factor in enumerate(self.parts)])
 
     def log_prob(self, value: Array) -> Array:
         """Returns the log-probability of ``value``, ``(...)``, the sum over the parts, in nats."""
-        ends = np.cumsum([width(part) for part in self.parts])[:-1].tolist()
+        ends = np.cumsum([width(factor) for factor in self.parts])[:-1].tolist()
         pairs = zip(self.parts, jnp.split(value, ends, axis=-1), strict=True)
-        return sum_of([part.log_prob(x[..., 0] if isinstance(part, Categorical) else x) for part, x in pairs])
+        return sum_of([factor.log_prob(x[..., 0] if isinstance(factor, Categorical) else x) for factor, x in pairs])
 
     def entropy(self) -> Array:
         """Returns the entropy, ``(...)``, the sum over the parts, in nats."""
-        return sum_of([part.entropy() for part in self.parts])
+        return sum_of([factor.entropy() for factor in self.parts])
 
     def mode(self) -> Array:
         """Returns the most likely value, ``float32 (..., width)``."""
-        return self.joined([part.mode() for part in self.parts])
+        return self.joined([factor.mode() for factor in self.parts])
 
-    def kl_divergence(self, other: Joint) -> Array:
-        """Returns the KL divergence of ``other`` from this distribution, ``(...)``, in nats."""
-        return sum_of([own.kl_divergence(theirs) for own, theirs in zip(self.parts, other.parts, strict=True)])
+    def kl_divergence(self, q: Joint) -> Array:
+        """Returns the KL divergence of ``q`` from this distribution, ``(...)``, in nats."""
+        return sum_of([a.kl_divergence(b) for a, b in zip(self.parts, q.parts, strict=True)])
 
     def joined(self, values: list[Array]) -> Array:
         """Returns values of the parts as one, ``float32 (..., width)``."""
         pairs = zip(self.parts, values, strict=True)
-        columns = [x[..., None] if isinstance(part, Categorical) else x for part, x in pairs]
+        columns = [x[..., None] if isinstance(factor, Categorical) else x for factor, x in pairs]
         return jnp.concatenate([column.astype(jnp.float32) for column in columns], axis=-1)
 
 

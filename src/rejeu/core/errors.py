@@ -90,8 +90,8 @@ def expected_errors() -> tuple[type[Exception], ...]:
     """Returns the errors whose message is meant for the user; the others are bugs and keep their traceback."""
     import gymnasium  # takes longer than all that --help needs
 
-    own = (BadEnvironmentError, NonFiniteError, RunInUseError, WorkerError)
-    return ValueError, TypeError, ImportError, OSError, MemoryError, *own, gymnasium.error.Error
+    ours = (BadEnvironmentError, NonFiniteError, RunInUseError, WorkerError)
+    return ValueError, TypeError, ImportError, OSError, MemoryError, *ours, gymnasium.error.Error
 
 
 def one_line(error: Exception | Warning | str) -> str:

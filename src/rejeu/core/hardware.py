@@ -28,16 +28,16 @@ def cores() -> int:
     A share of 1.5 cores, as containers may have, counts as 2.
     """
     try:
-        found = len(os.sched_getaffinity(0))
+        n = len(os.sched_getaffinity(0))
     except AttributeError:  # macOS and Windows
-        found = os.cpu_count() or 1
+        n = os.cpu_count() or 1
     for group in groups("cpu"):
-        one, two = group / "cpu.cfs_quota_us", group / "cpu.cfs_period_us"  # version 1
-        quota, period = _text(group / "cpu.max").split() or (_text(one).strip(), _text(two).strip())
+        quota_file, period_file = group / "cpu.cfs_quota_us", group / "cpu.cfs_period_us"  # version 1
+        quota, period = _text(group / "cpu.max").split() or (_text(quota_file).strip(), _text(period_file).strip())
         if quota.isdecimal() and period.isdecimal():
-            found = min(found, max(math.ceil(int(quota) / int(period)), 1))
+            n = min(n, max(math.ceil(int(quota) / int(period)), 1))
     limit = os.environ.get(CORES, "")
-    return min(found, int(limit)) if limit.isdecimal() and int(limit) > 0 else found
+    return min(n, int(limit)) if limit.isdecimal() and int(limit) > 0 else n
 
 
 def physical_memory() -> int | None:
@@ -62,8 +62,8 @@ def free_memory() -> int | None:
     for group, limit in limited_groups():
         used = _value(group / "memory.current") or _value(group / "memory.usage_in_bytes") or 0
         cached = _value(group / "memory.stat", "total_inactive_file") or _value(group / "memory.stat", "inactive_file")
-        left = max(limit - max(used - (cached or 0), 0), 0)
-        free = left if free is None else min(free, left)
+        remaining = max(limit - max(used - (cached or 0), 0), 0)
+        free = remaining if free is None else min(free, remaining)
     return free
 
 
@@ -90,7 +90,7 @@ def groups(controller: str) -> Iterator[Path]:
 
 
 def _text(path: Path) -> str:
-    """Returns what a file holds; nothing if it cannot be read."""
+    """Returns the text of a file; nothing if it cannot be read."""
     try:
         return path.read_text(encoding="utf-8")
     except OSError:
@@ -99,8 +99,8 @@ def _text(path: Path) -> str:
 
 def _value(path: Path, name: str = "") -> int | None:
     """Returns the number after ``name`` at the beginning of a line; None if there is none, or no such file."""
-    found = re.search(rf"^{name}\s*(\d+)", _text(path), re.MULTILINE)
-    return int(found[1]) if found else None
+    match = re.search(rf"^{name}\s*(\d+)", _text(path), re.MULTILINE)
+    return int(match[1]) if match else None
 
 
 def quiet_sdl() -> None:

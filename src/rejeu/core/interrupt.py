@@ -50,7 +50,7 @@ active: list[Interrupt] = []
 
 def requested() -> int | None:
     """Returns the signal that asked to stop, if a context of :class:`Interrupt` received one; else None."""
-    return next((one.signal for one in active if one.signal is not None), None)
+    return next((context.signal for context in active if context.signal is not None), None)
 
 
 class Interrupt:
@@ -96,7 +96,7 @@ class Interrupt:
         if self.signal is not None and not self._is_within(self.signal):
             raise Stopped(self.signal)
 
-    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(self, error_type: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
         active.remove(self)
         restore(self._previous)
 

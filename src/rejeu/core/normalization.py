@@ -108,9 +108,9 @@ def merged(moments: Moments, values: Array, weight: Array) -> Moments:
     first = moments.n_seen == 0
     old = jnp.where(first, 0.0, moments.variance)
     after = (1.0 - share) * old + share * variance + (1.0 - share) * share * jnp.square(delta)
-    seen = Moments(moments.mean + share * delta, after, jnp.minimum(total, MAX_COUNT))
-    counts = (n > 0) & jnp.isfinite(seen.mean).all() & jnp.isfinite(seen.variance).all()
-    return jax.tree.map(lambda new, before: jnp.where(counts, new, before), seen, moments)
+    updated = Moments(moments.mean + share * delta, after, jnp.minimum(total, MAX_COUNT))
+    counts = (n > 0) & jnp.isfinite(updated.mean).all() & jnp.isfinite(updated.variance).all()
+    return jax.tree.map(lambda new, before: jnp.where(counts, new, before), updated, moments)
 
 
 class Statistics(NamedTuple):
@@ -229,7 +229,7 @@ class Normalizer(NamedTuple):
 
 
 def normalizer_of(leaves: tuple[Leaf, ...], config: NormalizationConfig, gamma: float = 1.0) -> Normalizer:
-    """Returns what normalizes observations of these leaves, and rewards."""
+    """Returns the functions that normalize observations of these leaves, and rewards."""
     indices = groups(leaves, config.share_goals)
     shapes = {g: leaf.shape for g, leaf in zip(indices, leaves, strict=True) if g is not None}
     return Normalizer(indices, shapes, config, gamma)
@@ -277,12 +277,12 @@ def acting_normalized(algorithm: Algorithm, explorer: Explorer, normalizer: Norm
     The actor is the pair of the algorithm's actor and the statistics.
     """
 
-    def by_actor(function: Callable[..., Any] | None, place: int = 0) -> Any:
-        """Returns a function whose argument at ``place`` is the actor, followed by observations; None of None."""
+    def by_actor(function: Callable[..., Any] | None, index: int = 0) -> Any:
+        """Returns a function whose argument at ``index`` is the actor, followed by observations; None of None."""
 
         def call(*arguments: Any) -> Any:
-            (actor, statistics), obs, *rest = arguments[place:]
-            return function(*arguments[:place], actor, normalizer.obs(statistics, obs), *rest)  # type: ignore[misc]
+            (actor, statistics), obs, *remaining = arguments[index:]
+            return function(*arguments[:index], actor, normalizer.obs(statistics, obs), *remaining)  # type: ignore[misc]
 
         return None if function is None else call
 

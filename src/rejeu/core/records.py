@@ -68,17 +68,17 @@ def parse_json(text: str | bytes) -> Any:
         raise Malformed(f"it is not valid JSON: {str(error)[:80]}") from None
 
 
-def read_json(path: Path, most: int) -> Any:
-    """Returns the value of a JSON file of at most ``most`` bytes.
+def read_json(path: Path, max_bytes: int) -> Any:
+    """Returns the value of a JSON file of at most ``max_bytes`` bytes.
 
     Raises:
         Malformed: if the file is longer, or no valid document.
         OSError: if it cannot be read.
     """
     with path.open("rb") as file:
-        data = file.read(most + 1)
-    if len(data) > most:
-        raise Malformed(f"it has more than {most:,} bytes")
+        data = file.read(max_bytes + 1)
+    if len(data) > max_bytes:
+        raise Malformed(f"it has more than {max_bytes:,} bytes")
     return parse_json(data)
 
 
@@ -97,11 +97,11 @@ def _as_dict(value: Any) -> dict[str, Any]:
         return dict(value)
     if isinstance(value, type):
         raise TypeError(f"{value!r} is no value of JSON")
-    return {one.name: getattr(value, one.name) for one in dataclasses.fields(value)}
+    return {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
 
 
-def convert(value: Any, kind: type[T]) -> T:
-    """Returns a JSON value, or one with arrays, as a record of type ``kind``.
+def convert(value: Any, record_type: type[T]) -> T:
+    """Returns a JSON value, or one with arrays, as a record of type ``record_type``.
 
     Raises:
         CheckpointError: if types or bounds differ; it names the field, what was received and what was expected.
@@ -112,21 +112,21 @@ def convert(value: Any, kind: type[T]) -> T:
     rejeu.core.errors.CheckpointError: [0]=-1: expected `int` >= 0
     """
     try:
-        return msgspec.convert(value, kind)
+        return msgspec.convert(value, record_type)
     except msgspec.ValidationError as error:
-        problem, _, place = str(error).partition(" - at ")
-        raise CheckpointError(f"{_received(value, place)}{problem[:1].lower()}{problem[1:]}") from None
+        problem, _, path = str(error).partition(" - at ")
+        raise CheckpointError(f"{_received(value, path)}{problem[:1].lower()}{problem[1:]}") from None
 
 
-def is_deep(value: Any, most: int) -> bool:
-    """Returns whether a JSON value has more than ``most`` levels."""
+def is_deep(value: Any, max_depth: int) -> bool:
+    """Returns whether a JSON value has more than ``max_depth`` levels."""
     level = [value]
-    for _ in range(most):
+    for _ in range(max_depth):
         level = [
             child
-            for one in level
-            if isinstance(one, dict | list)
-            for child in (one.values() if isinstance(one, dict) else one)
+            for node in level
+            if isinstance(node, dict | list)
+            for child in (node.values() if isinstance(node, dict) else node)
         ]
         if not level:
             break
@@ -139,7 +139,7 @@ def shown(value: Any, length: int = 100) -> str:
     >>> print(shown("héros\u202e\n"))
     héros\u202e\n
     """
-    text = "".join(one if one.isprintable() else ascii(one)[1:-1] for one in str(value)[: length + 1])
+    text = "".join(char if char.isprintable() else ascii(char)[1:-1] for char in str(value)[: length + 1])
     return text if len(text) <= length else text[: length - 3] + "..."
 
 
@@ -158,9 +158,9 @@ def brief(error: BaseException) -> str:
     return text if len(text) <= 400 else text[:397] + "..."
 
 
-def _received(value: Any, place: str) -> str:
-    """Returns ``field=value: `` for a place such as ``$.counters.step``, or the place alone where it has no index."""
-    name = place.replace("`", "").removeprefix("$").lstrip(".")
+def _received(value: Any, path: str) -> str:
+    """Returns ``field=value: `` for a path such as ``$.counters.step``, or the path alone where it has no index."""
+    name = path.replace("`", "").removeprefix("$").lstrip(".")
     if not name or "..." in name or " " in name:
         return f"{name}: " if name else ""
     for key, index in re.findall(r"([^.\[\]]+)|\[(\d+)\]", name):
@@ -188,10 +188,10 @@ def encode(value: Any, arrays: dict[str, np.ndarray], name: str) -> Any:
         arrays[name] = np.array(value)
         return {"array" if isinstance(value, np.ndarray) else "scalar": name}
     if isinstance(value, list | tuple):
-        parts = [encode(part, arrays, f"{name}.{i}") for i, part in enumerate(value)]
+        parts = [encode(child, arrays, f"{name}.{i}") for i, child in enumerate(value)]
         return parts if isinstance(value, list) else {"tuple": parts}
     if isinstance(value, Mapping) and all(isinstance(key, str) for key in value):
-        return {"dict": {key: encode(part, arrays, f"{name}.{key}") for key, part in value.items()}}
+        return {"dict": {key: encode(child, arrays, f"{name}.{key}") for key, child in value.items()}}
     raise TypeError(f"{name} is a {type(value).__name__}; expected numbers, strings, lists, tuples, dicts and arrays")
 
 
@@ -202,16 +202,16 @@ def decode(value: Any, arrays: Mapping[str, np.ndarray]) -> Any:
         CheckpointError: if ``value`` cannot come from :func:`encode`.
     """
     if isinstance(value, list):
-        return [decode(part, arrays) for part in value]
+        return [decode(child, arrays) for child in value]
     if not isinstance(value, dict):
         return value
-    kind, content = next(iter(value.items())) if len(value) == 1 else (None, None)
-    if kind == "dict" and isinstance(content, dict):
-        return {key: decode(part, arrays) for key, part in content.items()}
-    if kind == "tuple" and isinstance(content, list):
-        return tuple(decode(part, arrays) for part in content)
-    if kind == "float" and content in ("nan", "inf", "-inf"):
+    tag, content = next(iter(value.items())) if len(value) == 1 else (None, None)
+    if tag == "dict" and isinstance(content, dict):
+        return {key: decode(child, arrays) for key, child in content.items()}
+    if tag == "tuple" and isinstance(content, list):
+        return tuple(decode(child, arrays) for child in content)
+    if tag == "float" and content in ("nan", "inf", "-inf"):
         return float(content)
-    if kind in ("array", "scalar") and isinstance(content, str) and content in arrays:
-        return arrays[content] if kind == "array" else arrays[content][()]
+    if tag in ("array", "scalar") and isinstance(content, str) and content in arrays:
+        return arrays[content] if tag == "array" else arrays[content][()]
     raise CheckpointError("the data have an unknown form; the file is damaged")

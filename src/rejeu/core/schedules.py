@@ -87,11 +87,11 @@ class TableSchedule:
             raise ValueError(f"a schedule needs two values or more, all finite; got {self.values!s:.80}")
 
     def __call__(self, progress: Any) -> Any:
-        place = _clip(progress) * (len(self.values) - 1)
-        if isinstance(place, int | float):
-            below = min(int(place), len(self.values) - 2)
-            return self.values[below] + (place - below) * (self.values[below + 1] - self.values[below])
-        return jnp.interp(place, jnp.arange(len(self.values)), jnp.array(self.values, jnp.float32))
+        position = _clip(progress) * (len(self.values) - 1)
+        if isinstance(position, int | float):
+            below = min(int(position), len(self.values) - 2)
+            return self.values[below] + (position - below) * (self.values[below + 1] - self.values[below])
+        return jnp.interp(position, jnp.arange(len(self.values)), jnp.array(self.values, jnp.float32))
 
 
 class Live:
@@ -151,8 +151,8 @@ def _schedule_of(name: str, value: Any) -> Schedule:
         if isinstance(value, str) and value.startswith("lin_"):
             return Linear(float(value.removeprefix("lin_")))
         if isinstance(value, Mapping) and value.get("schedule") in SCHEDULES:
-            given = {key: part for key, part in value.items() if key != "schedule"}
-            return SCHEDULES[value["schedule"]](**given)
+            fields = {key: number for key, number in value.items() if key != "schedule"}
+            return SCHEDULES[value["schedule"]](**fields)
     except (TypeError, ValueError) as error:
         raise type(error)(f"{name}={value!r} is not a schedule: {error}") from None
     if callable(value):
@@ -186,7 +186,7 @@ def check_function(name: str, function: Schedule) -> None:
 
 def to_json(schedule: Any) -> dict[str, Any]:
     """Returns the JSON form that :func:`parse` reads."""
-    name = next(key for key, kind in SCHEDULES.items() if isinstance(schedule, kind))
+    name = next(key for key, schedule_class in SCHEDULES.items() if isinstance(schedule, schedule_class))
     return {"schedule": name, **asdict(schedule)}
 
 

@@ -67,12 +67,8 @@ def leaves(space: spaces.Space, path: str = "") -> tuple[Leaf, ...]:
     if isinstance(space, spaces.Dict | spaces.Tuple) and not len(space.spaces):
         where = f" at {path!r}" if path else ""
         raise TypeError(f"the observation space{where} is {space}, which holds nothing; give it a part or leave it out")
-    if isinstance(space, spaces.Dict):
-        return tuple(
-            leaf for key in sorted(space.spaces) for leaf in leaves(space.spaces[key], f"{path}.{key}".lstrip("."))
-        )
-    if isinstance(space, spaces.Tuple):
-        return tuple(leaf for i, part in enumerate(space.spaces) for leaf in leaves(part, f"{path}.{i}".lstrip(".")))
+    if isinstance(space, spaces.Dict | spaces.Tuple):
+        return tuple(leaf for key in _keys(space) for leaf in leaves(space.spaces[key], f"{path}.{key}".lstrip(".")))
     if isinstance(space, spaces.Box):
         is_image = space.dtype == np.uint8 and len(space.shape) in (3, 4)
         return (Leaf(path, "image" if is_image else "continuous", space.shape, stored_dtype(space)),)
@@ -98,14 +94,14 @@ def groups(leaves: tuple[Leaf, ...], share_goals: bool = True) -> list[int | Non
     With ``share_goals`` the achieved and the desired goal have the same: hindsight replaces one by the other, and their
     difference must keep its meaning.
     """
-    found: dict[str, int] = {}
+    indices: dict[str, int] = {}
     result: list[int | None] = []
     for leaf in leaves:
         if leaf.kind != "continuous":
             result.append(None)
             continue
         name = "goal" if share_goals and leaf.path in ("achieved_goal", "desired_goal") else f"leaf {leaf.path}"
-        result.append(found.setdefault(name, len(found)))
+        result.append(indices.setdefault(name, len(indices)))
     return result
 
 
@@ -124,7 +120,7 @@ def flat_keys(tree_structure: Any) -> list[str] | None:
     import jax
 
     skeleton = jax.tree.unflatten(tree_structure, range(tree_structure.num_leaves))
-    is_flat = isinstance(skeleton, dict) and all(isinstance(part, int) for part in skeleton.values())
+    is_flat = isinstance(skeleton, dict) and all(isinstance(child, int) for child in skeleton.values())
     return list(skeleton) if is_flat else None
 
 
@@ -219,9 +215,9 @@ def parts(space: spaces.Space, observation: Any) -> list[Any]:
         ValueError: if a tuple has another length than in the space.
     """
     if isinstance(space, spaces.Dict):
-        return [one for key in sorted(space.spaces) for one in parts(space.spaces[key], observation[key])]
+        return [leaf for key in sorted(space.spaces) for leaf in parts(space.spaces[key], observation[key])]
     if isinstance(space, spaces.Tuple):
-        return [one for part, obs in zip(space.spaces, observation, strict=True) for one in parts(part, obs)]
+        return [leaf for subspace, obs in zip(space.spaces, observation, strict=True) for leaf in parts(subspace, obs)]
     return [observation]
 
 
@@ -235,9 +231,9 @@ def plain(space: spaces.Space, observation: Any) -> Any:
         KeyError: if a key of the space is missing.
     """
     if isinstance(space, spaces.Dict):
-        return {key: plain(part, observation[key]) for key, part in space.spaces.items()}
+        return {key: plain(subspace, observation[key]) for key, subspace in space.spaces.items()}
     if isinstance(space, spaces.Tuple):
-        return tuple(plain(part, one) for part, one in zip(space.spaces, observation, strict=True))
+        return tuple(plain(subspace, obs) for subspace, obs in zip(space.spaces, observation, strict=True))
     return observation
 
 
@@ -328,11 +324,11 @@ def check_discrete_action(space: spaces.Space, algorithm: str) -> int:
     return int(space.n)
 
 
-def wrong_action(space: spaces.Space, algorithm: str, kind: str, advice: str) -> ValueError:
-    """Returns the error for actions that are not of ``kind``, with advice for these, if there is any."""
-    wrapped = f"wrap the environment in a gymnasium.ActionWrapper with a {kind} action space"
+def wrong_action(space: spaces.Space, algorithm: str, expected: str, advice: str) -> ValueError:
+    """Returns the error for actions that are not ``expected``, with advice for these, if there is any."""
+    wrapped = f"wrap the environment in a gymnasium.ActionWrapper with a {expected} action space"
     instead = f"for this environment {advice}" if advice else wrapped
-    return ValueError(f"{algorithm} needs a {kind} action space, got {space}; {instead}")
+    return ValueError(f"{algorithm} needs a {expected} action space, got {space}; {instead}")
 
 
 def check_action(space: spaces.Space, algorithm: str) -> spaces.Space:
@@ -352,8 +348,8 @@ def check_action(space: spaces.Space, algorithm: str) -> spaces.Space:
                 f"every action bound must satisfy low < high, got low={space.low.tolist()}, high={space.high.tolist()}"
             )
     elif isinstance(space, spaces.Dict | spaces.Tuple) and len(space.spaces):
-        for part in members(space):
-            check_action(part, algorithm)
+        for subspace in members(space):
+            check_action(subspace, algorithm)
     elif not isinstance(space, spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary):
         raise ValueError(
             f"{algorithm} needs a Box, Discrete, MultiDiscrete or MultiBinary action space, or a Dict or Tuple of these, "
@@ -405,19 +401,19 @@ def nested_action(space: spaces.Dict | spaces.Tuple, action: Any, scale: Callabl
 
     The arrays are of NumPy or of JAX.
     """
-    found, begin = list[Any](), 0
-    for part in members(space):
-        numbers = action[:, begin : begin + action_width(part)]
-        begin += action_width(part)
-        found.append(scale(part, numbers[:, 0] if isinstance(part, spaces.Discrete) else numbers))
-    return dict(zip(_keys(space), found, strict=True)) if isinstance(space, spaces.Dict) else tuple(found)
+    actions, begin = list[Any](), 0
+    for subspace in members(space):
+        numbers = action[:, begin : begin + action_width(subspace)]
+        begin += action_width(subspace)
+        actions.append(scale(subspace, numbers[:, 0] if isinstance(subspace, spaces.Discrete) else numbers))
+    return dict(zip(_keys(space), actions, strict=True)) if isinstance(space, spaces.Dict) else tuple(actions)
 
 
 def rows(action: Any) -> Any:
     """Returns a batch of actions as a sequence of single ones: an array as it is, of a Dict or Tuple a list."""
     if isinstance(action, dict):
         parts = zip(*map(rows, action.values()), strict=True)
-        return [dict(zip(action, part, strict=True)) for part in parts]
+        return [dict(zip(action, row, strict=True)) for row in parts]
     return [*zip(*map(rows, action), strict=True)] if isinstance(action, tuple) else action
 
 
@@ -440,7 +436,7 @@ def scale_action(space: spaces.Space, action: Any, xp: Any = np) -> Any:
 def action_scaler(space: spaces.Space, xp: Any = np) -> Callable[[Any], Any]:
     """Returns :func:`scale_action` for one space."""
     if isinstance(space, spaces.Dict | spaces.Tuple):
-        return lambda action: nested_action(space, action, lambda part, numbers: scale_action(part, numbers, xp))
+        return lambda action: nested_action(space, action, lambda member, numbers: scale_action(member, numbers, xp))
     shape, dtype = (-1, *(space.shape or ())), space.dtype if xp is np else narrow(space.dtype)
     if isinstance(space, spaces.Box):
         return box_scaler(space, shape, dtype if xp is np else stored_dtype(space), xp)
@@ -515,7 +511,7 @@ def random_action(space: spaces.Space, n: int, rng: Any, mask: Any = None) -> An
     if isinstance(space, spaces.MultiBinary):
         return rng.integers(2, size=(n, int(np.prod(space.shape))), dtype=np.int32)
     if isinstance(space, spaces.Dict | spaces.Tuple) and len(space.spaces):
-        parts = [random_action(part, n, rng).reshape(n, -1) for part in members(space)]
+        parts = [random_action(subspace, n, rng).reshape(n, -1) for subspace in members(space)]
         return np.concatenate(parts, axis=-1).astype(np.float32)
     raise TypeError(f"the actions are {space}; agents choose Box, Discrete, MultiDiscrete, MultiBinary, Dict and Tuple")
 
@@ -549,23 +545,23 @@ def check_env_actions(space: spaces.Space, action: np.ndarray, owner: str) -> No
         raise ValueError(f"{owner} has actions from {action.min()} to {action.max()}, expected {space}")
 
 
-def same(space: spaces.Space, other: spaces.Space, bounds: bool) -> bool:
+def same(space: spaces.Space, compared: spaces.Space, bounds: bool) -> bool:
     """Returns whether two spaces hold arrays of the same structure, shapes and dtypes, and the same bounds if asked.
 
     Backends declare different observation bounds for the same environment, and nothing depends on them. Bounds are compared as
     ``float32``: MuJoCo's actions have this dtype in Gymnasium, and ``float64`` in EnvPool.
     """
     if bounds:
-        return describe(space, single=True) == describe(other, single=True)
-    return leaves(space) == leaves(other)
+        return describe(space, single=True) == describe(compared, single=True)
+    return leaves(space) == leaves(compared)
 
 
 def describe(space: spaces.Space, single: bool = False) -> Any:
     """Returns a description of a space in JSON values; infinite bounds are strings. With ``single`` floats are float32."""
     if isinstance(space, spaces.Dict):
-        return {"Dict": {key: describe(part, single) for key, part in sorted(space.spaces.items())}}
+        return {"Dict": {key: describe(subspace, single) for key, subspace in sorted(space.spaces.items())}}
     if isinstance(space, spaces.Tuple):
-        return {"Tuple": [describe(part, single) for part in space.spaces]}
+        return {"Tuple": [describe(subspace, single) for subspace in space.spaces]}
     if isinstance(space, spaces.Box):
         dtype = space.dtype
         if single if dtype.kind == "f" else stored_dtype(space) != "float32":
@@ -592,32 +588,32 @@ def rebuild(description: Any, largest: int = MAX_NUMBERS) -> spaces.Space:
     Raises:
         ValueError: if the description is not one that :func:`describe` writes, or is of a larger space.
     """
-    left = largest
+    remaining = largest
 
     def build(description: Any) -> spaces.Space:
-        nonlocal left
-        ((kind, body),) = description.items()
-        if kind in ("Dict", "Tuple") and len(body) > MAX_LEAVES:
+        nonlocal remaining
+        ((name, body),) = description.items()
+        if name in ("Dict", "Tuple") and len(body) > MAX_LEAVES:
             raise ValueError(f"{len(body)} parts, expected {MAX_LEAVES} at most")
-        if kind == "Dict":
-            return spaces.Dict({key: build(part) for key, part in body.items()})
-        if kind == "Tuple":
-            return spaces.Tuple([build(part) for part in body])
-        size = {"Discrete": "n", "MultiDiscrete": "nvec"}.get(kind)
-        left -= sum(np.ravel(body[size]).tolist()) if size else math.prod(body["shape"])
-        if left < 0:
-            raise ValueError(f"{largest - left} numbers, expected {largest} at most")
-        if kind == "Box" and np.dtype(str(body["dtype"])).kind in "fiu":
+        if name == "Dict":
+            return spaces.Dict({key: build(subspace) for key, subspace in body.items()})
+        if name == "Tuple":
+            return spaces.Tuple([build(subspace) for subspace in body])
+        size = {"Discrete": "n", "MultiDiscrete": "nvec"}.get(name)
+        remaining -= sum(np.ravel(body[size]).tolist()) if size else math.prod(body["shape"])
+        if remaining < 0:
+            raise ValueError(f"{largest - remaining} numbers, expected {largest} at most")
+        if name == "Box" and np.dtype(str(body["dtype"])).kind in "fiu":
             dtype, shape = np.dtype(body["dtype"]), tuple(body["shape"])
             low, high = (np.broadcast_to(_bound(body[end], dtype), shape) for end in ("low", "high"))
             return spaces.Box(low, high, shape, dtype.type)
-        if kind == "Discrete":
+        if name == "Discrete":
             return spaces.Discrete(body["n"], start=body["start"])
-        if kind == "MultiDiscrete":
+        if name == "MultiDiscrete":
             return spaces.MultiDiscrete(body["nvec"], start=body["start"])
-        if kind == "MultiBinary":
+        if name == "MultiBinary":
             return spaces.MultiBinary(body["shape"])
-        raise ValueError(f"{str(kind)[:40]!r}")
+        raise ValueError(f"{str(name)[:40]!r}")
 
     try:
         return build(description)
@@ -632,7 +628,7 @@ def _bound(value: Any, dtype: np.dtype) -> np.ndarray:
         return bound.astype(dtype)
     limits = np.iinfo(dtype)
     nearest = [
-        min(max(int(one), limits.min), limits.max) for one in bound.ravel()
+        min(max(int(number), limits.min), limits.max) for number in bound.ravel()
     ]  # floats may round beyond the largest
     return np.array(nearest, dtype).reshape(bound.shape)
 
@@ -641,8 +637,8 @@ def _bounds(bounds: np.ndarray, dtype: Any) -> Any:
     """Returns one number if all bounds are equal, else a nested list; infinities as the strings ``inf`` and ``-inf``."""
     with np.errstate(over="ignore"):
         values = bounds.astype(dtype).astype(np.float64)
-    named = np.array([v if np.isfinite(v) else str(v) for v in values.ravel().tolist()], object).reshape(values.shape)
-    return named.flat[0] if values.size and (values == values.flat[0]).all() else named.tolist()
+    numbers = np.array([v if np.isfinite(v) else str(v) for v in values.ravel().tolist()], object).reshape(values.shape)
+    return numbers.flat[0] if values.size and (values == values.flat[0]).all() else numbers.tolist()
 
 
 def as_batch(observation: Any, space: spaces.Space, leaves: Sequence[Leaf]) -> tuple[Any, bool]:
@@ -667,7 +663,7 @@ def batch_arrays(observation: Any, space: spaces.Space, leaves: Sequence[Leaf]) 
             or cannot be what the space declares.
     """
     try:
-        arrays = [np.asarray(one) for one in parts(space, observation)]
+        arrays = [np.asarray(leaf_values) for leaf_values in parts(space, observation)]
         if not {array.dtype.kind for array in arrays} <= {*"biuf"}:
             raise TypeError("there is something else than numbers")
         single = arrays[0].ndim == len(leaves[0].shape)
@@ -700,7 +696,7 @@ def described(observation: Any) -> str:
     ('dict(goal: list, place: NoneType)', 'tuple(int, int)')
     """
     if isinstance(observation, Mapping):
-        return f"dict({', '.join(f'{key}: {type(part).__name__}' for key, part in observation.items())})"
+        return f"dict({', '.join(f'{key}: {type(value).__name__}' for key, value in observation.items())})"
     if isinstance(observation, tuple):
-        return f"tuple({', '.join(type(part).__name__ for part in observation)})"
+        return f"tuple({', '.join(type(value).__name__ for value in observation)})"
     return type(observation).__name__

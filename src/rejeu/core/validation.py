@@ -42,8 +42,9 @@ def whole(key: str, value: Any, least: int, most: int = 2**63 - 1) -> int:
     """
     good = is_number(value) and value == int(value)
     if not good or not least <= value <= most:
-        named = most < 2**62 or (good and value > most)  # a limit that nobody reaches is named to those who exceed it
-        raise ValueError(f"{key}={value!r} must be a whole number of at least {least}" + f" and at most {most}" * named)
+        # A limit that nobody reaches is named to those who exceed it.
+        limit = f" and at most {most}" * (most < 2**62 or (good and value > most))
+        raise ValueError(f"{key}={value!r} must be a whole number of at least {least}{limit}")
     return int(value)
 
 
@@ -117,8 +118,8 @@ def coerce(
     for key in (keys,) if isinstance(keys, str) else keys:
         value = getattr(config, key)
         if not (optional and value is None):
-            most = {"most": MOST[key]} if converter is whole and key in MOST else {}
-            assign(config, **{key: converter(key, without_numpy(value), **{**most, **limits})})
+            limit = {"most": MOST[key]} if converter is whole and key in MOST else {}
+            assign(config, **{key: converter(key, without_numpy(value), **{**limit, **limits})})
 
 
 def assign(config: Any, **values: Any) -> None:
@@ -138,32 +139,32 @@ def choice(key: str, value: Any, among: Collection[str]) -> Any:
     return value
 
 
-def nested(key: str, value: Any, kind: type[C]) -> C:
-    """Returns a sub-configuration of class ``kind`` from itself or from a mapping of its fields."""
-    if isinstance(value, kind):
+def nested(key: str, value: Any, config_class: type[C]) -> C:
+    """Returns a sub-configuration of class ``config_class`` from itself or from a mapping of its fields."""
+    if isinstance(value, config_class):
         return value
     if value is None:
-        return kind()
+        return config_class()
     if not isinstance(value, Mapping):
-        raise TypeError(f"{key}={value!r} must be a dict with the keys {', '.join(field_names(kind))}")
-    return build(kind, value, key)
+        raise TypeError(f"{key}={value!r} must be a dict with the keys {', '.join(field_names(config_class))}")
+    return build(config_class, value, key)
 
 
-def build(kind: type[C], given: Mapping[str, Any], setting: str = "") -> C:
-    """Returns ``kind(**given)``; ``setting`` is what the user calls it, if not by the name of the class.
+def build(cls: type[C], settings: Mapping[str, Any], setting: str = "") -> C:
+    """Returns ``cls(**settings)``; ``setting`` is the user's name for it, if not that of the class.
 
     Raises:
         TypeError: for a name that is no field, suggesting the nearest that is.
     """
-    check_names(given, field_names(kind), setting or getattr(kind, "name", "") or kind.__name__)
-    return kind(**given)
+    check_names(settings, field_names(cls), setting or getattr(cls, "name", "") or cls.__name__)
+    return cls(**settings)
 
 
-def check_names(given: Iterable[str], known: Sequence[str], owner: str, shape: Sequence[str] = ()) -> None:
+def check_names(keys: Iterable[str], names: Sequence[str], owner: str, shape: Sequence[str] = ()) -> None:
     """Raises ``TypeError`` for a name that ``owner`` does not know, suggesting the nearest, or where ``shape`` goes."""
-    for key in given:
-        if key not in known:
-            raise TypeError(unknown_name(key, known, owner, shape))
+    for key in keys:
+        if key not in names:
+            raise TypeError(unknown_name(key, names, owner, shape))
 
 
 def with_value(mapping: Mapping[str, Any], path: Sequence[str], value: Any, name: str) -> dict[str, Any]:
@@ -175,14 +176,14 @@ def with_value(mapping: Mapping[str, Any], path: Sequence[str], value: Any, name
     >>> with_value({"a": {"b": 1}}, ["a", "c"], 2, "--set a.c")
     {'a': {'b': 1, 'c': 2}}
     """
-    head, *rest = path
-    if not rest:
+    head, *tail = path
+    if not tail:
         return {**mapping, head: value}
     inner = mapping.get(head)
     inner = {} if inner is None else inner
     if not isinstance(inner, Mapping):
         raise TypeError(f"{name}: {head}={inner!r} has no parts to set")
-    return {**mapping, head: with_value(inner, rest, value, name)}
+    return {**mapping, head: with_value(inner, tail, value, name)}
 
 
 ELSEWHERE = {
@@ -212,37 +213,37 @@ def unknown_name(key: str, names: Iterable[str], owner: str, shape: Sequence[str
     return f"{owner} has no setting {key!r}; {hint}"
 
 
-def field_names(kind: type) -> list[str]:
+def field_names(config_class: type) -> list[str]:
     """Returns the names of a dataclass's fields, in order."""
-    return [field.name for field in dataclasses.fields(kind)]
+    return [field.name for field in dataclasses.fields(config_class)]
 
 
-def field_defaults(kind: type) -> dict[str, Any]:
+def field_defaults(config_class: type) -> dict[str, Any]:
     """Returns the default of each field of a dataclass as an instance has it; ``inspect.Parameter.empty`` if it has none."""
-    fields = dataclasses.fields(kind)
+    fields = dataclasses.fields(config_class)
     if any(field.default is field.default_factory is dataclasses.MISSING for field in fields):
         empty = inspect.Parameter.empty
         return {field.name: empty if field.default is dataclasses.MISSING else field.default for field in fields}
-    defaults = kind()
+    defaults = config_class()
     return {field.name: getattr(defaults, field.name) for field in fields}
 
 
-def field_docs(kind: type) -> dict[str, str]:
+def field_docs(config_class: type) -> dict[str, str]:
     """Returns the attribute docstring of each field of a dataclass, its bases' included, each on one line.
 
     Fields without one are left out, as are all fields of a class without source, such as one of a notebook.
     """
     docs: dict[str, str] = {}
-    for owner in reversed(kind.__mro__):
+    for owner in reversed(config_class.__mro__):
         docs.update(_attribute_docs(owner))
-    return {key: docs[key] for key in field_names(kind) if key in docs}
+    return {key: docs[key] for key in field_names(config_class) if key in docs}
 
 
 @cache
-def _attribute_docs(kind: type) -> dict[str, str]:
+def _attribute_docs(owner: type) -> dict[str, str]:
     """Returns the docstrings that follow attributes in the source of a class."""
     try:
-        definition = ast.parse(textwrap.dedent(inspect.getsource(kind))).body[0]
+        definition = ast.parse(textwrap.dedent(inspect.getsource(owner))).body[0]
     except (OSError, TypeError, SyntaxError):
         return {}
     body = definition.body if isinstance(definition, ast.ClassDef) else []

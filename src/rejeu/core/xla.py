@@ -79,8 +79,8 @@ def start_device(n_threads: int) -> None:
     if _threads is not None:
         return
     if is_running() or THREADS in os.environ:
-        given = os.environ.get(THREADS, "")
-        _threads = int(given) if given.isdecimal() and int(given) > 0 else cores()
+        setting = os.environ.get(THREADS, "")
+        _threads = int(setting) if setting.isdecimal() and int(setting) > 0 else cores()
         return
     _threads = n_threads
     os.environ[THREADS] = str(n_threads)
@@ -161,15 +161,15 @@ def for_runs(function: Callable[..., Any], n: int) -> Callable[..., Any]:
     return call
 
 
-def _marked(function: F, marks: dict[str, str], most: float, concatenates: int = 0) -> F:
-    """Returns ``function`` as a call with these attributes, if its inputs have at most ``most`` elements."""
+def _marked(function: F, marks: dict[str, str], limit: float, concatenates: int = 0) -> F:
+    """Returns ``function`` as a call with these attributes, if its inputs have at most ``limit`` elements."""
 
     @functools.wraps(function)
     def call(*arguments: Any, **keywords: Any) -> Any:
         leaves, structure = jax.tree.flatten((arguments, keywords))
         where = [i for i, leaf in enumerate(leaves) if isinstance(leaf, jax.Array | np.ndarray)]
         is_split = concatenates * _n_runs > SPLIT and threads() > 1
-        if platform() != "cpu" or is_split or sum(leaves[i].size for i in where) > most:
+        if platform() != "cpu" or is_split or sum(leaves[i].size for i in where) > limit:
             return function(*arguments, **keywords)
 
         def of_arrays(*arrays: Array) -> Any:
