@@ -70,13 +70,13 @@ class Saved(NamedTuple):
     action_space: gym.Space
 
 
-def interpret(header: Mapping[str, Any], room: int, kind: Any, changes: Mapping[str, Any]) -> Saved:
-    """Returns what a header says.
+def interpret(header: Mapping[str, Any], room: int, config_class: Any, changes: Mapping[str, Any]) -> Saved:
+    """Returns a header with its values checked and converted.
 
     Args:
         header: JSON values of schema ``checkpoint.SCHEMA``.
         room: bytes that the file holds.
-        kind: class of the algorithm's configuration.
+        config_class: that of the algorithm.
         changes: hyperparameters that the user sets otherwise than they were saved.
 
     Raises:
@@ -85,7 +85,7 @@ def interpret(header: Mapping[str, Any], room: int, kind: Any, changes: Mapping[
     """
     try:
         saved = convert(header, AgentHeader)
-        config = configs.rebuild(kind, saved.config, configs.own_changes(saved.config, changes))
+        config = configs.rebuild(config_class, saved.config, configs.own_changes(saved.config, changes))
         largest = max(spaces.MAX_NUMBERS, room)
         observation_space = spaces.rebuild(saved.observation_space, largest)
         spaces.check_policy(saved.policy, observation_space, config.policy_kwargs.normalize_images)
@@ -94,24 +94,24 @@ def interpret(header: Mapping[str, Any], room: int, kind: Any, changes: Mapping[
         raise
     except WRONG as error:
         raise CheckpointError(f"the header is damaged or of another version: {brief(error)}") from None
-    return Saved(
-        saved, configs.rebuild(kind, saved.config, changes) if changes else config, observation_space, action_space
-    )
+    if changes:
+        config = configs.rebuild(config_class, saved.config, changes)
+    return Saved(saved, config, observation_space, action_space)
 
 
-def check_space(description: Any, own: gym.Space, kind: str) -> None:
+def check_space(description: Any, ours: gym.Space, name: str) -> None:
     """Raises ``ValueError`` unless a space of a file is the agent's, apart from the bounds of observations.
 
     Args:
         description: JSON values.
-        own: the agent's.
-        kind: ``"observation"`` or ``"action"``.
+        ours: the agent's.
+        name: ``"observation"`` or ``"action"``.
     """
-    if description == spaces.describe(own):
+    if description == spaces.describe(ours):
         return
-    other = spaces.rebuild(description, max(spaces.MAX_NUMBERS, sum(leaf.nbytes for leaf in spaces.leaves(own))))
-    if not spaces.same(other, own, bounds=kind == "action"):
-        raise ValueError(f"it is of the {kind} space {other}, and this agent was made for {own}")
+    theirs = spaces.rebuild(description, max(spaces.MAX_NUMBERS, sum(leaf.nbytes for leaf in spaces.leaves(ours))))
+    if not spaces.same(theirs, ours, bounds=name == "action"):
+        raise ValueError(f"it is of the {name} space {theirs}, and this agent was made for {ours}")
 
 
 A = TypeVar("A", bound=BaseAgent)
@@ -152,11 +152,11 @@ def made_from(agent: BaseAgent) -> dict[str, Any] | None:
 
 
 def trained_on(header: Mapping[str, Any]) -> tuple[str, dict[str, Any]] | None:
-    """Returns what :func:`made_from` wrote; None if it is missing or not what a file may hold."""
-    said = header.get("made_from")
-    if not isinstance(said, dict) or not is_plain_id(said.get("env_id")) or not are_plain(said.get("env_kwargs")):
+    """Returns the value of :func:`made_from` in a header; None if it is missing or not what a file may hold."""
+    source = header.get("made_from")
+    if not isinstance(source, dict) or not is_plain_id(source.get("env_id")) or not are_plain(source.get("env_kwargs")):
         return None
-    return said["env_id"], said["env_kwargs"]
+    return source["env_id"], source["env_kwargs"]
 
 
 def load(
@@ -182,16 +182,16 @@ def load(
     """
     name, path, header = cls.algorithm.Config.name, file.path, file.header
     if header.get("algorithm") != name:
-        other = str(header.get("algorithm"))[:40]
-        raise CheckpointError(f"{path} holds a {other} agent, not {name}; use rejeu.load(path) or rejeu.{other}.load")
+        theirs = str(header.get("algorithm"))[:40]
+        raise CheckpointError(f"{path} holds a {theirs} agent, not {name}; use rejeu.load(path) or rejeu.{theirs}.load")
     changes = cls.converted(changes)
-    own = {key: changes.pop(key) for key in [*changes] if key in AGENT_ARGUMENTS}
+    arguments = {key: changes.pop(key) for key in [*changes] if key in AGENT_ARGUMENTS}
     try:
         saved = interpret(header, file.room, cls.algorithm.Config, changes)
     except CheckpointError as error:
         raise CheckpointError(f"{path}: {error}") from None
     agent = cls.__new__(cls)
-    _set_up(agent, saved, own)
+    _set_up(agent, saved, arguments)
     try:
         agent.build(saved.observation_space, saved.action_space)
     except WRONG as error:
@@ -217,15 +217,15 @@ def load(
     return agent
 
 
-def _set_up(agent: BaseAgent, saved: Saved, given: Mapping[str, Any]) -> None:
+def _set_up(agent: BaseAgent, saved: Saved, arguments: Mapping[str, Any]) -> None:
     """Sets the attributes of an agent from a model file, and from the user's changes.
 
     Raises:
-        ValueError: if ``given`` is invalid.
+        ValueError: if ``arguments`` are invalid.
     """
-    outputs = {key: given[key] for key in OUTPUTS if key in given}
-    others = {key: value for key, value in given.items() if key not in OUTPUTS}
-    agent.configure(config=saved.config, **{key: getattr(saved.header, key) for key in ARGUMENTS} | others)
+    outputs = {key: arguments[key] for key in OUTPUTS if key in arguments}
+    settings = {key: value for key, value in arguments.items() if key not in OUTPUTS}
+    agent.configure(config=saved.config, **{key: getattr(saved.header, key) for key in ARGUMENTS} | settings)
     agent.set_outputs(**outputs)
     spaces.check_policy(agent.policy_name, saved.observation_space, agent.config.policy_kwargs.normalize_images)
 

@@ -69,7 +69,7 @@ class Name(NamedTuple):
 
 
 class PickledCall:
-    """What a pickle would create by calling a name: the name, the arguments, and the attributes that it would set."""
+    """An object that a pickle would create by a call: the name, the arguments, and the attributes that it would set."""
 
     def __init__(self, name: Any, arguments: tuple[Any, ...]) -> None:
         self.name, self.arguments = str(name) if isinstance(name, Name) else "", arguments
@@ -161,22 +161,22 @@ def parse(
     raise Malformed("it is cut short")
 
 
-def check_size(value: Any, most: int, arrays: int = 0) -> None:
-    """Raises ``Malformed`` if a value is larger than ``most``, see :data:`MOST_WRITTEN`, or its arrays than ``arrays``.
+def check_size(value: Any, limit: int, arrays: int = 0) -> None:
+    """Raises ``Malformed`` if a value is larger than ``limit``, see :data:`MOST_WRITTEN`, or its arrays than ``arrays``.
 
     Neither may it have more than :data:`MAX_DEPTH` levels: Python's hash of a tuple ends the process at some ten thousand.
     """
     level = [value]
     for _ in range(MAX_DEPTH):
         below: list[Any] = []
-        for one in level:
-            if isinstance(one, PickledCall):
-                inside: Any = [one.arguments, one.state]
+        for node in level:
+            if isinstance(node, PickledCall):
+                inside: Any = [node.arguments, node.state]
             else:
-                inside = one.values() if isinstance(one, dict) else one if isinstance(one, list | tuple) else ()
-            most -= 64 * len(inside) + (len(one) if isinstance(one, str | bytes | bytearray) else 0)
-            arrays -= one.nbytes if isinstance(one, np.ndarray) else 0
-            if most < 0 or arrays < 0:
+                inside = node.values() if isinstance(node, dict) else node if isinstance(node, list | tuple) else ()
+            limit -= 64 * len(inside) + (len(node) if isinstance(node, str | bytes | bytearray) else 0)
+            arrays -= node.nbytes if isinstance(node, np.ndarray) else 0
+            if limit < 0 or arrays < 0:
                 raise Malformed("its parts are shared so often that they have no end, or are larger than the file")
             below.extend(inside)
         level = below
@@ -264,16 +264,16 @@ def tensors_of(data: bytes) -> Any:
     if not data.startswith(b"PK"):
         return old_tensors(data)
     with opened(io.BytesIO(data)) as archive:
-        found = {info.filename.partition("/")[2]: info for info in archive.infolist()}
+        members = {info.filename.partition("/")[2]: info for info in archive.infolist()}
 
         def member(name: str) -> bytes:
-            if name not in found:
+            if name not in members:
                 raise Malformed(f"it has no {shown(name, 40)}: it is a file of another program")
-            return archive.read(found[name])
+            return archive.read(members[name])
 
-        if "byteorder" in found and member("byteorder") != b"little":
+        if "byteorder" in members and member("byteorder") != b"little":
             raise Malformed("its numbers are big-endian, which is not supported")
-        if found.get("data.pkl", zipfile.ZipInfo()).file_size > MOST_TEXT:
+        if members.get("data.pkl", zipfile.ZipInfo()).file_size > MOST_TEXT:
             raise Malformed(f"its structure has more than {MOST_TEXT:,} bytes")
         return structure(member("data.pkl"), lambda key: member(f"data/{key}"), len(data))
 
@@ -319,10 +319,10 @@ def kind_of(reference: Any) -> tuple[str, np.dtype, int]:
     """Returns name, dtype and number of values of the storage to which a structure refers."""
     if not isinstance(reference, tuple) or len(reference) > 6:
         raise Malformed("it has a tensor whose storage is not described by a tuple of five or six")
-    _, kind, key, _, n, *view = reference
-    code = STORAGES.get(kind.name.removesuffix("Storage")) if isinstance(kind, Name) else None
+    _, storage, key, _, n, *view = reference
+    code = STORAGES.get(storage.name.removesuffix("Storage")) if isinstance(storage, Name) else None
     if code is None:
-        raise Malformed(f"it has a tensor of {named(kind)}, expected one of {', '.join(STORAGES)}")
+        raise Malformed(f"it has a tensor of {named(storage)}, expected one of {', '.join(STORAGES)}")
     if type(n) is not int or not isinstance(key, str) or view not in ([], [None]):
         raise Malformed("it has a tensor whose storage is not named by a text and a size")
     return key, np.dtype(code), n
@@ -335,7 +335,7 @@ def tensor(function: Any, arguments: tuple[Any, ...]) -> Any:
     if function != ("torch._utils", "_rebuild_tensor_v2"):
         raise Malformed(f"it calls {named(function)}, expected tensors only")
     storage, first, shape, strides = arguments[:4]
-    if not all(isinstance(one, tuple) and len(one) <= 8 for one in (shape, strides)):
+    if not all(isinstance(sizes, tuple) and len(sizes) <= 8 for sizes in (shape, strides)):
         raise Malformed("it has a tensor whose shape or strides are no tuple of at most 8 numbers")
     if not isinstance(storage, np.ndarray) or not all(type(n) is int and n >= 0 for n in (first, *shape, *strides)):
         raise Malformed("it has a tensor whose shape is not valid")
@@ -368,8 +368,8 @@ def opened(file: BinaryIO, room: int = 0) -> Iterator[zipfile.ZipFile]:
         raise Malformed("it is not a complete zip file")
     directory = struct.unpack_from("<I", tail, at + 12)[0]
     if tail[max(at - 20, 0) : at].startswith(b"PK\6\7"):  # the sizes of large files, which PyTorch always writes
-        place, directory = struct.unpack_from("<Q", tail, at - 12)[0], struct.unpack_from("<Q", tail, at - 36)[0]
-        if place != size - len(tail) + at - 76 or not tail[at - 76 :].startswith(b"PK\6\6"):
+        start, directory = struct.unpack_from("<Q", tail, at - 12)[0], struct.unpack_from("<Q", tail, at - 36)[0]
+        if start != size - len(tail) + at - 76 or not tail[at - 76 :].startswith(b"PK\6\6"):
             raise Malformed("its table of contents is damaged")
     if directory > MOST_DIRECTORY:
         raise Malformed(f"its table of contents has more than {MOST_DIRECTORY:,} bytes")
@@ -411,11 +411,11 @@ def read_normalization(path: Path) -> dict[str, Any]:
         data = file.read(MOST_FIELD + 1)
     if len(data) > MOST_FIELD:
         raise Malformed(f"it has more than {MOST_FIELD:,} bytes")
-    found = parse(data)
+    wrapper = parse(data)
     if (
-        not isinstance(found, PickledCall)
-        or not found.name.endswith("VecNormalize")
-        or not isinstance(found.state, dict)
+        not isinstance(wrapper, PickledCall)
+        or not wrapper.name.endswith("VecNormalize")
+        or not isinstance(wrapper.state, dict)
     ):
         raise Malformed("it holds no VecNormalize")
-    return found.state
+    return wrapper.state

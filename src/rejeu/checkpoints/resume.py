@@ -36,18 +36,18 @@ A = TypeVar("A", bound=BaseAgent)
 
 def resume(cls: type[A], folder: Path, env: Any, changes: dict[str, Any]) -> A:
     """Returns the agent of the newest complete checkpoint, or of the one that is named; see :meth:`Agent.resume`."""
-    found = [folder] if folder.is_file() else checkpoint_files(folder)
-    if not found:
+    paths = [folder] if folder.is_file() else checkpoint_files(folder)
+    if not paths:
         raise FileNotFoundError(f"there is no checkpoint in {folder}")
     skipped: list[str] = []
-    for i, path in enumerate(found):
+    for i, path in enumerate(paths):
         try:
             agent = _resume(cls, path, env, dict(changes))
         except CheckpointError as error:
             settings = changes.keys() - model_files.AGENT_ARGUMENTS
             if settings and is_whole(path):  # an older one might fit, and lose what was trained since
                 raise CheckpointError(f"{error}; {', '.join(sorted(settings))} cannot be changed here") from None
-            if i + 1 == len(found):
+            if i + 1 == len(paths):
                 raise
             skipped.append(str(error))
             warnings.warn(f"{error}; resuming from the checkpoint before it", UserWarning, stacklevel=3)
@@ -72,17 +72,17 @@ def is_whole(path: Path) -> bool:
 
 
 def _resume(cls: type[A], path: Path, env: Any, changes: dict[str, Any]) -> A:
-    with checkpoint.opened(path, "run") as file, ExitStack() as made:
-        agent = _resume_within(made, file, cls, env, changes)
-        made.pop_all()
+    with checkpoint.opened(path, "run") as file, ExitStack() as stack:
+        agent = _resume_within(stack, file, cls, env, changes)
+        stack.pop_all()
     assert agent.resumed is not None
     if not agent.resumed.exact:
         warnings.warn(str(agent.resumed), UserWarning, stacklevel=4)
     return agent
 
 
-def _resume_within(made: ExitStack, file: checkpoint.Contents, cls: type[A], env: Any, changes: dict[str, Any]) -> A:
-    """Returns the agent; ``made`` closes the environments made for it if the checkpoint is refused."""
+def _resume_within(stack: ExitStack, file: checkpoint.Contents, cls: type[A], env: Any, changes: dict[str, Any]) -> A:
+    """Returns the agent; ``stack`` closes the environments made for it if the checkpoint is refused."""
     path = file.path
     try:
         header = convert(file.header, RunHeader)
@@ -98,7 +98,7 @@ def _resume_within(made: ExitStack, file: checkpoint.Contents, cls: type[A], env
         env_id, backend = environment(path, header)
         try:
             vector = agent.make_envs(env_id, header.n_envs, backend, seed_of_run(agent.seed))
-            made.callback(vector.close)
+            stack.callback(vector.close)
             agent.check_spaces(vector, f"{env_id} as it is here")
         except (ValueError, TypeError, gym.error.Error) as error:
             raise CheckpointError(
@@ -123,7 +123,7 @@ def _resume_within(made: ExitStack, file: checkpoint.Contents, cls: type[A], env
         raise refusal(path, error) from error
     if parts:
         ring = agent.run.replay.ring
-        heads = [part["head"] for part in parts]
+        heads = [rows["head"] for rows in parts]
         folder_of(agent, path.parent).row_files = RowFiles(
             list(zip(header.rows, heads, strict=True)), ring, ring.version
         )
@@ -277,7 +277,7 @@ def put_envs_back(run: Run, saved: SavedRun, n_episodes: int | None) -> str:
     held = run.replay if isinstance(run.replay, RolloutBuffer) else run.replay.ring
     parts = zip(saved.obs or (), held.obs_leaves, strict=True)
     obs = jax.tree.unflatten(
-        held.obs_structure, [exactly(part, (n_envs, *leaf.shape), leaf.dtype, "obs") for part, leaf in parts]
+        held.obs_structure, [exactly(array, (n_envs, *leaf.shape), leaf.dtype, "obs") for array, leaf in parts]
     )
     try:
         must_reset = run.env.restore(saved.envs, obs)
@@ -329,18 +329,18 @@ def with_draws(priorities: Priorities, drawn: Sequence[Any], td_errors: list[Arr
     return list(zip(draws, td_errors, strict=True))
 
 
-def like(expected: PyTree, given: list[np.ndarray], name: str) -> PyTree:
-    """Returns a tree with the structure of ``expected`` and the given leaves.
+def like(expected: PyTree, arrays: list[np.ndarray], name: str) -> PyTree:
+    """Returns a tree with the structure of ``expected`` and the leaves ``arrays``.
 
     Raises:
         ValueError: if shapes or dtypes differ, or a number is not finite.
     """
     parts = jax.tree.leaves(expected)
-    if not all(spaces.is_finite(part) for part in given):
+    if not all(spaces.is_finite(array) for array in arrays):
         raise ValueError(f"{name} is not finite")
     return jax.tree.unflatten(
         jax.tree.structure(expected),
-        [jnp.asarray(exactly(g, e.shape, np.dtype(e.dtype), name)) for g, e in zip(given, parts, strict=True)],
+        [jnp.asarray(exactly(g, e.shape, np.dtype(e.dtype), name)) for g, e in zip(arrays, parts, strict=True)],
     )
 
 
@@ -351,6 +351,6 @@ def exactly(array: Any, shape: tuple[int, ...], dtype: Any, name: str) -> np.nda
         ValueError: if its shape or dtype differs from what is expected.
     """
     if not isinstance(array, np.ndarray) or array.shape != shape or array.dtype != dtype:
-        found = f"{array.dtype}{list(array.shape)}" if isinstance(array, np.ndarray) else type(array).__name__
-        raise ValueError(f"{name} is {found}, expected {np.dtype(dtype)}{list(shape)}")
+        got = f"{array.dtype}{list(array.shape)}" if isinstance(array, np.ndarray) else type(array).__name__
+        raise ValueError(f"{name} is {got}, expected {np.dtype(dtype)}{list(shape)}")
     return array.copy()

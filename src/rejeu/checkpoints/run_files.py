@@ -72,7 +72,7 @@ class RowFiles:
         """Adds a file with the rows up to the newest, and drops files of which the ring keeps no row."""
         self.files.append((name, ring.head.copy()))
         oldest = ring.oldest()
-        self.files = [one for one in self.files if (one[1] >= oldest).any()]
+        self.files = [(file, head) for file, head in self.files if (head >= oldest).any()]
 
 
 def folder_of(agent: BaseAgent, folder: Path) -> CheckpointFolder:
@@ -80,8 +80,8 @@ def folder_of(agent: BaseAgent, folder: Path) -> CheckpointFolder:
     path = folder.resolve()
     if path not in agent.checkpoint_folders:
         agent.checkpoint_folders[path] = CheckpointFolder(agent, folder)
-    found: CheckpointFolder = agent.checkpoint_folders[path]
-    return found
+    checkpoint_folder: CheckpointFolder = agent.checkpoint_folders[path]
+    return checkpoint_folder
 
 
 class CheckpointFolder:
@@ -151,11 +151,11 @@ class CheckpointFolder:
             path = checkpoint.write(self.folder / f"run_{run.step:012d}.safetensors", "run", arrays, header)
             self._named[path], agent.last_saved = header["rows"], path
         except OSError as error:
-            left = checkpoint_files(self.folder)
+            remaining = checkpoint_files(self.folder)
             raise OSError(
                 error.errno,
                 f"the checkpoint of step {run.step} could not be written ({error}); "
-                + (f"the one before it is complete: {left[0]}" if left else "there is none before it"),
+                + (f"the one before it is complete: {remaining[0]}" if remaining else "there is none before it"),
             ) from error
         self._delete_old(keep)
         return path
@@ -184,11 +184,11 @@ class CheckpointFolder:
 
     def _delete_old(self, keep: int) -> None:
         """Deletes all but the newest ``keep`` checkpoints, and the files of rows that none of these needs."""
-        found = checkpoint_files(self.folder)
-        for path in found[keep:]:
+        paths = checkpoint_files(self.folder)
+        for path in paths[keep:]:
             _remove(path)
             self._named.pop(path, None)
-        needed = {name for path in found[:keep] for name in self._rows_of(path)}
+        needed = {name for path in paths[:keep] for name in self._rows_of(path)}
         for path in self.folder.iterdir():
             if ROWS_FILE.fullmatch(path.name) and path.name not in needed:
                 _remove(path)
@@ -219,7 +219,7 @@ def versions() -> dict[str, Any]:
 
 
 class RunHeader(msgspec.Struct):
-    """What the header of a run's checkpoint holds in addition to that of a model file; unknown fields are ignored."""
+    """The header of a run's checkpoint, in addition to that of a model file; unknown fields are ignored."""
 
     rows: list[Annotated[str, Meta(pattern=rf"^{ROWS_FILE.pattern}\Z")]]
     """Names of the files with the rows of the replay buffer, oldest first."""
@@ -313,7 +313,7 @@ def content(agent: BaseAgent, reason: str) -> tuple[dict[str, Any], dict[str, np
         "logger": [dict(agent.logger.name_to_value), dict(agent.logger.name_to_count)],
         "n_predictions": agent.n_predictions,
         "call": None if agent.training_call is None else agent.training_call.to_json(),
-        "callbacks": [[type(one).__name__, one.state_dict()] for one in agent.callbacks],
+        "callbacks": [[type(callback).__name__, callback.state_dict()] for callback in agent.callbacks],
         "vec_normalize": None if statistics is None else statistics.statistics(),
     }
     header = {

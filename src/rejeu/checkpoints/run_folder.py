@@ -22,7 +22,7 @@ class File:
 
     name: str
 
-    def __get__(self, folder: Any, kind: type) -> Path:
+    def __get__(self, folder: Any, owner: type) -> Path:
         path: Path = folder.path
         return path / self.name
 
@@ -154,12 +154,12 @@ def checkpoint_files(folder: Path) -> list[Path]:
 
 def step_of(path: Path) -> int:
     """Returns the environment step of a checkpoint."""
-    found = RUN_FILE.fullmatch(path.name)
-    assert found is not None
-    return int(found[1])
+    match = RUN_FILE.fullmatch(path.name)
+    assert match is not None
+    return int(match[1])
 
 
 def newest_step(folder: Path) -> int:
     """Returns the environment step of the newest checkpoint in a folder, -1 if there is none."""
-    found = checkpoint_files(folder)
-    return step_of(found[0]) if found else -1
+    paths = checkpoint_files(folder)
+    return step_of(paths[0]) if paths else -1

@@ -112,16 +112,16 @@ def read(path: str | Path) -> Demonstrations:
         import h5py  # noqa: F401
     path = Path(path)
     files = (file for pattern in (dataset.METADATA, "*.hdf5") for file in path.rglob(pattern))
-    found = sorted({file.parent for file in files if file.parent.name == "data"})
-    if not found:
+    folders = sorted({file.parent for file in files if file.parent.name == "data"})
+    if not folders:
         raise FileNotFoundError(
             f"{path} holds no Minari dataset; give another folder (rejeu resume: --set demonstrations=FOLDER) or None, or "
             f"record one: rejeu play ENV --record {path}"
         )
-    if len(found) > 1:
-        names = ", ".join(str(one.parent.relative_to(path)) for one in found[:5])
-        raise ValueError(f"{path} holds {len(found)} datasets ({names}); give the folder of one of them")
-    rows, observation_space, action_space, spec = dataset.read(found[0])
+    if len(folders) > 1:
+        names = ", ".join(str(folder.parent.relative_to(path)) for folder in folders[:5])
+        raise ValueError(f"{path} holds {len(folders)} datasets ({names}); give the folder of one of them")
+    rows, observation_space, action_space, spec = dataset.read(folders[0])
     for name, _, _, *series in rows:
         check_end(path, name, *series)
     episodes = tuple(
@@ -163,17 +163,17 @@ def record(
     """
     from rejeu.demonstrations.recording import Recording
 
-    made = one_of(env)
-    recording = None if path is None else Recording(path, made, None, "expert")
+    game = one_of(env)
+    recording = None if path is None else Recording(path, game, None, "expert")
     try:
         seeds = [None if seed is None else seed + i for i in range(whole("episodes", episodes, least=1))]
-        played = [play(made, agent, lambda obs, own: own, one, recording)[0][0] for one in seeds]
+        played = [play(game, agent, lambda obs, action: action, start, recording)[0][0] for start in seeds]
     finally:
         if recording is not None:
             recording.close()
-        if made is not env:
-            made.close()
-    return Demonstrations(tuple(played), made.observation_space, made.action_space)
+        if game is not env:
+            game.close()
+    return Demonstrations(tuple(played), game.observation_space, game.action_space)
 
 
 def one_of(env: Any) -> gym.Env:
@@ -197,9 +197,9 @@ def play(
     is None are left out; each stretch between them is an episode. Where actions of the result were not taken, it says so.
     """
     masked = for_agent(agent, env)
-    plain = (lambda seen: seen) if masked is env else (lambda seen: split(seen, None)[0])
-    seen, _ = masked.reset(seed=seed)
-    obs = plain(seen)
+    plain = (lambda obs: obs) if masked is env else (lambda obs: split(obs, None)[0])
+    agent_obs, _ = masked.reset(seed=seed)
+    obs = plain(agent_obs)
     parts: list[list[tuple[Any, ...]]] = [[]]
     if recording is not None:
         recording.begin(obs, seed)
@@ -208,14 +208,14 @@ def play(
     while not done:
         if (signal := interrupt.requested()) is not None:
             raise interrupt.Stopped(signal)
-        action, state = agent.predict(seen, *memory, deterministic=True)
+        action, state = agent.predict(agent_obs, *memory, deterministic=True)
         memory = () if state is None else (state,)
         labeled = label(obs, action)
         action = labeled if takes_over and labeled is not None else action
         is_labeled = labeled is not action
         before, labeled = jax.tree.map(np.copy, (obs, labeled))  # which may be written to again
-        seen, reward, terminated, truncated, _ = masked.step(action)
-        obs = plain(seen)
+        agent_obs, reward, terminated, truncated, _ = masked.step(action)
+        obs = plain(agent_obs)
         if labeled is not None:
             parts[-1].append((before, labeled, float(reward), jax.tree.map(np.copy, obs), bool(terminated), is_labeled))
         elif parts[-1]:
@@ -223,7 +223,7 @@ def play(
         if recording is not None:
             recording.step(obs, action, float(reward), terminated, truncated)
         n_steps, done = n_steps + 1, terminated or truncated
-    return [episode_of(part) for part in parts if part], n_steps
+    return [episode_of(steps) for steps in parts if steps], n_steps
 
 
 def episode_of(steps: Sequence[tuple[Any, ...]]) -> Episode:
@@ -271,25 +271,25 @@ def clone(
     pairs = [arrays_of(agent, episode) for episode in demonstrations.episodes]
     obs, action = jax.tree.map(lambda *parts: np.concatenate(parts), *pairs)
     state = seen(agent, demonstrations.episodes[whole("counted", counted, least=0) :])
-    weights, rest = eqx.partition(state, eqx.is_inexact_array)
+    weights, static = eqx.partition(state, eqx.is_inexact_array)
 
     def loss(weights: PyTree, batch: tuple[PyTree, Any]) -> tuple[Any, PyTree]:
-        actor = algorithm.actor(eqx.combine(weights, rest))
-        losses, seen = in_training(actor, lambda actor: imitation_loss(algorithm, actor, *batch))
-        return jnp.mean(losses), eqx.filter(seen, eqx.is_inexact_array)
+        actor = algorithm.actor(eqx.combine(weights, static))
+        losses, updated = in_training(actor, lambda actor: imitation_loss(algorithm, actor, *batch))
+        return jnp.mean(losses), eqx.filter(updated, eqx.is_inexact_array)
 
-    def settled(weights: PyTree, seen: PyTree) -> PyTree:
+    def settled(weights: PyTree, updated: PyTree) -> PyTree:
         actor = algorithm.actor(weights)
         if not is_normalized(actor):
             return weights
-        return eqx.tree_at(algorithm.actor, weights, projected(with_statistics(actor, seen)))
+        return eqx.tree_at(algorithm.actor, weights, projected(with_statistics(actor, updated)))
 
     @jax.jit
     def steps(weights: PyTree, moments: PyTree, batches: tuple[PyTree, Any]) -> tuple[PyTree, PyTree, Any]:
         def step(carry: tuple[PyTree, PyTree], batch: tuple[PyTree, Any]) -> tuple[tuple[PyTree, PyTree], Any]:
-            (value, seen), gradients = jax.value_and_grad(loss, has_aux=True)(carry[0], batch)
+            (value, updated), gradients = jax.value_and_grad(loss, has_aux=True)(carry[0], batch)
             direction, moments = optimizer.update(gradients, carry[1])
-            return (settled(optax.apply_updates(carry[0], direction), seen), moments), value
+            return (settled(optax.apply_updates(carry[0], direction), updated), moments), value
 
         carry, losses = jax.lax.scan(step, (weights, moments), batches)
         return *carry, jnp.mean(losses)
@@ -304,7 +304,7 @@ def clone(
         raise ValueError(
             f"the loss is {value}, and the agent was not changed; try a learning_rate below {learning_rate}"
         )
-    agent.run.state = agent.learner.pack(with_targets(eqx.combine(weights, rest)))
+    agent.run.state = agent.learner.pack(with_targets(eqx.combine(weights, static)))
     return float(value)
 
 
@@ -356,31 +356,30 @@ def dagger(
         ValueError: if the spaces differ, or the agent has a memory.
     """
     steps = whole("steps", steps, least=1)
-    made, say = one_of(env), after_round or (lambda i, known: None)
-    known = demonstrations
+    game, say = one_of(env), after_round or (lambda i, demonstrations: None)
     try:
-        if known is not None:
-            clone(agent, known, updates, learning_rate=learning_rate, seed=seed)
-            say(0, known)
+        if demonstrations is not None:
+            clone(agent, demonstrations, updates, learning_rate=learning_rate, seed=seed)
+            say(0, demonstrations)
         for i in range(whole("rounds", rounds, least=1)):
             played: list[Episode] = []
             n_steps = n_episodes = 0
             while n_steps < steps:
                 start = seed + 1000 * (i + 1) + n_episodes
-                labeled, length = play(made, agent, lambda obs, own: expert(obs), start, takes_over=takes_over)
+                labeled, length = play(game, agent, lambda obs, action: expert(obs), start, takes_over=takes_over)
                 played, n_steps, n_episodes = played + labeled, n_steps + length, n_episodes + 1
-            new = Demonstrations(tuple(played), made.observation_space, made.action_space)
-            counted = 0 if known is None else len(known.episodes)
-            known = new if known is None else known + new
+            new = Demonstrations(tuple(played), game.observation_space, game.action_space)
+            counted = 0 if demonstrations is None else len(demonstrations.episodes)
+            demonstrations = new if demonstrations is None else demonstrations + new
             if not played:
                 continue  # nobody took over
-            clone(agent, known, updates, learning_rate=learning_rate, seed=seed + i + 1, counted=counted)
-            say(i + 1, known)
+            clone(agent, demonstrations, updates, learning_rate=learning_rate, seed=seed + i + 1, counted=counted)
+            say(i + 1, demonstrations)
     finally:
-        if made is not env:
-            made.close()
-    assert known is not None
-    return known
+        if game is not env:
+            game.close()
+    assert demonstrations is not None
+    return demonstrations
 
 
 def learn_offline(
@@ -436,8 +435,8 @@ def keeping_policy(agent: Any) -> Learner:
     def update(state: PyTree, batch: Any, clock: Clock) -> tuple[PyTree, Metrics]:
         new, metrics = algorithm.update(state, batch, clock)
         of_actor = ["actor" in name.removesuffix("actor_loss") for name in names(new)]  # also its target and moments
-        kept = jax.tree.unflatten(jax.tree.structure(new), of_actor)
-        new = jax.tree.map(lambda kept, old, new: old if kept else new, kept, state, new)
+        is_kept = jax.tree.unflatten(jax.tree.structure(new), of_actor)
+        new = jax.tree.map(lambda is_kept, old, new: old if is_kept else new, is_kept, state, new)
         return eqx.tree_at(algorithm.actor, new, algorithm.actor(state)), metrics
 
     return Learner(algorithm._replace(update=update), None, agent.learner.skips)
@@ -457,13 +456,13 @@ def check(agent: Any, demonstrations: Demonstrations) -> None:
     """Raises ``ValueError`` unless an agent can learn from demonstrations: these spaces, the bounds of observations aside."""
     if not isinstance(demonstrations, Demonstrations):
         raise TypeError(f"demonstrations={demonstrations!r} must be what read(FOLDER) or record(...) returns")
-    for kind, own, theirs in (
+    for name, ours, theirs in (
         ("observation", agent.observation_space, demonstrations.observation_space),
         ("action", agent.action_space, demonstrations.action_space),
     ):
-        if not spaces.same(own, theirs, bounds=kind == "action"):
+        if not spaces.same(ours, theirs, bounds=name == "action"):
             raise ValueError(
-                f"the demonstrations have the {kind} space {theirs}, and the agent {own}; record them in its environment"
+                f"the demonstrations have the {name} space {theirs}, and the agent {ours}; record them in its environment"
             )
     if isinstance(space := agent.action_space, gym.spaces.Dict | gym.spaces.Tuple):
         raise ValueError(f"demonstrations of the action space {space} cannot be learned from; flatten it in a wrapper")
@@ -559,8 +558,8 @@ class WithDemonstrations:
     Source: Ball et al. 2023 (arXiv 2302.02948), "symmetric sampling" with a share of one half.
     """
 
-    def __init__(self, own: Any, demonstrations: Any, share: float) -> None:
-        self.own, self.demonstrations, self.share = own, demonstrations, share
+    def __init__(self, buffer: Any, demonstrations: Any, share: float) -> None:
+        self.own, self.demonstrations, self.share = buffer, demonstrations, share
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.own, name)

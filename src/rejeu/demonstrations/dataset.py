@@ -45,13 +45,13 @@ class ArrayReader:
 
     def __init__(self, files: list[Path], is_jpeg: bool) -> None:
         self.is_jpeg = is_jpeg
-        found = [file.stat() for file in files]
-        real = sum(min(one.st_size, 512 * getattr(one, "st_blocks", one.st_size)) for one in found)
-        self.size, self.left = sum(one.st_size for one in found), SLACK + ROOM * real
+        stats = [file.stat() for file in files]
+        real = sum(min(stat.st_size, 512 * getattr(stat, "st_blocks", stat.st_size)) for stat in stats)
+        self.size, self.left = sum(stat.st_size for stat in stats), SLACK + ROOM * real
         self.unpacked = max(UNPACKED, PACKED * real)
 
     def part(self, group: Any, path: str, space: gym.Space | None) -> Any:
-        """Returns a part of an episode: arrays in the structure of a space, or one array."""
+        """Returns a part of an episode: arrays in the structure of a space, or subspace array."""
         import h5py
 
         for name in path.split("/"):
@@ -59,9 +59,9 @@ class ArrayReader:
                 raise ValueError(f"{shown(path)} is missing, or a link to somewhere else")
             group = group[name]
         if isinstance(space, gym.spaces.Dict):
-            return {key: self.part(group, key, one) for key, one in space.spaces.items()}
+            return {key: self.part(group, key, subspace) for key, subspace in space.spaces.items()}
         if isinstance(space, gym.spaces.Tuple):
-            return tuple(self.part(group, f"_index_{i}", one) for i, one in enumerate(space.spaces))
+            return tuple(self.part(group, f"_index_{i}", subspace) for i, subspace in enumerate(space.spaces))
         if not isinstance(group, h5py.Dataset) or group.external or group.is_virtual or not group.ndim:
             raise ValueError(f"{shown(path)} is no array that the file itself holds")
         shape = () if space is None else space.shape or ()
@@ -73,17 +73,17 @@ class ArrayReader:
             raise ValueError(f"{shown(path)} has the dtype {group.dtype}, expected numbers")
         plist = group.id.get_create_plist()
         filters = [plist.get_filter(i)[0] for i in range(plist.get_nfilters())]
-        if other := {*filters} - FILTERS.keys():
-            raise ValueError(f"{shown(path)} is packed by the filters {shown(sorted(other))}, expected gzip or lzf")
-        most = min(group.id.get_storage_size(), self.size) * math.prod(FILTERS[one] for one in filters)
-        chunk = math.prod(group.chunks or ()) * group.dtype.itemsize  # one is unpacked as a whole
-        self._take(path, max(group.nbytes, chunk if group.nbytes else 0), most, bool(filters))
+        if unknown := {*filters} - FILTERS.keys():
+            raise ValueError(f"{shown(path)} is packed by the filters {shown(sorted(unknown))}, expected gzip or lzf")
+        limit = min(group.id.get_storage_size(), self.size) * math.prod(FILTERS[number] for number in filters)
+        chunk = math.prod(group.chunks or ()) * group.dtype.itemsize  # subspace is unpacked as a whole
+        self._take(path, max(group.nbytes, chunk if group.nbytes else 0), limit, bool(filters))
         return group[()]
 
-    def _take(self, path: str, n: int, most: int, is_packed: bool = True) -> None:
+    def _take(self, path: str, n: int, limit: int, is_packed: bool = True) -> None:
         self.left -= 0 if is_packed else n
         self.unpacked -= n if is_packed else 0
-        if n > most or min(self.left, self.unpacked) < 0:
+        if n > limit or min(self.left, self.unpacked) < 0:
             raise ValueError(f"{shown(path)} has {n:,} bytes, more than the file holds")
 
 
@@ -105,24 +105,24 @@ def read(data: Path) -> tuple[list[tuple[Any, ...]], gym.Space, gym.Space, EnvSp
         rows = ArrayReader(files, bool(metadata.get("jpeg_encoding", True)))
         if (form := metadata.get("data_format", "hdf5")) != "hdf5":
             raise ValueError(f"it is in the format {shown(form)}, and only hdf5 is read")
-        most = max(spaces.MAX_NUMBERS, rows.left)
-        both = [spaces.rebuild(described(json.loads(metadata[name])), most) for name in SPACES]
+        limit = max(spaces.MAX_NUMBERS, rows.left)
+        both = [spaces.rebuild(described(json.loads(metadata[name])), limit) for name in SPACES]
         keys = dict(zip(("observations", "actions", *SERIES), (*both, None, None, None), strict=True))
-        found: dict[int, tuple[Any, ...]] = {}
+        episodes: dict[int, tuple[Any, ...]] = {}
         left_out: list[str] = []
         for path in files:
             with passed_over(path, left_out), h5py.File(path, "r") as file:
                 for name in file:
-                    if (match := EPISODE.fullmatch(name)) and (i := int(match[1])) not in found:
+                    if (match := EPISODE.fullmatch(name)) and (i := int(match[1])) not in episodes:
                         episode = tuple(rows.part(file, f"{name}/{key}", space) for key, space in keys.items())
                         if problem := problem_of(*episode):
                             left_out.append(f"{name} of {path.name}, {problem}")
                         else:
-                            found[i] = name, *episode
+                            episodes[i] = name, *episode
         if left_out:
             more = f", and {len(left_out) - 3} more" if len(left_out) > 3 else ""
             warnings.warn(f"{atomic.shortened(data)} is read without {'; '.join(left_out[:3])}{more}", stacklevel=3)
-        return [found[i] for i in sorted(found)], both[0], both[1], spec_of(metadata.get("env_spec"))
+        return [episodes[i] for i in sorted(episodes)], both[0], both[1], spec_of(metadata.get("env_spec"))
     except (*WRONG, OSError, RuntimeError) as error:
         problem = f"{atomic.shortened(data)} is damaged or of another kind ({brief(error)})"
         raise ValueError(f"{problem}; copy or record it again") from error
@@ -144,8 +144,8 @@ def problem_of(observations: Any, actions: Any, rewards: np.ndarray, *ends: np.n
     n = len(rewards)
     parts = {"observations": (observations, n + 1), "actions": (actions, n)}
     parts |= {key: (flags, n) for key, flags in zip(SERIES[1:], ends, strict=True)}
-    for key, (part, expected) in parts.items():
-        if wrong := {len(one) for one in jax.tree.leaves(part)} - {expected}:
+    for key, (series, expected) in parts.items():
+        if wrong := {len(leaf) for leaf in jax.tree.leaves(series)} - {expected}:
             return f"it has {n} rewards and {wrong.pop()} {key}, expected {expected}"
     return ""
 
@@ -158,10 +158,10 @@ def metadata_of(data: Path, files: list[Path]) -> Mapping[str, Any]:
         if not (data / METADATA).is_file():
             raise ValueError(f"{METADATA} is missing")
         with (data / METADATA).open("rb") as file:
-            found = json.loads(file.read(MOST_METADATA))
-        if not isinstance(found, dict) or not found.keys() >= {*SPACES}:
+            metadata = json.loads(file.read(MOST_METADATA))
+        if not isinstance(metadata, dict) or not metadata.keys() >= {*SPACES}:
             raise ValueError(f"{METADATA} does not describe the spaces")
-        return found
+        return metadata
     except (ValueError, RecursionError) as error:
         for path in files:
             with suppress(OSError), h5py.File(path, "r") as file:
@@ -180,23 +180,23 @@ def parts(data: Path) -> list[Path]:
 
 def described(space: Any) -> Any:
     """Returns Minari's description of a space as one of :func:`rejeu.core.spaces.describe`."""
-    kind = space["type"]
-    if kind == "Dict":
-        return {kind: {key: described(one) for key, one in space["subspaces"].items()}}
-    if kind == "Tuple":
-        return {kind: [described(one) for one in space["subspaces"]]}
-    if kind == "MultiBinary":
-        return {kind: {"shape": np.ravel(space["n"]).tolist()}}
-    return {kind: {"start": 0, **space}}
+    name = space["type"]
+    if name == "Dict":
+        return {name: {key: described(subspace) for key, subspace in space["subspaces"].items()}}
+    if name == "Tuple":
+        return {name: [described(subspace) for subspace in space["subspaces"]]}
+    if name == "MultiBinary":
+        return {name: {"shape": np.ravel(space["n"]).tolist()}}
+    return {name: {"start": 0, **space}}
 
 
 def spec_of(text: str | None) -> EnvSpec | None:
     """Returns the spec of an environment, also one that another version of Gymnasium wrote; it names code, and runs none."""
     if text is None:
         return None
-    known = {field.name for field in dataclasses.fields(EnvSpec) if field.init}
-    given = {key: value for key, value in json.loads(text).items() if key in known}
-    return EnvSpec.from_json(json.dumps({"additional_wrappers": [], **given}))
+    names = {field.name for field in dataclasses.fields(EnvSpec) if field.init}
+    fields = {key: value for key, value in json.loads(text).items() if key in names}
+    return EnvSpec.from_json(json.dumps({"additional_wrappers": [], **fields}))
 
 
 def picture(data: Any, shape: tuple[int, ...]) -> np.ndarray:
@@ -246,10 +246,10 @@ class Hdf5Output(io.FileIO):
 
     def write(self, content: Any) -> int:
         """Writes all of it, or nothing after an error."""
-        rest = memoryview(content).cast("B")
+        remaining = memoryview(content).cast("B")
         try:
-            while rest and self.error is None:
-                rest = rest[super().write(rest) :]
+            while remaining and self.error is None:
+                remaining = remaining[super().write(remaining) :]
         except OSError as error:
             self.error = error
         return len(content)

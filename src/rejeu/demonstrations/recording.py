@@ -119,8 +119,8 @@ class Recording:
         steps, self._steps = self._steps, []
         if len(steps) < 2:
             return
-        *most, terminated, truncated = steps[-1]
-        steps[-1] = (*most, terminated, truncated or not terminated)
+        *others, terminated, truncated = steps[-1]
+        steps[-1] = (*others, terminated, truncated or not terminated)
         content = dataset.episode(self.episodes, steps, self._seed, {} if self.episodes else self._metadata)
         write = partial(self._write, self.episodes, content)
         self.episodes += self._writes.attempt("episodes of the recording", write, is_row=True)
