@@ -123,6 +123,7 @@ def result_of(data: dict[str, Any], judged_by_success: tuple[str, ...] = JUDGED_
     return PresetResult(
         env_id=env_id,
         algorithm=algorithm,
+        preset=options.get("--preset", ""),
         setting=", ".join(settings),
         measure="success rate" if is_success else "mean return",
         mean=round(sum(values) / len(values), 4),

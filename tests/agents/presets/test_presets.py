@@ -39,9 +39,10 @@ def test_every_result_has_a_preset_and_every_preset_a_result_or_says_that_it_is_
     untuned = {(preset.env_id, preset.algorithm) for preset in presets.ALL if preset.source.endswith("not tuned")}
     known = {(preset.env_id, preset.algorithm) for preset in presets.ALL}
     as_it_is = [result for result in presets.results() if not result.setting]
-    by_name = {one: one.command.partition("--preset ")[2].partition(" ")[0] for one in as_it_is}
-    assert all(presets.named(name, one.env_id).name == name for one, name in by_name.items() if name)
-    assert {(one.env_id, one.algorithm) for one, name in by_name.items() if not name} <= known <= found | untuned
+    assert all(
+        presets.named(result.preset, result.env_id).name == result.preset for result in as_it_is if result.preset
+    )
+    assert {(result.env_id, result.algorithm) for result in as_it_is if not result.preset} <= known <= found | untuned
 
 
 def test_a_preset_with_a_name_is_for_any_environment():
@@ -105,7 +106,7 @@ def test_a_result_is_of_the_preset_as_it_is_or_of_the_named_one_and_shows_its_in
     assert presets.find_result("CartPole-v1", "PPO").setting == ""
     assert presets.find_result("Blackjack-v1", "DQN") is None
     small = presets.find_result("HalfCheetah-v5", "FlashSAC", "small")
-    assert small.seeds == 1
+    assert (small.seeds, small.preset) == (1, "small")
     assert "1 seed" in str(small).split(", ")
     assert presets.find_result("HalfCheetah-v5", "FlashSAC", "full") is None
 

@@ -44,7 +44,7 @@ class Preset:
     n_envs: EnvCount
     """Number of parallel environments."""
     name: Annotated[str, Meta(max_length=200)] = ""
-    """What the settings are known as, such as ``Rainbow``, for ``--preset`` with any environment; empty if they have none.
+    """The name of the settings, such as ``Rainbow``, for ``--preset`` with any environment; empty if they have none.
     They are used only by this name."""
     total_steps: Positive
     """Environment steps of a full run, over all environments."""
@@ -67,7 +67,7 @@ class Preset:
 def built_in() -> tuple[Preset, ...]:
     """Returns the presets of rejeu, in the order of ``presets.toml``."""
     text = resources.files("rejeu.agents.presets").joinpath("presets.toml").read_text(encoding="utf-8")
-    return tuple(convert(one, Preset) for one in tomllib.loads(text)["preset"])
+    return tuple(convert(table, Preset) for table in tomllib.loads(text)["preset"])
 
 
 def write(preset: Preset, path: str | Path) -> Path:
@@ -92,7 +92,7 @@ def read(path: str | Path) -> Preset:
     """
     path = Path(path)
     if not path.is_file():
-        names = ", ".join(dict.fromkeys(one.name for one in every() if one.name))
+        names = ", ".join(dict.fromkeys(preset.name for preset in every() if preset.name))
         raise FileNotFoundError(
             f"there is no preset file {path}; rejeu tune writes one as preset.json, and presets with a name are {names}"
         )
@@ -104,14 +104,16 @@ def read(path: str | Path) -> Preset:
 
 @dataclass(frozen=True, kw_only=True)
 class PresetResult:
-    """What an algorithm reached in an environment, over several seeds."""
+    """The result of an algorithm in an environment, over several seeds."""
 
     env_id: str
     """Id of the environment."""
     algorithm: str
     """Name of the algorithm."""
+    preset: str
+    """Name of the preset; empty for that of the environment."""
     setting: str
-    """What was not as in the preset, such as ``"sigma=1"``; empty if nothing was."""
+    """The setting that was not as in the preset, such as ``"sigma=1"``; empty if nothing was."""
     measure: str
     """``"mean return"`` or ``"success rate"``."""
     mean: float
@@ -125,7 +127,7 @@ class PresetResult:
     episodes: int
     """Episodes of the evaluation of each seed."""
     budget: str
-    """What each seed was trained for, such as ``"20,000 steps"``."""
+    """The steps or minutes of each seed, such as ``"20,000 steps"``."""
     seconds: tuple[float, float]
     """Shortest and longest training of a seed."""
     command: str
@@ -167,9 +169,8 @@ def results() -> tuple[PresetResult, ...]:
 
 def find_result(env_id: str, algorithm: str, name: str = "") -> PresetResult | None:
     """Returns the first result of an algorithm in an environment, with the preset of this name; None if there is none."""
-    wanted = env_id, algorithm, name
-    preset_of = lambda command: command.partition("--preset ")[2].partition(" ")[0]  # noqa: E731
-    return next((one for one in results() if (one.env_id, one.algorithm, preset_of(one.command)) == wanted), None)
+    key = env_id, algorithm, name
+    return next((result for result in results() if (result.env_id, result.algorithm, result.preset) == key), None)
 
 
 ALL: tuple[Preset, ...] = built_in()
@@ -217,13 +218,13 @@ def named(name: str, env_id: str, algorithm: str | None = None) -> Preset | None
     >>> named("Rainbow", "Acrobot-v1").algorithm
     'DQN'
     """
-    known = [preset for preset in every() if preset.name.lower() == name.lower() != ""]
-    return max(known, key=lambda one: (one.algorithm == algorithm, one.env_id == env_id), default=None)
+    presets = [preset for preset in every() if preset.name.lower() == name.lower() != ""]
+    return max(presets, key=lambda preset: (preset.algorithm == algorithm, preset.env_id == env_id), default=None)
 
 
 def small(algorithm: str) -> Mapping[str, Any]:
     """Returns the hyperparameters of an algorithm's preset ``small``, which is for any environment; empty if it has none."""
-    return next((one.hyperparameters for one in every() if (one.name, one.algorithm) == ("small", algorithm)), {})
+    return next((p.hyperparameters for p in every() if (p.name, p.algorithm) == ("small", algorithm)), {})
 
 
 def default(env_id: str, algorithm: str, hyperparameters: Mapping[str, Any] = MappingProxyType({})) -> Preset:
@@ -248,9 +249,9 @@ def find(env_id: str, algorithm: str | None = None) -> Preset | None:
     >>> find("jax/Parking-v0").backend
     'jax'
     """
-    known = [preset for preset in every() if preset.env_id == env_id and not preset.name]
-    found = next((preset for preset in known if algorithm in (None, preset.algorithm)), None)
-    if found is not None or env_id not in TWINS:
-        return found
+    presets = [preset for preset in every() if preset.env_id == env_id and not preset.name]
+    match = next((preset for preset in presets if algorithm in (None, preset.algorithm)), None)
+    if match is not None or env_id not in TWINS:
+        return match
     twin = find(TWINS[env_id], algorithm)
     return twin and dataclasses.replace(twin, env_id=env_id, backend="jax", source=f"the preset of {twin.env_id}")
