@@ -58,14 +58,14 @@ def register(agent: A, presets: Iterable[Preset] = ()) -> A:
     name = agent.algorithm.Config.name
     if name in BUILT_IN and agent is not BUILT_IN[name]:
         raise ValueError(f"rejeu has an algorithm {name!r}; choose another Config.name")
-    given = tuple(presets)
-    for preset in given:
+    tuned = tuple(presets)
+    for preset in tuned:
         if preset.algorithm != name:
             raise ValueError(f"the preset of {preset.env_id} is for {preset.algorithm!r}, not {name!r}")
     AGENTS[name] = agent
     if name not in BUILT_IN:
         configs.registered[name] = config
-    all_presets.register(name, given)
+    all_presets.register(name, tuned)
     return agent
 
 
@@ -81,16 +81,16 @@ def find_agent(name: str, is_typed: bool = True) -> type[Agent]:
     Raises:
         ValueError: if there is no such algorithm, with the nearest name or what to import.
     """
-    known = {key.lower(): key for key in AGENTS}
-    if name.lower() in known:
-        return AGENTS[known[name.lower()]]
-    if (found := entry_point(name)) is not None:
-        if not (is_typed or found.module in sys.modules):
-            raise ValueError(f"{name} is not registered, and no file may name what is imported; {advice(found)}")
-        agent = found.load()
+    names = {key.lower(): key for key in AGENTS}
+    if name.lower() in names:
+        return AGENTS[names[name.lower()]]
+    if (entry := entry_point(name)) is not None:
+        if not (is_typed or entry.module in sys.modules):
+            raise ValueError(f"{name} is not registered, and no file may name what is imported; {advice(entry)}")
+        agent = entry.load()
         return agent if agent in AGENTS.values() else register(agent)
-    near = difflib.get_close_matches(name.lower(), known, n=1, cutoff=0.5)
-    hint = f"did you mean {known[near[0]]}?" if near else f"there are {', '.join(AGENTS)}"
+    near = difflib.get_close_matches(name.lower(), names, n=1, cutoff=0.5)
+    hint = f"did you mean {names[near[0]]}?" if near else f"there are {', '.join(AGENTS)}"
     raise ValueError(f"no algorithm is called {name!r}; {hint}; --import MODULE imports one that registers others")
 
 
@@ -109,17 +109,17 @@ def agent_of_file(name: Any, path: str | Path) -> type[Agent]:
     )
 
 
-def advice(found: metadata.EntryPoint | None) -> str:
-    """Returns what to import for an algorithm that is not registered."""
-    if found is None:
+def advice(entry: metadata.EntryPoint | None) -> str:
+    """Returns the advice to import the module of an algorithm that is not registered."""
+    if entry is None:
         return "import the module that registers it (--import MODULE)"
-    return f"import {found.module} (--import {found.module})"
+    return f"import {entry.module} (--import {entry.module})"
 
 
 def entry_point(name: str) -> metadata.EntryPoint | None:
     """Returns the entry point of an algorithm that an installed package offers, without importing it."""
     offered = metadata.entry_points(group=ENTRY_POINTS)
-    return next((one for one in offered if one.name.lower() == name.lower()), None)
+    return next((entry for entry in offered if entry.name.lower() == name.lower()), None)
 
 
 def modules_of(algorithm: str, imports: Iterable[str]) -> tuple[str, ...]:
@@ -128,11 +128,11 @@ def modules_of(algorithm: str, imports: Iterable[str]) -> tuple[str, ...]:
     Raises:
         ValueError: if it is not registered, or in this process only, such as one of a notebook.
     """
-    given = tuple(imports)
-    if given or find_agent(algorithm, is_typed=False) in BUILT_IN.values():
-        return given
-    if (found := entry_point(algorithm)) is not None:
-        return (found.module,)
+    modules = tuple(imports)
+    if modules or find_agent(algorithm, is_typed=False) in BUILT_IN.values():
+        return modules
+    if (entry := entry_point(algorithm)) is not None:
+        return (entry.module,)
     raise ValueError(
         f"{algorithm} is registered in this program only, and each run is a process of its own; write the algorithm into a "
         "file, and name that: imports=['my_algorithm.py'], or --import my_algorithm.py"
@@ -167,12 +167,12 @@ def choose_algorithm(
     """
     if preset is not None:
         return preset.algorithm
-    kind = type(actions).__name__
-    if kind not in all_presets.ALGORITHM_FOR:
-        known = ", ".join(f"{name} takes {space}" for space, name in all_presets.ALGORITHM_FOR.items())
-        raise ValueError(f"{env_id} has the actions {actions}, which no algorithm here takes; {known}")
+    name = type(actions).__name__
+    if name not in all_presets.ALGORITHM_FOR:
+        supported = ", ".join(f"{name} takes {space}" for space, name in all_presets.ALGORITHM_FOR.items())
+        raise ValueError(f"{env_id} has the actions {actions}, which no algorithm here takes; {supported}")
     is_vector = isinstance(observations, gym.spaces.Box) and len(observations.shape) == 1
-    return all_presets.FOR_LONG_RUNS if kind == "Box" and is_vector and is_long else all_presets.ALGORITHM_FOR[kind]
+    return all_presets.FOR_LONG_RUNS if name == "Box" and is_vector and is_long else all_presets.ALGORITHM_FOR[name]
 
 
 def load(path: str | Path, env: Any = None, **changes: Any) -> Agent:

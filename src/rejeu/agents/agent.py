@@ -134,7 +134,7 @@ class Agent(BaseAgent):
         with devices.chosen(self.device):
             action, memory = policy.act(self, batch, deterministic, state, ended)
         scaled = spaces.scale_action(self.action_space, action)
-        scaled = jax.tree.map(lambda part: part[0], scaled) if single else scaled
+        scaled = jax.tree.map(lambda array: array[0], scaled) if single else scaled
         return scaled, state if memory is None else memory
 
     def evaluate(
@@ -366,8 +366,8 @@ class Agent(BaseAgent):
             path = source
             with checkpoint.opened(path, "agent") as file:
                 shapes = self.learner.shapes
-                own = {} if exact_match else dict(zip(core.names(shapes), jax.tree.leaves(shapes), strict=True))
-                checkpoint.match(shapes, {**own, **file.specs}, path)
+                defaults = {} if exact_match else dict(zip(core.names(shapes), jax.tree.leaves(shapes), strict=True))
+                checkpoint.match(shapes, {**defaults, **file.specs}, path)
                 source = file.read()
             checkpoint.require_finite(source, path)
         arrays = {key: np.asarray(value) for key, value in source.items()}

@@ -89,7 +89,7 @@ class Resumed(NamedTuple):
     exact: bool
     """Whether the run continues bit for bit as it would have without the interruption."""
     reason: str
-    """What differs; empty if it is exact."""
+    """The difference; empty if it is exact."""
     skipped: tuple[str, ...] = ()
     """Errors of the newer checkpoints that could not be read, newest first."""
 
@@ -98,10 +98,10 @@ class Resumed(NamedTuple):
 
 
 class BaseAgent(ABC):
-    """What all agents have. Abstract: subclass :class:`rejeu.OffPolicyAgent` or :class:`rejeu.OnPolicyAgent`."""
+    """The common base of agents. Abstract: subclass :class:`rejeu.OffPolicyAgent` or :class:`rejeu.OnPolicyAgent`."""
 
     algorithm: ClassVar[Any]
-    """What has ``Config`` and ``make``: a module, or a ``types.SimpleNamespace(Config=Config, make=make)``."""
+    """The object with ``Config`` and ``make``: a module, or a ``types.SimpleNamespace(Config=Config, make=make)``."""
     policy_name: str
     """The argument ``policy``."""
     device: str
@@ -112,7 +112,7 @@ class BaseAgent(ABC):
     stops: Stops | None = None
     """During a ``learn`` on the device: where the program returns to the host. None with the loop of the host."""
     run: Run
-    """What every step changes: environments, buffer, counters, and the state of the algorithm."""
+    """The state that every step changes: environments, buffer, counters, and the state of the algorithm."""
     run_id: str
     """Identifies the run in its checkpoints."""
     is_learning: bool = False
@@ -158,9 +158,9 @@ class BaseAgent(ABC):
     checkpoint_folders: dict[Path, Any]
     """Folders that contain its checkpoints, by path."""
     failed_writes: FailedWrites
-    """What ``learn`` could not write, such as checkpoints and log rows when the disk is full."""
+    """The files that ``learn`` could not write, such as checkpoints and log rows when the disk is full."""
     notes: list[str]
-    """What :func:`rejeu.sb3.load_zip` says of the file; only of agents that it read."""
+    """The notes of :func:`rejeu.sb3.load_zip` about the file; only of agents that it read."""
     predict: Callable[..., Any]
     last_saved: Path | None = None
     """The newest file that :meth:`save` wrote."""
@@ -196,9 +196,9 @@ class BaseAgent(ABC):
         **hyperparameters: Any,
     ) -> None:
         hyperparameters = self.converted(hyperparameters)
-        known = [*validation.field_names(self.algorithm.Config), *AGENT_ARGUMENTS]
+        names = [*validation.field_names(self.algorithm.Config), *AGENT_ARGUMENTS]
         shape = validation.field_names(self.algorithm.Config.policy_kwargs_class)
-        validation.check_names(hyperparameters, known, self.name, shape)
+        validation.check_names(hyperparameters, names, self.name, shape)
         config = self.algorithm.Config(**hyperparameters)
         self.configure(policy, config, seed, stats_window_size, success_threshold, best_window, device)
         self.set_outputs(verbose, log, tensorboard_log)
@@ -254,18 +254,21 @@ class BaseAgent(ABC):
 
         def __getattr__(self, name: str) -> Any:
             """Returns a hyperparameter."""
-            known = validation.field_names(type(self).algorithm.Config)
-            if name in known and "config" in self.__dict__:
+            hyperparameters = validation.field_names(type(self).algorithm.Config)
+            if name in hyperparameters and "config" in self.__dict__:
                 return getattr(self.config, name)
-            public = [one for one in dir(type(self)) if not one.startswith("_")]
-            near = difflib.get_close_matches(name, [*known, *public], 1)
+            public = [attribute for attribute in dir(type(self)) if not attribute.startswith("_")]
+            near = difflib.get_close_matches(name, [*hyperparameters, *public], 1)
             hint = f"; did you mean {near[0]}?" if near else ""
             raise AttributeError(f"{type(self).__name__} has no attribute {name!r}{hint}")
 
     def __setattr__(self, name: str, value: Any) -> None:
         """Sets an attribute; one that agents do not have by :meth:`assign`."""
         has_it = name not in READ_ONCE and (name in self.__dict__ or hasattr(type(self), name))
-        (object.__setattr__ if has_it or "run" not in self.__dict__ else BaseAgent.assign)(self, name, value)
+        if has_it or "run" not in self.__dict__:
+            object.__setattr__(self, name, value)
+        else:
+            BaseAgent.assign(self, name, value)
 
     def assign(self, name: str, value: Any) -> None:
         """Sets a hyperparameter, which counts from the next update on, or an attribute of a class of your own.
@@ -330,8 +333,8 @@ class BaseAgent(ABC):
 
     def algorithm_of(self, config: Any) -> Algorithm:
         """Returns the algorithm for the agent's spaces and a configuration, on raw observations and rewards."""
-        made = self.algorithm.make(config, self.observation_space, self.action_space)
-        algorithm = contract.checked(made, self.action_space)
+        unchecked = self.algorithm.make(config, self.observation_space, self.action_space)
+        algorithm = contract.checked(unchecked, self.action_space)
         if config.rnd is not None:
             algorithm = with_rnd(algorithm, self.obs_leaves, config.rnd)
         if config.normalize is None:
@@ -500,12 +503,12 @@ class BaseAgent(ABC):
         env = self.run.env
         return None if env is None else env.vec_normalize
 
-    def check_spaces(self, vector: VectorEnv, what: str) -> None:
-        """Raises ``ValueError`` if environments, called ``what`` in the message, have other spaces than the agent."""
-        for kind in ("observation", "action"):
-            own, other = getattr(self, f"{kind}_space"), getattr(vector, f"{kind}_space")
-            if not spaces.same(own, other, bounds=kind == "action"):
-                raise ValueError(f"{what} has the {kind} space {other}, and this agent was made for {own}")
+    def check_spaces(self, vector: VectorEnv, source: str) -> None:
+        """Raises ``ValueError`` if environments, called ``source`` in the message, have other spaces than the agent."""
+        for name in ("observation", "action"):
+            ours, theirs = getattr(self, f"{name}_space"), getattr(vector, f"{name}_space")
+            if not spaces.same(ours, theirs, bounds=name == "action"):
+                raise ValueError(f"{source} has the {name} space {theirs}, and this agent was made for {ours}")
 
     def __repr__(self) -> str:
         return f"<rejeu.{self.name} on {self._place}, {self.run.step} steps, {self.run.n_updates} updates>"
@@ -540,8 +543,8 @@ class Documentation:
             lines.append(
                 f"    {key}: {text}" + ("" if default is inspect.Parameter.empty else f"Default: {default!r}.")
             )
-        about = inspect.cleandoc(config.__doc__ or "")
-        return "\n".join([self.text, "", about, "", "Args:", *lines])
+        config_text = inspect.cleandoc(config.__doc__ or "")
+        return "\n".join([self.text, "", config_text, "", "Args:", *lines])
 
 
 class Signature:

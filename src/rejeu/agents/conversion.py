@@ -107,8 +107,8 @@ class OriginalPolicy(NamedTuple):
 
 
 def under(prefix: str, network: Network) -> Network:
-    """Returns the same arrays as parts of something of that name."""
-    return {f"{prefix}.{name}": made for name, made in network.items()}
+    """Returns the arrays of a network as a part of that name."""
+    return {f"{prefix}.{name}": make for name, make in network.items()}
 
 
 def linear(name: str, order: Any = ALL) -> Network:
@@ -150,14 +150,14 @@ def mlp(names: Sequence[str], order: Any) -> Network:
 
 def encoder(policy: OriginalPolicy, prefix: str) -> Network:
     """Returns the CNNs of all images."""
-    made: Network = {}
+    network: Network = {}
     images = [leaf for leaf in policy.leaves if policy.is_image(leaf)]
     for i, leaf in enumerate(images):
         base = f"{prefix}.extractors.{leaf.path}" if leaf.path else prefix
         for j in range(3):
-            made |= under(f"images.{i}.layers.{j}", convolution(f"{base}.cnn.{2 * j}"))
-        made |= under(f"images.{i}.linear", {**linear(f"{base}.linear.0"), "weight": flattened(base)})
-    return made
+            network |= under(f"images.{i}.layers.{j}", convolution(f"{base}.cnn.{2 * j}"))
+        network |= under(f"images.{i}.linear", {**linear(f"{base}.linear.0"), "weight": flattened(base)})
+    return network
 
 
 def convolution(name: str) -> Network:
@@ -179,7 +179,7 @@ def flattened(base: str) -> Made:
 
 def joined(networks: Sequence[Network], join: Callable[..., np.ndarray]) -> Network:
     """Returns networks of equal structure joined array by array."""
-    return {name: lambda view, name=name: join([one[name](view) for one in networks]) for name in networks[0]}  # type: ignore[misc]
+    return {name: lambda view, name=name: join([network[name](view) for network in networks]) for name in networks[0]}  # type: ignore[misc]
 
 
 def plain(policy: OriginalPolicy, extractor: str, hidden: Sequence[str], head: Network, extra: int = 0) -> Network:
@@ -201,7 +201,7 @@ def q_network(policy: OriginalPolicy, prefix: str, name: str, n_quantiles: int) 
     head = linear(last)
     if n_quantiles > 1:
         apart = lambda x: np.moveaxis(x.reshape(*x.shape[:-1], n_quantiles, -1), -1, -2).reshape(x.shape)  # noqa: E731
-        head = {key: lambda view, made=made: apart(made(view)) for key, made in head.items()}  # type: ignore[misc]
+        head = {key: lambda view, make=make: apart(make(view)) for key, make in head.items()}  # type: ignore[misc]
     return plain(policy, f"{prefix}.features_extractor", hidden, head)
 
 
@@ -223,25 +223,25 @@ def actor(policy: OriginalPolicy, prefix: str) -> Network:
 
 def critics(policy: OriginalPolicy, prefix: str) -> list[Network]:
     """Returns the critics."""
-    made: list[Network] = []
-    while hidden := policy.layers(f"{prefix}.qf{len(made)}"):
+    networks: list[Network] = []
+    while hidden := policy.layers(f"{prefix}.qf{len(networks)}"):
         last = hidden.pop()
         n_actions = int(np.prod(policy.action_space.shape or ()))
-        made.append(plain(policy, f"{prefix}.features_extractor", hidden, linear(last), n_actions))
-    if not made:
+        networks.append(plain(policy, f"{prefix}.features_extractor", hidden, linear(last), n_actions))
+    if not networks:
         raise Malformed(f"policy.pth has no critics under {prefix}")
-    return made
+    return networks
 
 
 def renormalized(policy: OriginalPolicy, network: Network, prefix: str, extra: int = 0) -> Network:
     """Returns a network of CrossQ: ``network`` with the normalization layers that are in the sequence ``prefix``."""
-    found = [key.split(".")[-2] for key in policy.weights if key.startswith(f"{prefix}.") and key.endswith(".ra_mean")]
+    norms = [key.split(".")[-2] for key in policy.weights if key.startswith(f"{prefix}.") and key.endswith(".ra_mean")]
     names = {"scale": "scale", "offset": "bias", "mean": "ra_mean", "variance": "ra_var", "n_batches": "steps"}
-    for i, index in enumerate(sorted(found, key=int)):
+    for i, index in enumerate(sorted(norms, key=int)):
         for ours, theirs in names.items():
             order = policy.order(extra) if i == 0 and theirs != "steps" else ...
-            made = lambda view, name=f"{prefix}.{index}.{theirs}", order=order: view.get(name)[order]  # noqa: E731
-            network[f"torso.norms.{i}.{ours}"] = made
+            make = lambda view, name=f"{prefix}.{index}.{theirs}", order=order: view.get(name)[order]  # noqa: E731
+            network[f"torso.norms.{i}.{ours}"] = make
     return network
 
 
@@ -256,8 +256,8 @@ def actor_critic(policy: OriginalPolicy, latent: bool) -> Network:
     """
     order = ALL if latent else policy.order()
     shared = policy.layers("mlp_extractor.shared_net")
-    made: Network = under("torso", mlp(shared + policy.layers("mlp_extractor.policy_net"), order))
-    made |= under("value_torso", mlp(shared + policy.layers("mlp_extractor.value_net"), order))
+    network: Network = under("torso", mlp(shared + policy.layers("mlp_extractor.policy_net"), order))
+    network |= under("value_torso", mlp(shared + policy.layers("mlp_extractor.value_net"), order))
     action, value = linear("action_net"), linear("value_net")
     if isinstance(policy.action_space, spaces.Box):
         action = (
@@ -265,10 +265,10 @@ def actor_critic(policy: OriginalPolicy, latent: bool) -> Network:
             if policy.squashes
             else in_unit_range(policy.action_space, action, "log_std")
         )
-        made["log_std"] = action.pop("log_std")
+        network["log_std"] = action.pop("log_std")
     for name, head in (("", action), ("value_", value)):
-        made |= under(f"{name}head", head if f"{name}torso.layers.0.bias" in made else reordered(head, order))
-    return made if latent else made | encoders(policy)
+        network |= under(f"{name}head", head if f"{name}torso.layers.0.bias" in network else reordered(head, order))
+    return network if latent else network | encoders(policy)
 
 
 def in_unit_range(space: spaces.Box, head: Network, log_std: str = "") -> Network:
@@ -278,18 +278,18 @@ def in_unit_range(space: spaces.Box, head: Network, log_std: str = "") -> Networ
     with np.errstate(invalid="ignore"):
         half, middle = np.where(is_bounded, 0.5 * (high - low), 1.0), np.where(is_bounded, 0.5 * (high + low), 0.0)
     weight, bias = head["weight"], head["bias"]
-    made: Network = {
+    network: Network = {
         "weight": lambda view: view.scaled(weight(view), 1.0 / half),
         "bias": lambda view: view.scaled(view.shifted(bias(view), -middle), 1.0 / half),
     }
-    return made | ({"log_std": lambda view: view.shifted(view.get(log_std), -np.log(half))} if log_std else {})
+    return network | ({"log_std": lambda view: view.shifted(view.get(log_std), -np.log(half))} if log_std else {})
 
 
 def encoders(policy: OriginalPolicy) -> Network:
     """Returns the encoder of the policy, and that of the value where it has its own."""
-    own = "pi_features_extractor" if policy.has("pi_features_extractor") else "features_extractor"
-    made = under("encoder", encoder(policy, own))
-    return made if shares_extractor(policy) else made | under("value_encoder", encoder(policy, "vf_features_extractor"))
+    extractor = "pi_features_extractor" if policy.has("pi_features_extractor") else "features_extractor"
+    net = under("encoder", encoder(policy, extractor))
+    return net if shares_extractor(policy) else net | under("value_encoder", encoder(policy, "vf_features_extractor"))
 
 
 def shares_extractor(policy: OriginalPolicy) -> bool:
@@ -306,8 +306,8 @@ def address(array: np.ndarray) -> int:
 def cell(policy: OriginalPolicy, name: str) -> Network:
     """Returns the LSTM of that name, whose gates are in the same order."""
     pairs = {"recurrent": "weight_hh_l0", "bias": "bias_ih_l0", "recurrent_bias": "bias_hh_l0"}
-    made: Network = {ours: lambda view, key=f"{name}.{theirs}": view.get(key).T for ours, theirs in pairs.items()}  # type: ignore[misc]
-    return made | {"inputs": lambda view: view.get(f"{name}.weight_ih_l0").T[policy.order()]}
+    network: Network = {ours: lambda view, key=f"{name}.{theirs}": view.get(key).T for ours, theirs in pairs.items()}  # type: ignore[misc]
+    return network | {"inputs": lambda view: view.get(f"{name}.weight_ih_l0").T[policy.order()]}
 
 
 def parts_of(algorithm: str, policy: OriginalPolicy, n_quantiles: int) -> list[Part]:
@@ -329,7 +329,7 @@ def parts_of(algorithm: str, policy: OriginalPolicy, n_quantiles: int) -> list[P
             network = renormalized(policy, network, "actor.latent_pi")
             n_actions = int(np.prod(policy.action_space.shape or ()))
             online_critics = [
-                renormalized(policy, one, f"critic.qf{i}", n_actions) for i, one in enumerate(online_critics)
+                renormalized(policy, critic, f"critic.qf{i}", n_actions) for i, critic in enumerate(online_critics)
             ]
         parts = [Part("actor", network, "actor_optimizer", "actor", "actor.")]
         parts += [Part("critics", stack(online_critics), "critics_optimizer", "critic", "critic.")]
@@ -378,18 +378,18 @@ def converted(
 
     arrays: dict[str, np.ndarray] = {}
     left_out: list[str] = []
-    for part in parts:
-        views = {part.field: View(weight, 1)}
-        if part.optimizer:
-            count, moments = moments_of(optimizers.get(f"{part.file}.optimizer"), policy, part.prefix)
-            left_out += [] if moments else [f"{part.file}.optimizer.pth"]
+    for component in parts:
+        views = {component.field: View(weight, 1)}
+        if component.optimizer:
+            count, moments = moments_of(optimizers.get(f"{component.file}.optimizer"), policy, component.prefix)
+            left_out += [] if moments else [f"{component.file}.optimizer.pth"]
             if "exp_avg" in moments:
-                arrays[f"{part.optimizer}.count"] = np.asarray(count)
-            for kind, name, power in (("exp_avg", "mu", -1), ("exp_avg_sq", "nu", -2), ("square_avg", "nu", -2)):
-                if kind in moments:
-                    views[f"{part.optimizer}.{name}"] = View(moments[kind], power)
+                arrays[f"{component.optimizer}.count"] = np.asarray(count)
+            for moment, name, power in (("exp_avg", "mu", -1), ("exp_avg_sq", "nu", -2), ("square_avg", "nu", -2)):
+                if moment in moments:
+                    views[f"{component.optimizer}.{name}"] = View(moments[moment], power)
         for field, view in views.items():
-            arrays |= {f"{field}.{name}": made(view) for name, made in part.network.items()}
+            arrays |= {f"{field}.{name}": make(view) for name, make in component.network.items()}
     return arrays, left_out
 
 
@@ -406,9 +406,9 @@ def moments_of(
         return 0, {}
     params = {name: i for i, name in enumerate(optimizer["param_groups"][0]["params"])}
     n_params = len(params)
-    state = {params[name]: one for name, one in state.items()}
-    keys = {key for one in state.values() for key in one}
-    kinds = sorted(keys & {"exp_avg", "exp_avg_sq", "square_avg"})
+    state = {params[name]: slots for name, slots in state.items()}
+    keys = {key for slots in state.values() for key in slots}
+    moment_names = sorted(keys & {"exp_avg", "exp_avg_sq", "square_avg"})
     # An extractor that actor and critic share is the actor's, and older versions of DQN number the target's parameters too.
     for begin, without in ((prefix, "/"), (prefix, "features_extractor"), ("", "/")):
         names = [name for name in policy.weights if name.startswith(begin) and without not in name]
@@ -420,16 +420,16 @@ def moments_of(
         return 0, {}
     number = dict(zip(places, range(n_params), strict=True))
     shapes = {number[address(policy.weights[name])]: policy.weights[name].shape for name in names}
-    fits = all(one[kind].shape == shapes.get(i) for i, one in state.items() for kind in kinds)
-    if kinds not in (["exp_avg", "exp_avg_sq"], ["square_avg"]) or "max_exp_avg_sq" in keys or not fits:
+    fits = all(slots[moment].shape == shapes.get(i) for i, slots in state.items() for moment in moment_names)
+    if moment_names not in (["exp_avg", "exp_avg_sq"], ["square_avg"]) or "max_exp_avg_sq" in keys or not fits:
         return 0, {}
 
-    def moments(kind: str) -> Callable[[str], np.ndarray]:
+    def moments(moment: str) -> Callable[[str], np.ndarray]:
         def get(name: str) -> np.ndarray:
             weight = policy.weights[name]
-            one = state.get(number.get(address(weight)))
-            return np.zeros(weight.shape, np.float32) if one is None else one[kind]
+            slots = state.get(number.get(address(weight)))
+            return np.zeros(weight.shape, np.float32) if slots is None else slots[moment]
 
         return get
 
-    return max(int(one["step"]) for one in state.values()), {kind: moments(kind) for kind in kinds}
+    return max(int(slots["step"]) for slots in state.values()), {moment: moments(moment) for moment in moment_names}

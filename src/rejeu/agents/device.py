@@ -70,9 +70,9 @@ def require_memory(agent: BaseAgent, n_runs: int = 1) -> None:
     of_one = of_run(run, agent.learner, agent.gradient_batch_size(agent.n_envs)) + is_cpu * unwritten(run)
     needed = of_one * n_runs
     if needed > free:
-        what, seeds = (f"{n_runs} runs", " or the number of seeds") if n_runs > 1 else ("the run", "")
+        runs, seeds = (f"{n_runs} runs", " or the number of seeds") if n_runs > 1 else ("the run", "")
         raise MemoryError(
-            f"{what} would need about {needed / GIB:.1f} GiB on {on}, which has {free / GIB:.1f} GiB free; lower "
+            f"{runs} would need about {needed / GIB:.1f} GiB on {on}, which has {free / GIB:.1f} GiB free; lower "
             f"{reducible(run)}{seeds}"
         )
 
@@ -122,7 +122,7 @@ def total(leaves: Sequence[Any]) -> int:
 
 def stops_at(call: TrainingCall, callbacks: Sequence[Any]) -> Stops:
     """Returns where limits and callbacks need the program to return to the host."""
-    every = tuple(sorted({one.every for one in callbacks if isinstance(one, Periodic) and one.every is not None}))
+    every = tuple(sorted({c.every for c in callbacks if isinstance(c, Periodic) and c.every is not None}))
     return Stops(every, at_episodes=call.n_episodes is not None)
 
 
@@ -140,8 +140,8 @@ def reason_against(agent: BaseAgent, callbacks: Sequence[Any]) -> str | None:
 
 def reason_against_callbacks(callbacks: Sequence[Any]) -> str | None:
     """Returns which callback must be called after every step, None if there is none."""
-    named = [type(one).__name__ for one in callbacks if isinstance(one, TrainingCallback) and one.every_step]
-    return f"the callback {named[0]} must be called after every step" if named else None
+    names = [type(c).__name__ for c in callbacks if isinstance(c, TrainingCallback) and c.every_step]
+    return f"the callback {names[0]} must be called after every step" if names else None
 
 
 def reason_against_replay(buffer: Any, config: OffPolicyConfig) -> str | None:

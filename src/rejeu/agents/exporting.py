@@ -32,7 +32,7 @@ MOST_SECONDS = 60.0
 
 
 class Exported(NamedTuple):
-    """What :meth:`rejeu.SAC.export` has written."""
+    """The files that :meth:`rejeu.SAC.export` has written."""
 
     path: Path
     """Of the file."""
@@ -77,23 +77,23 @@ def export(
     form.check(target, noise, batch, frame_stack)
     batch = 1 if form.takes == "one" else batch
     stack = stack_of(agent, frame_stack) if form.frames else None
-    one = policy_for(agent, noise, 1, stack)
-    recording, duration, stack = record(agent, one, make_env, stack)
-    one = one if stack is None else policy_for(agent, noise, 1, stack)
-    made = one if batch == 1 else policy_for(agent, noise, batch, stack)
-    card = card_of(agent, made, target, source, duration)
+    single = policy_for(agent, noise, 1, stack)
+    recording, duration, stack = record(agent, single, make_env, stack)
+    single = single if stack is None else policy_for(agent, noise, 1, stack)
+    policy = single if batch == 1 else policy_for(agent, noise, batch, stack)
+    card = card_of(agent, policy, target, source, duration)
     if stack is not None:
         card["frame_stack"] = {"n": stack.n, "padding": "zero" if stack.zeros else "reset"}
-    about = agent.observation_space, agent.action_space, path.stem, *(agent.origin or ())
-    contents, run = form.files(Exportable(made, one, card, *about))
-    found = None if run is None else check.compare(one, recording, run)
-    if found is not None and not found.difference <= found.allowed:
+    details = agent.observation_space, agent.action_space, path.stem, *(agent.origin or ())
+    contents, run = form.files(Exportable(policy, single, card, *details))
+    result = None if run is None else check.compare(single, recording, run)
+    if result is not None and not result.difference <= result.allowed:
         raise ValueError(
-            f"the {target} file differs from predict by {found.difference:.3g}, more than {found.allowed:.3g}, "
-            f"on {found.n} observations ({found.source}), and was not kept; please report this with the model"
+            f"the {target} file differs from predict by {result.difference:.3g}, more than {result.allowed:.3g}, "
+            f"on {result.n} observations ({result.source}), and was not kept; please report this with the model"
         )
     note = "" if run is not None else f"not checked, because {form.runner} is not installed"
-    card |= {"sha256": hashlib.sha256(contents[0]).hexdigest(), "check": found and found._asdict()}
+    card |= {"sha256": hashlib.sha256(contents[0]).hexdigest(), "check": result and result._asdict()}
     card_path = path.with_name(f"{path.name}.json")
     files = [path, path.with_suffix(".h")][: len(contents)]
     contents = (*contents, json.dumps(card, indent=1).encode())
@@ -102,16 +102,16 @@ def export(
             out = opened.enter_context(atomic.replacing(file))
             out.write(content)
             out.flush()
-    return Exported(path, card_path, target, len(contents[0]), found, note)
+    return Exported(path, card_path, target, len(contents[0]), result, note)
 
 
 def stack_of(agent: BaseAgent, n: int | None) -> FrameStack | None:
     """Returns of which frames the observations of an agent are made; None if they are no stacks."""
-    own = getattr(agent.config, "frame_stack", None)
-    if n is None and own is not None:
-        flags = stacked_leaves(agent.obs_leaves, own)
+    n_frames = getattr(agent.config, "frame_stack", None)
+    if n is None and n_frames is not None:
+        flags = stacked_leaves(agent.obs_leaves, n_frames)
         pairs = zip(agent.obs_leaves, flags, strict=True)
-        return FrameStack(own, tuple(-len(leaf.shape) if flag else None for leaf, flag in pairs))
+        return FrameStack(n_frames, tuple(-len(leaf.shape) if flag else None for leaf, flag in pairs))
     return None if n is None else frame_stack_of(agent.obs_leaves, n)
 
 
@@ -137,7 +137,7 @@ def numpy_policy(agent: BaseAgent, source: str) -> NumpyPolicy:
     return NumpyPolicy(*npz_file.content_of(exportable), spaces.MAX_NUMBERS)
 
 
-def card_of(agent: BaseAgent, made: Policy, target: str, source: str, duration: float | None) -> dict[str, Any]:
+def card_of(agent: BaseAgent, policy: Policy, target: str, source: str, duration: float | None) -> dict[str, Any]:
     """Returns the contract of a policy in JSON values."""
     finite.settle(agent)
     weights = hashlib.sha256()
@@ -157,15 +157,15 @@ def card_of(agent: BaseAgent, made: Policy, target: str, source: str, duration: 
         "steps": agent.run.step,
         "weights": weights.hexdigest(),
         "seconds_per_step": duration,
-        "batch": "free" if made.batch is None else made.batch,
-        "inputs": [narrow(port).to_json() for port in made.inputs],
-        "outputs": [narrow(port).to_json() for port in made.outputs],
+        "batch": "free" if policy.batch is None else policy.batch,
+        "inputs": [narrow(port).to_json() for port in policy.inputs],
+        "outputs": [narrow(port).to_json() for port in policy.outputs],
         "versions": {"jax": jax.__version__, "numpy": np.__version__},
     }
 
 
 def record(
-    agent: BaseAgent, one: Policy, make_env: Callable[[], Any] | None, stack: FrameStack | None = None
+    agent: BaseAgent, policy: Policy, make_env: Callable[[], Any] | None, stack: FrameStack | None = None
 ) -> tuple[SeenSteps, float | None, FrameStack | None]:
     """Returns observations with the actions of ``predict``, the duration of a step in seconds if it is known, and the stack.
 
@@ -175,13 +175,13 @@ def record(
     they are samples of the observation space.
     """
     vector, duration = environment(agent, make_env)
-    ports = [port for port in one.inputs if port.role in ("observation", "action_mask")]
+    ports = [port for port in policy.inputs if port.role in ("observation", "action_mask")]
     rows: list[list[np.ndarray]] = []
     actions, starts = [], []
     rng, end = np.random.default_rng(0), xla.clock() + MOST_SECONDS
     agent.observation_space.seed(0)
     memory, ended = None, np.ones(1, bool)
-    obs = vector.reset(0) if vector is not None else _sample(agent, one, rng)
+    obs = vector.reset(0) if vector is not None else _sample(agent, policy, rng)
     try:
         while len(rows) < check.OBSERVATIONS and xla.clock() < end:
             if vector is None and stack is not None:
@@ -192,7 +192,7 @@ def record(
             actions.append(action[0])
             starts.append(bool(ended[0]))
             if vector is None:
-                obs, ended = _sample(agent, one, rng), np.array([len(rows) % 100 == 0])
+                obs, ended = _sample(agent, policy, rng), np.array([len(rows) % 100 == 0])
                 continue
             step = vector.step(action)
             ended = step.terminated | step.truncated
@@ -204,11 +204,11 @@ def record(
     if stack is not None:
         n_leaves = len(stack.axes)
         if vector is not None:
-            stack = stack._replace(zeros=stack.begins_with_zeros([one[starts] for one in columns[:n_leaves]]))
-        columns[:n_leaves] = [np.asarray(stack.newest(i, one)) for i, one in enumerate(columns[:n_leaves])]
+            stack = stack._replace(zeros=stack.begins_with_zeros([column[starts] for column in columns[:n_leaves]]))
+        columns[:n_leaves] = [np.asarray(stack.newest(i, column)) for i, column in enumerate(columns[:n_leaves])]
     inputs = {port.name: column.astype(port.dtype) for port, column in zip(ports, columns, strict=True)}
-    inputs |= {port.name: np.array(starts) for port in one.of("episode_start")}
-    for port in one.of("noise"):  # with these numbers a sample is the mode
+    inputs |= {port.name: np.array(starts) for port in policy.of("episode_start")}
+    for port in policy.of("noise"):  # with these numbers a sample is the mode
         number = 0.0 if port.drawn == "normal" else 0.5
         inputs[port.name] = np.full((len(rows), *port.shape), number, port.dtype)
     return SeenSteps(inputs, np.stack(actions), "sampled" if vector is None else vector.env_id), duration, stack
@@ -233,8 +233,8 @@ def seconds_per_step(env: Any) -> float | None:
     config = getattr(inner, "config", None)
     if isinstance(config, dict) and "policy_frequency" in config:  # highway-env
         return 1.0 / float(config["policy_frequency"])
-    found = next((value for name in ("dt", "tau") if isinstance(value := getattr(inner, name, None), float)), None)
-    return None if found is None else float(found)
+    seconds = next((value for name in ("dt", "tau") if isinstance(value := getattr(inner, name, None), float)), None)
+    return None if seconds is None else float(seconds)
 
 
 def _restacked(agent: BaseAgent, stack: FrameStack, obs: Any, before: list[np.ndarray] | None, starts: bool) -> Any:
@@ -245,8 +245,8 @@ def _restacked(agent: BaseAgent, stack: FrameStack, obs: Any, before: list[np.nd
         if axis is not None:
             last = leaves[i][0] if before is None else before[i]
             leaves[i] = np.asarray(stack.pushed(i, last, stack.newest(i, leaves[i][0]), starts))[None]
-    found = jax.tree.unflatten(structure, leaves)
-    return found if masked is None else masked._replace(obs=found)
+    stacked = jax.tree.unflatten(structure, leaves)
+    return stacked if masked is None else masked._replace(obs=stacked)
 
 
 def moderate(x: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -254,13 +254,13 @@ def moderate(x: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return np.where(np.abs(x) < 1e6, x, rng.normal(size=x.shape)).astype(x.dtype) if x.dtype.kind == "f" else x
 
 
-def _sample(agent: BaseAgent, one: Policy, rng: np.random.Generator) -> Any:
+def _sample(agent: BaseAgent, policy: Policy, rng: np.random.Generator) -> Any:
     """Returns a batch of one sample of the observation space, with a mask if the agent takes masks."""
     obs = jax.tree.map(
-        lambda part: moderate(np.asarray(part)[None], rng),
+        lambda array: moderate(np.asarray(array)[None], rng),
         spaces.plain(agent.observation_space, agent.observation_space.sample()),
     )
-    masks = one.of("action_mask")
+    masks = policy.of("action_mask")
     if not masks:
         return obs
     mask = rng.random((1, *masks[0].shape)) < 0.7

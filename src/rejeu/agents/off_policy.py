@@ -1,4 +1,4 @@
-"""What agents have in common that learn from a replay buffer."""
+"""The base class of agents that learn from a replay buffer."""
 
 from __future__ import annotations
 
@@ -85,8 +85,8 @@ class OffPolicyAgent(Agent):
         self._require_replay()
         try:
             with checkpoint.opened(path, "replay") as file:
-                for kind, own in (("observation", self.observation_space), ("action", self.action_space)):
-                    model_files.check_space(file.header.get(f"{kind}_space"), own, kind)
+                for name, space in (("observation", self.observation_space), ("action", self.action_space)):
+                    model_files.check_space(file.header.get(f"{name}_space"), space, name)
                 ring_io.check(self.run.replay.ring, file.specs)
                 arrays = file.read()
             self.run.replay.restore(arrays)
@@ -130,14 +130,14 @@ class OffPolicyAgent(Agent):
 
     def make_buffer(self, env: VectorEnv) -> Any:
         config = self.config
-        own = self.empty_buffer(env, env.n_envs, config.buffer_size, config.priorities)
+        buffer = self.empty_buffer(env, env.n_envs, config.buffer_size, config.priorities)
         if config.demonstrations is None:
-            return own
+            return buffer
         from rejeu import demonstrations
 
         recorded = demonstrations.read(config.demonstrations)
         share = 1.0 if config.offline else config.demonstration_share
-        return demonstrations.WithDemonstrations(own, self.replay_of(recorded, env), share)
+        return demonstrations.WithDemonstrations(buffer, self.replay_of(recorded, env), share)
 
     def replay_of(self, recorded: Demonstrations, env: VectorEnv) -> ReplayBuffer | HerReplayBuffer:
         """Returns a replay buffer that holds demonstrations, from which batches are drawn as from the agent's own.
@@ -173,29 +173,31 @@ class OffPolicyAgent(Agent):
         if config.hindsight is not None:
             spaces.check_goal_space(env.observation_space)
         action = spaces.random_action(env.action_space, 1, np.random.default_rng(0))
+        leaves, structure = self.observed(env)
         ring = Ring(
-            size,
-            n_envs,
-            *self.observed(env),
-            action.shape[1:],
-            action.dtype,
-            config.frame_stack,
-            counters(config.hindsight),
-            sum(leaf.size for leaf in jax.tree.leaves(self.learner.initial_memory(1))),
+            capacity=size,
+            n_envs=n_envs,
+            obs_leaves=leaves,
+            obs_structure=structure,
+            action_shape=action.shape[1:],
+            action_dtype=action.dtype,
+            frame_stack=config.frame_stack,
+            counters=counters(config.hindsight),
+            memory_size=sum(leaf.size for leaf in jax.tree.leaves(self.learner.initial_memory(1))),
         )
         tree = None if priorities is None else Priorities(ring, priorities)
         each_reward = config.normalize is not None and config.normalize.norm_reward
-        kind: Any = config.replay_buffer_class
-        kind = BUFFERS[kind] if isinstance(kind, str) else kind
+        cls: Any = config.replay_buffer_class
+        cls = BUFFERS[cls] if isinstance(cls, str) else cls
         if config.hindsight is not None:
-            buffer = kind(ring, config.gamma, config.hindsight, self._goals(env), config.n_steps, tree, each_reward)
+            buffer = cls(ring, config.gamma, config.hindsight, self._goals(env), config.n_steps, tree, each_reward)
             buffer.last_infos = env.infos
         else:
             settings: Any = config.replay_buffer_kwargs or ()
             if config.has_memory:
                 shape = config.policy_kwargs
                 settings = {"sequence": (shape.sequence_length, shape.burn_in)}
-            buffer = kind(ring, config.gamma, config.n_steps, tree, each_reward, **dict(settings))
+            buffer = cls(ring, config.gamma, config.n_steps, tree, each_reward, **dict(settings))
         if config.needs_next_action:
             buffer.with_next_action = True
         return buffer

@@ -1,4 +1,4 @@
-"""What agents have in common that learn from rollouts of their current policy."""
+"""The base class of agents that learn from rollouts of their current policy."""
 
 from __future__ import annotations
 

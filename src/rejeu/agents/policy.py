@@ -100,12 +100,12 @@ def q_values(
     is_discrete = isinstance(space, gym.spaces.Discrete)
     if action is None and not is_discrete:
         raise ValueError(f"q_values needs actions of {space}; only for Discrete actions it returns the values of all")
-    given = None if action is None else _actions(space, action, single, n)
+    actions = None if action is None else _actions(space, action, single, n)
     with devices.chosen(agent.device):
         finite.settle(agent)
-        values = np.asarray(agent.learner.action_values(agent.run.state, obs, None if is_discrete else given))
-    if is_discrete and given is not None:
-        values = values[:, np.arange(n), given]
+        values = np.asarray(agent.learner.action_values(agent.run.state, obs, None if is_discrete else actions))
+    if is_discrete and actions is not None:
+        values = values[:, np.arange(n), actions]
     if single:
         values = values[:, 0]
     return CRITICS[critics](values)
@@ -139,11 +139,11 @@ def memory_of(agent: BaseAgent, memory: Any, n: int) -> Any:
         return agent.learner.initial_memory(n)
     if agent.carry_shapes is None:  # once: it takes longer than a prediction
         agent.carry_shapes = jax.eval_shape(lambda: agent.learner.initial_memory(1))
-    given = jax.tree.map(np.shape, memory)
+    shapes = jax.tree.map(np.shape, memory)
     expected = jax.tree.map(lambda x: (n, *x.shape[1:]), agent.carry_shapes)
-    if given != expected:
+    if shapes != expected:
         raise ValueError(
-            f"{agent.name}.predict was given a state of the shapes {given}, expected {expected}; give what its last call "
+            f"{agent.name}.predict was given a state of the shapes {shapes}, expected {expected}; give what its last call "
             "returned for as many observations, or None where episodes begin"
         )
     return memory

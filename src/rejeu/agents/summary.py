@@ -39,13 +39,13 @@ def describe(state: Any, leaves: tuple[Leaf, ...]) -> str:
 
 def layers(network: Any) -> list[tuple[str, str, str]]:
     """Returns a row for each layer: its name, the shapes of its arrays, and its number of parameters."""
-    found: dict[str, list[tuple[str, Any]]] = {}
+    by_layer: dict[str, list[tuple[str, Any]]] = {}
     for path, leaf in zip(core.names(network), jax.tree.leaves(network), strict=True):
         layer, _, name = path.rpartition(".")
-        found.setdefault(layer, []).append((name, leaf))
+        by_layer.setdefault(layer, []).append((name, leaf))
     return [
         (f"  {layer}", ", ".join(f"{name} {leaf.shape}" for name, leaf in arrays), f"{n_parameters(arrays):,}")
-        for layer, arrays in found.items()
+        for layer, arrays in by_layer.items()
     ]
 
 

@@ -98,11 +98,11 @@ def train_seeds(
     numbers = numbers_of(seeds)
     lists = {name: value for name, value in settings.items() if is_list_of_numbers(value)}
     fixed = {name: value for name, value in settings.items() if name not in lists}
-    values = [dict(zip(lists, one, strict=True)) for one in itertools.product(*lists.values())]
+    values = [dict(zip(lists, combination, strict=True)) for combination in itertools.product(*lists.values())]
     agents: list[A] = []
-    for one in values:
+    for combination in values:
         vector = lambda seed: make_vector(env, n_envs, seed=seed)  # noqa: E731
-        first = kind(policy, vector(numbers[0]), seed=numbers[0], device=device, **fixed, **one)
+        first = kind(policy, vector(numbers[0]), seed=numbers[0], device=device, **fixed, **combination)
         if not agents:
             require_memory(first, len(numbers) * len(values))
         first.made_from_id = isinstance(env, str)
@@ -129,7 +129,7 @@ def numbers_of(seeds: int | Iterable[int]) -> list[int]:
     """
     if not isinstance(seeds, Iterable) or isinstance(seeds, str):
         return [*range(whole("seeds", seeds, least=1))]
-    numbers = [whole_seed(one) for one in seeds]
+    numbers = [whole_seed(seed) for seed in seeds]
     if not numbers or len({*numbers}) < len(numbers):
         raise ValueError(f"seeds={seeds!r} must be a number of at least 1, or different seeds")
     return numbers
@@ -146,15 +146,15 @@ def is_list_of_numbers(value: Any) -> bool:
 
 def sibling(agent: A, env: Any, seed: int) -> A:
     """Returns an agent with the same settings and compiled functions, other environments and another seed."""
-    other = object.__new__(type(agent))
+    twin = object.__new__(type(agent))
     same = ("config", "stats_window_size", "success_threshold", "best_window", "device")
-    other.configure(agent.policy_name, seed=seed, **{name: getattr(agent, name) for name in same})
-    other.set_outputs(agent.verbose, agent.log, agent.tensorboard_log)
-    other.made_from_id = agent.made_from_id
-    other.observation_space, other.action_space = agent.observation_space, agent.action_space
-    other.obs_leaves, other.learner = agent.obs_leaves, agent.learner
-    other.start_run(other.make_envs(env, seed=seed))
-    return other
+    twin.configure(agent.policy_name, seed=seed, **{name: getattr(agent, name) for name in same})
+    twin.set_outputs(agent.verbose, agent.log, agent.tensorboard_log)
+    twin.made_from_id = agent.made_from_id
+    twin.observation_space, twin.action_space = agent.observation_space, agent.action_space
+    twin.obs_leaves, twin.learner = agent.obs_leaves, agent.learner
+    twin.start_run(twin.make_envs(env, seed=seed))
+    return twin
 
 
 def learn_together(
@@ -182,7 +182,7 @@ def learn_together(
     """
     first = agents[0]
     check_differing(first, differing)
-    ordered = [in_order(one) for one in callbacks]
+    ordered = [in_order(run_callbacks) for run_callbacks in callbacks]
     if progress_bar:
         ordered[0] = [*ordered[0], ProgressBar.of(calls[0])]
     stops = common_stops(agents, calls, ordered)
@@ -193,8 +193,8 @@ def learn_together(
         stack.enter_context(devices.chosen(first.device))
         outputs = sinks or [()] * len(agents)
         sessions = [
-            stack.enter_context(training.session(agent, call, one, None, more))
-            for agent, call, one, more in zip(agents, calls, ordered, outputs, strict=True)
+            stack.enter_context(training.session(agent, call, run_callbacks, None, more))
+            for agent, call, run_callbacks, more in zip(agents, calls, ordered, outputs, strict=True)
         ]
         try:
             with Interrupt() as interrupt:
@@ -217,9 +217,9 @@ def learn_together(
             for agent in agents:
                 agent.interrupted, agent.interrupted_by = interrupt.requested, interrupt.signal
         except NonFiniteSteps as broken:
-            which = agents[broken.which]
-            values = [f"{name}={getattr(which.config, name):g}" for name in differing]
-            raise finite.steps_reported(which, broken, f"{', '.join([f'seed {which.seed}', *values])}: ") from None
+            culprit = agents[broken.which]
+            values = [f"{name}={getattr(culprit.config, name):g}" for name in differing]
+            raise finite.steps_reported(culprit, broken, f"{', '.join([f'seed {culprit.seed}', *values])}: ") from None
 
 
 def common_stops(
@@ -230,17 +230,17 @@ def common_stops(
     Raises:
         ValueError: if an agent cannot train on the device, or the limit is a number of episodes.
     """
-    found: set[int] = set()
-    for agent, call, one in zip(agents, calls, callbacks, strict=True):
-        if reason := reason_against(agent, one):
+    every: set[int] = set()
+    for agent, call, run_callbacks in zip(agents, calls, callbacks, strict=True):
+        if reason := reason_against(agent, run_callbacks):
             raise ValueError(
                 f"several runs in one program are not possible: {reason}; use rejeu train --seeds N --jobs M"
             )
         if call.n_episodes is not None:
             raise ValueError("several runs in one program end after steps or minutes, not after episodes")
-        agent.stops, agent.n_together = device.stops_at(call, one), len(agents)
-        found |= {*agent.stops.every}
-    return Stops(tuple(sorted(found)))
+        agent.stops, agent.n_together = device.stops_at(call, run_callbacks), len(agents)
+        every |= {*agent.stops.every}
+    return Stops(tuple(sorted(every)))
 
 
 def reason_against(agent: Agent, callbacks: Sequence[Callback]) -> str | None:
@@ -253,12 +253,12 @@ def reason_against(agent: Agent, callbacks: Sequence[Callback]) -> str | None:
 
 def check_differing(agent: Agent, names: Iterable[str]) -> None:
     """Raises ``ValueError`` if hyperparameters cannot differ between the runs of one program."""
-    kinds = {field.name: str(field.type) for field in dataclasses.fields(agent.config)}
+    types = {field.name: str(field.type) for field in dataclasses.fields(agent.config)}
     for name in names:
-        if name not in kinds:
+        if name not in types:
             raise ValueError(f"{name} is no hyperparameter of {agent.name} and is equal for all runs; give one value")
         in_replay = name in IN_REPLAY and isinstance(agent.config, OffPolicyConfig)
-        if "float" not in kinds[name] or in_replay:
+        if "float" not in types[name] or in_replay:
             raise ValueError(
                 f"{name} cannot differ between the runs of one program, which is compiled for its value; give one number, or "
                 "train one program for each"
@@ -266,7 +266,7 @@ def check_differing(agent: Agent, names: Iterable[str]) -> None:
 
 
 def remaking(agent: Agent) -> Callable[[Any], Any]:
-    """Returns what makes the algorithm of an agent, and its exploration, from other hyperparameters."""
+    """Returns the function that makes the algorithm of an agent, and its exploration, from other hyperparameters."""
 
     def make(config: Any) -> Any:
         algorithm = agent.algorithm_of(config)

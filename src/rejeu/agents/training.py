@@ -30,7 +30,7 @@ TABLE_SECONDS = 2.0
 """Least time between two tables that ``verbose=1`` prints; other outputs get every row."""
 HINT_SECONDS, HINT_RATE = 10.0, 200.0
 """After so many seconds of training, at fewer steps a second, a run may get a hint."""
-DETERMINISTIC = {name for name, one in CATALOG.items() if one.is_deterministic}
+DETERMINISTIC = {name for name, entry in CATALOG.items() if entry.is_deterministic}
 LOG_FOLDER = "logs"
 """Folder of the folders of logs, in the current folder."""
 LOGGED_AS = {"exploration_rate": "rollout/exploration_rate"}
@@ -41,18 +41,18 @@ def open_outputs(
     agent: BaseAgent, sinks: Iterable[Sink], tb_log_name: str | None, stack: ExitStack
 ) -> Sequence[GuardedSink]:
     """Returns the outputs for rows of statistics; ``stack`` closes those that are opened here."""
-    given, opened = [*sinks, *agent.logger.outputs], list[Sink]()
+    passed, opened = [*sinks, *agent.logger.outputs], list[Sink]()
     if agent.verbose and not agent.logger.outputs:
         opened.append(Console(TABLE_SECONDS))
     if agent.log and not agent.logger.outputs:
         folder = next_folder(agent.tensorboard_log or LOG_FOLDER, tb_log_name or agent.name)
-        opened += [open_log(kind, folder, run_name(agent), tracker_id(agent)) for kind in agent.log]
-    outputs = [guarded(one, agent.failed_writes) for one in given]
-    for one, output in zip(given, outputs, strict=True):
-        if output.in_background and output is not one:
+        opened += [open_log(name, folder, run_name(agent), tracker_id(agent)) for name in agent.log]
+    outputs = [guarded(sink, agent.failed_writes) for sink in passed]
+    for sink, output in zip(passed, outputs, strict=True):
+        if output.in_background and output is not sink:
             stack.callback(output.close)
-    for one in opened:
-        outputs.append(guarded(one, agent.failed_writes, closes=True))
+    for sink in opened:
+        outputs.append(guarded(sink, agent.failed_writes, closes=True))
         stack.callback(outputs[-1].close)
     return outputs
 
@@ -63,12 +63,12 @@ def run_name(agent: BaseAgent) -> str:
 
 
 def tracker_id(agent: BaseAgent) -> str:
-    """Returns what identifies the run in a tracker. A ``learn`` that counts steps from 0 starts another run."""
+    """Returns the id of the run in a tracker. A ``learn`` that counts steps from 0 starts another run."""
     return agent.run_id + (f"-{agent.reset_step}" if agent.reset_step else "")
 
 
 def run_config(agent: BaseAgent, call: TrainingCall) -> dict[str, Any]:
-    """Returns what trackers show as the configuration of a run: environment, algorithm, limits, hyperparameters."""
+    """Returns the configuration of a run for trackers: environment, algorithm, limits, hyperparameters."""
     return {
         "algorithm": agent.name,
         "env_id": agent.run.env.env_id,
@@ -98,8 +98,8 @@ def statistics_row(agent: BaseAgent) -> dict[str, float]:
     numbers["time/fps"] = float(agent.steps_per_second)
     numbers["time/time_elapsed"] = run.seconds["total"]
     numbers["time/total_timesteps"] = agent.num_timesteps
-    for part, share in time_shares(run.seconds).items():
-        numbers[f"time/{part}_share"] = share
+    for phase, share in time_shares(run.seconds).items():
+        numbers[f"time/{phase}_share"] = share
     numbers["time/compile_seconds"] = xla.seconds()
     numbers["train/n_updates"] = run.n_updates
     if agent.learner.skips:
@@ -244,11 +244,11 @@ def session(
 
         def record(turn: Progress) -> bool:
             record_turn(agent, call, turn)
-            answers = [called(callback, agent, turn) for callback in callbacks if not runs_last(callback)]
+            results = [called(callback, agent, turn) for callback in callbacks if not runs_last(callback)]
             write_row(agent, call, turn, outputs)  # with what these callbacks have recorded
-            answers += [called(callback, agent, turn) for callback in callbacks if runs_last(callback)]
+            results += [called(callback, agent, turn) for callback in callbacks if runs_last(callback)]
             over = call.is_over(agent.run)
-            return over or any(isinstance(answer, bool | np.bool_) and not answer for answer in answers)
+            return over or any(isinstance(result, bool | np.bool_) and not result for result in results)
 
         try:
             yield record
@@ -280,7 +280,7 @@ def horizon(agent: BaseAgent, call: TrainingCall) -> tuple[int | None, Callable[
     """Returns the number of steps that are left to take, and the progress of schedules after a number of them."""
     run, first = agent.run, agent.run.step
     remaining = None if call.last_step is None else call.last_step - first
-    return remaining, lambda taken: call.progress(first + taken, run.episode)
+    return remaining, lambda n_steps: call.progress(first + n_steps, run.episode)
 
 
 @contextmanager

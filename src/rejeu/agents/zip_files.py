@@ -133,8 +133,8 @@ def read(path: Path) -> Model:
     Raises:
         Malformed: if it is damaged, too large, or no model of Stable-Baselines3.
     """
-    found = path.stat()
-    room = min(found.st_size, 512 * getattr(found, "st_blocks", found.st_size))
+    status = path.stat()
+    room = min(status.st_size, 512 * getattr(status, "st_blocks", status.st_size))
     with path.open("rb") as file:
         if file.read(1) == b"\x80":
             raise Malformed(f"it is a pickle, as statistics of VecNormalize are and {TENSORFLOW}")
@@ -151,7 +151,7 @@ def read(path: Path) -> Model:
                 with part_of(name):
                     tensors[name.removesuffix(".pth")] = tensors_of(content_of(archive, name))
     weights = tensors["policy"]
-    if not isinstance(weights, dict) or not all(isinstance(one, np.ndarray) for one in weights.values()):
+    if not isinstance(weights, dict) or not all(isinstance(array, np.ndarray) for array in weights.values()):
         raise Malformed("policy.pth holds something else than tensors by name")
     return Model(fields, tensors, room)
 
@@ -199,25 +199,25 @@ def described(value: Any) -> Any:
     Raises:
         Malformed: for another kind of space.
     """
-    kind = value.name.rpartition(".")[2] if isinstance(value, PickledCall) and ".spaces." in value.name else ""
-    state = value.state if kind else None
+    name = value.name.rpartition(".")[2] if isinstance(value, PickledCall) and ".spaces." in value.name else ""
+    state = value.state if name else None
     if not isinstance(state, dict):
         raise Malformed("it is no space of Gymnasium")
-    if kind == "Dict" and isinstance(state["spaces"], dict):
-        return {"Dict": {str(key): described(part) for key, part in state["spaces"].items()}}
-    if kind == "Box":
+    if name == "Dict" and isinstance(state["spaces"], dict):
+        return {"Dict": {str(key): described(subspace) for key, subspace in state["spaces"].items()}}
+    if name == "Box":
         low, high = array_of(state["low"]), array_of(state["high"])
         return {"Box": {"low": low.tolist(), "high": high.tolist(), "shape": list(low.shape), "dtype": low.dtype.name}}
-    if kind == "Discrete":
+    if name == "Discrete":
         return {"Discrete": {"n": int(array_of(state["n"])), "start": int(array_of(state.get("start", 0)))}}
-    if kind == "MultiDiscrete":
+    if name == "MultiDiscrete":
         n = array_of(state["nvec"])
         start = array_of(state["start"]) if isinstance(state.get("start"), PickledCall) else np.zeros_like(n)
         return {"MultiDiscrete": {"nvec": n.tolist(), "start": start.tolist()}}
-    if kind == "MultiBinary":
+    if name == "MultiBinary":
         shape = state["n"] if isinstance(state["n"], tuple | list) else [state["n"]]
         return {"MultiBinary": {"shape": [int(array_of(n)) for n in shape]}}
-    raise Malformed(f"it is the space {shown(kind, 40)}, which policies of Stable-Baselines3 do not take")
+    raise Malformed(f"it is the space {shown(name, 40)}, which policies of Stable-Baselines3 do not take")
 
 
 def space_of(model: Model, key: str) -> tuple[gym.Space, list[str]]:
@@ -253,22 +253,22 @@ def with_goals(model: Model, space: gym.Space) -> tuple[gym.Space, list[str], di
     return whole, keys, weights
 
 
-def observation_space_of(own: gym.Space, given: gym.Space | None) -> gym.Space:
+def observation_space_of(old: gym.Space, new: gym.Space | None) -> gym.Space:
     """Returns the observation space of an agent: that of the environment, if it is given.
 
     Raises:
         Malformed: if the policy was trained on another; the axes of images may be in another order, as behind
             Stable-Baselines3's ``VecTransposeImage``.
     """
-    if given is None:
-        return own
+    if new is None:
+        return old
     plain = lambda leaf: leaf if leaf.kind != "image" else dataclasses.replace(leaf, shape=tuple(sorted(leaf.shape)))  # noqa: E731
-    if [*map(plain, spaces.leaves(own))] != [*map(plain, spaces.leaves(given))]:
-        longer = 1 + given.shape[0] if isinstance(given, gym.spaces.Box) and len(given.shape) == 1 else 0
-        missing = own.shape == (longer,) and isinstance(own, gym.spaces.Box) and (own.low[-1], own.high[-1]) == (0, 1)
+    if [*map(plain, spaces.leaves(old))] != [*map(plain, spaces.leaves(new))]:
+        longer = 1 + new.shape[0] if isinstance(new, gym.spaces.Box) and len(new.shape) == 1 else 0
+        missing = old.shape == (longer,) and isinstance(old, gym.spaces.Box) and (old.low[-1], old.high[-1]) == (0, 1)
         hint = f"; wrap it as the policy was trained, --wrapper {zoo.TIME_FEATURE}" if missing else ""
-        raise Malformed(f"its observation space is {own}, and the environment's is {given}{hint}")
-    return given
+        raise Malformed(f"its observation space is {old}, and the environment's is {new}{hint}")
+    return new
 
 
 def number_of(value: Any) -> Any:
@@ -278,10 +278,10 @@ def number_of(value: Any) -> Any:
     return array_of(value).item() if isinstance(value, PickledCall) and value.name.endswith(".scalar") else value
 
 
-def settings_of(kind: Any, model: Model, notes: list[str], changed: Collection[str] = ()) -> dict[str, Any]:
+def settings_of(config_class: Any, model: Model, notes: list[str], changed: Collection[str] = ()) -> dict[str, Any]:
     """Returns the hyperparameters of a file that rejeu has too, but for those ``changed``; what is left out is noted."""
-    names = {field.name for field in dataclasses.fields(kind)}
-    found: dict[str, Any] = {}
+    names = {field.name for field in dataclasses.fields(config_class)}
+    settings: dict[str, Any] = {}
     names -= {"max_grad_norm"} if number_of(model.readable("max_grad_norm")) == 0 else set()  # of TRPO, without effect
     stored = {name: f"{name}_schedule" if name == "delta_std" else name for name in names - {*IGNORED}}
     for name in sorted(name for name, key in stored.items() if key in model.fields and name not in changed):
@@ -296,35 +296,35 @@ def settings_of(kind: Any, model: Model, notes: list[str], changed: Collection[s
             used = f"{value:g}" if isinstance(value, int | float) else "the default"
             notes.append(f"{name} is code in the file; {used} is used")
         if isinstance(value, bool | int | float | str) or name not in SCHEDULES:
-            found[name] = value
+            settings[name] = value
     if "train_freq" in names and isinstance(value := model.readable("train_freq"), PickledCall | int):
         n, unit = value.arguments if isinstance(value, PickledCall) else (value, "step")
         n, unit = (n, unit) if n != -1 else (model.readable("n_episodes_rollout"), "episode")  # of versions before 1.0
         unit = unit.arguments[0] if isinstance(unit, PickledCall) else unit
-        found["train_freq"] = n if unit == "step" else (n, unit)
+        settings["train_freq"] = n if unit == "step" else (n, unit)
     if isinstance(buffer := model.readable("replay_buffer_class"), Name) and buffer.name == "HerReplayBuffer":
-        settings = model.readable("replay_buffer_kwargs")
-        found |= hindsight(settings.get if isinstance(settings, dict) else {}.get)
+        kwargs = model.readable("replay_buffer_kwargs")
+        settings |= hindsight(kwargs.get if isinstance(kwargs, dict) else {}.get)
     elif OLD_HER in model.fields:
-        found |= hindsight(model.readable)
+        settings |= hindsight(model.readable)
     if "action_noise" in names and (noise := model.readable("action_noise")) is not None:
         state = noise.state if isinstance(noise, PickledCall) and isinstance(noise.state, dict) else {}
         sigma = np.unique(array_of(state["_sigma"])) if "_sigma" in state and "_theta" not in state else np.zeros(2)
         if sigma.size == 1 and not array_of(state["_mu"]).any():
-            found["action_noise"] = float(sigma[0])
+            settings["action_noise"] = float(sigma[0])
         else:
             notes.append("action_noise is not taken over; give it again for training")
     if "rms_prop_eps" in names:
-        found |= {"rms_prop_eps": model.group.get("eps", 1e-5), "use_rms_prop": "alpha" in model.group}
-    return found
+        settings |= {"rms_prop_eps": model.group.get("eps", 1e-5), "use_rms_prop": "alpha" in model.group}
+    return settings
 
 
 def hindsight(setting: Callable[[str], Any]) -> dict[str, Any]:
     """Returns the hyperparameters of hindsight replay, from a function that returns a setting by its name."""
-    known = {key: value for key in ("n_sampled_goal", OLD_HER) if (value := setting(key)) is not None}
-    if isinstance(strategy := known.get(OLD_HER), PickledCall):
-        known[OLD_HER] = ("future", "final", "episode")[strategy.arguments[0]]
-    return {"replay_buffer_class": "HerReplayBuffer", "replay_buffer_kwargs": known}
+    kwargs = {key: value for key in ("n_sampled_goal", OLD_HER) if (value := setting(key)) is not None}
+    if isinstance(strategy := kwargs.get(OLD_HER), PickledCall):
+        kwargs[OLD_HER] = ("future", "final", "episode")[strategy.arguments[0]]
+    return {"replay_buffer_class": "HerReplayBuffer", "replay_buffer_kwargs": kwargs}
 
 
 def policy_settings(model: Model, policy: OriginalPolicy, algorithm: str) -> dict[str, Any]:
@@ -335,19 +335,19 @@ def policy_settings(model: Model, policy: OriginalPolicy, algorithm: str) -> dic
     Raises:
         Malformed: for settings of a policy that rejeu does not have.
     """
-    given = model.value("policy_kwargs") or {}
-    if not isinstance(given, dict):
+    kwargs = model.value("policy_kwargs") or {}
+    if not isinstance(kwargs, dict):
         raise Malformed("data: policy_kwargs are no dict")
-    extractor = given.get("features_extractor_class")
+    extractor = kwargs.get("features_extractor_class")
     if extractor is not None and not (isinstance(extractor, Name) and extractor.name in EXTRACTORS):
         raise Malformed(
             f"its feature extractor is of another kind than {', '.join(EXTRACTORS)}, and no file holds code"
         )
     for key, expected in {"use_expln": False, "full_std": True, "clip_mean": 2.0}.items():
-        if given.get(key, expected) != expected:
-            raise Malformed(f"policy_kwargs has {key}={shown(given[key], 40)}, which is not read")
-    shape: dict[str, Any] = {"normalize_images": given.get("normalize_images", True)}
-    if (activation := given.get("activation_fn")) is not None:
+        if kwargs.get(key, expected) != expected:
+            raise Malformed(f"policy_kwargs has {key}={shown(kwargs[key], 40)}, which is not read")
+    shape: dict[str, Any] = {"normalize_images": kwargs.get("normalize_images", True)}
+    if (activation := kwargs.get("activation_fn")) is not None:
         shape["activation_fn"] = activation.name.lower() if isinstance(activation, Name) else "of another kind"
         if shape["activation_fn"] == "gelu":
             raise Malformed("its activation_fn is GELU, of which JAX has an approximation; the outputs would differ")
@@ -370,7 +370,7 @@ def policy_settings(model: Model, policy: OriginalPolicy, algorithm: str) -> dic
         return changes
     if algorithm == "ARS":
         *shape["net_arch"], _ = (len(policy.weights[f"{name}.weight"]) for name in action_layers(policy))
-        squashes = given.get("squash_output", bool(shape["net_arch"]))
+        squashes = kwargs.get("squash_output", bool(shape["net_arch"]))
         if isinstance(policy.action_space, gym.spaces.Box) and squashes is not bool(shape["net_arch"]):
             raise Malformed("its actions are squashed behind a linear policy, or clipped behind hidden layers")
         return changes
@@ -394,17 +394,17 @@ def moments(field: str, value: Any) -> dict[str, np.ndarray]:
     if not isinstance(value, PickledCall) or not isinstance(value.state, dict):
         raise Malformed(f"it has no running statistics for {field}")
     mean, variance, count = (array_of(value.state[key]) for key in ("mean", "var", "count"))
-    seen = min(float(count), normalization.MAX_COUNT)
-    if not (np.isfinite(mean).all() and np.isfinite(variance).all() and (variance >= 0).all() and seen >= 0):
+    n_seen = min(float(count), normalization.MAX_COUNT)
+    if not (np.isfinite(mean).all() and np.isfinite(variance).all() and (variance >= 0).all() and n_seen >= 0):
         raise Malformed("its statistics have negative variances or counts, or values that are not finite")
     if max(np.abs(mean).max(), variance.max()) > np.finfo(np.float32).max:
         raise Malformed("its statistics are larger than float32 can hold")
-    return {f"{field}.mean": mean, f"{field}.variance": variance, f"{field}.n_seen": np.asarray(seen)}
+    return {f"{field}.mean": mean, f"{field}.variance": variance, f"{field}.n_seen": np.asarray(n_seen)}
 
 
-def equal(one: Mapping[str, np.ndarray], other: Mapping[str, np.ndarray]) -> bool:
+def equal(a: Mapping[str, np.ndarray], b: Mapping[str, np.ndarray]) -> bool:
     """Returns whether two collections of arrays are the same."""
-    return all(np.array_equal(one[key], other[key]) for key in one)
+    return all(np.array_equal(a[key], b[key]) for key in a)
 
 
 def unresolved(value: Any) -> int:
@@ -429,17 +429,17 @@ def statistics_of(
     goals = (
         [obs[key] for key in spaces.GOAL_KEYS[1:]] if isinstance(obs, dict) and {*spaces.GOAL_KEYS} <= {*obs} else []
     )
-    if goals and not equal(*(moments("", one) for one in goals)):
+    if goals and not equal(*(moments("", rms) for rms in goals)):
         settings["share_goals"] = False
     for leaf, group in zip(leaves, spaces.groups(leaves, settings.get("share_goals", True)), strict=True):
         if obs is None or (group is None and not isinstance(obs, dict)):
             continue
-        one = obs.get(leaf.path) if isinstance(obs, dict) else obs
-        if (one is None) != (group is None):
+        rms = obs.get(leaf.path) if isinstance(obs, dict) else obs
+        if (rms is None) != (group is None):
             raise Malformed(f"it normalizes other parts of observations than an agent does: {leaf.path}")
         if group is not None:
             field = f"statistics.obs.{group}"
-            arrays |= moments(field, one)
+            arrays |= moments(field, rms)
     if moving := sum(map(unresolved, obs.values() if isinstance(obs, dict) else [obs] if obs else [])):
         notes.append(
             f"{moving} numbers of the observations vary by less than float32, in which rejeu holds them, tells apart: "
@@ -494,10 +494,10 @@ def load_zip(
             "action masks, is lost"
         )
     cls = kind or BUILT_IN[algorithm]
-    own = {key: changes.pop(key) for key in [*changes] if key in (*OWN, *OUTPUTS)}
-    outputs = {key: own.pop(key) for key in [*own] if key in OUTPUTS}
+    arguments = {key: changes.pop(key) for key in [*changes] if key in (*OWN, *OUTPUTS)}
+    outputs = {key: arguments.pop(key) for key in [*arguments] if key in OUTPUTS}
     with explained(path):
-        own = arguments_of(model) | own
+        arguments = arguments_of(model) | arguments
         policy, space = policy_of(model, algorithm)
         settings = settings_of(cls.algorithm.Config, model, notes, changes)
         settings |= policy_settings(model, policy, algorithm)
@@ -509,17 +509,17 @@ def load_zip(
         cls.algorithm.Config(**settings)  # what the file says is judged apart from what the user says
     agent: Agent = cls.__new__(cls)
     agent.notes = notes  # before it is built, when only known attributes can be set
-    agent.configure(name_of(policy), build(cls.algorithm.Config, settings | changes), **own)
+    agent.configure(name_of(policy), build(cls.algorithm.Config, settings | changes), **arguments)
     agent.set_outputs(**outputs)
     vector = None if env is None else agent.make_envs(env, 1, seed=agent.seed)
-    given = None if vector is None else vector.observation_space
+    env_space = None if vector is None else vector.observation_space
     with explained(path):
-        agent.build(observation_space_of(space, given), policy.action_space)
+        agent.build(observation_space_of(space, env_space), policy.action_space)
         restore(agent, model, policy, algorithm, arrays)
     restore_windows(agent, model.readable)
     if kind is not None:  # as the original's load does
-        said = {key: model.readable(key) for key in OUTPUTS}
-        agent.set_outputs(**{key: x for key, x in said.items() if type(x) is OUTPUTS[key]} | outputs)
+        saved = {key: model.readable(key) for key in OUTPUTS}
+        agent.set_outputs(**{key: x for key, x in saved.items() if type(x) is OUTPUTS[key]} | outputs)
     if vector is not None:
         agent.set_env(vector)
         agent.made_from_id = isinstance(env, str)
@@ -575,7 +575,7 @@ def restore(
     agent.notes += [f"the state of {name} is not taken over: it is of another optimizer" for name in left_out]
     values |= counts_of(algorithm, model)
     arrays = {**statistics, **{f"{prefix}{key}": value for key, value in values.items()}}
-    arrays = checked(agent.learner.shapes, arrays, [f"{prefix}{part.field}." for part in parts])
+    arrays = checked(agent.learner.shapes, arrays, [f"{prefix}{component.field}." for component in parts])
     agent.start_run(None)
     agent.set_parameters(arrays, exact_match=False)
     restore_counters(agent, model, values)
@@ -584,18 +584,18 @@ def restore(
 def counts_of(algorithm: str, model: Model) -> dict[str, np.ndarray]:
     """Returns the counters and the temperature among the arrays of a state."""
     variables = model.tensors.get("pytorch_variables", model.tensors.get("tensors"))
-    found: dict[str, Any] = {}
+    counts: dict[str, Any] = {}
     if isinstance(variables, dict) and isinstance(log_alpha := variables.get("log_ent_coef"), np.ndarray):
-        found["log_alpha"] = log_alpha.reshape(())
+        counts["log_alpha"] = log_alpha.reshape(())
         optimizer = model.tensors.get("ent_coef_optimizer")
         moments = next(iter(optimizer["state"].values()), None) if isinstance(optimizer, dict) else None
         if moments:
-            found |= {"alpha_optimizer.count": np.asarray(int(moments["step"]))}
+            counts |= {"alpha_optimizer.count": np.asarray(int(moments["step"]))}
             for ours, theirs in (("mu", "exp_avg"), ("nu", "exp_avg_sq")):
-                found[f"alpha_optimizer.{ours}"] = moments[theirs].reshape(())
+                counts[f"alpha_optimizer.{ours}"] = moments[theirs].reshape(())
     if algorithm in ("DQN", "QRDQN"):
-        found["step"] = np.asarray(model.value("num_timesteps"))
-    return found
+        counts["step"] = np.asarray(model.value("num_timesteps"))
+    return counts
 
 
 def checked(shapes: Any, arrays: Mapping[str, np.ndarray], fields: list[str]) -> dict[str, np.ndarray]:
@@ -622,19 +622,19 @@ def checked(shapes: Any, arrays: Mapping[str, np.ndarray], fields: list[str]) ->
 def restore_windows(agent: Agent, value: Callable[[str], Any]) -> None:
     """Fills the buffers of recent episodes from what ``value`` says a file has by a name; it ends at what is no episode."""
     for name in ("ep_info_buffer", "ep_success_buffer"):
-        found, number = value(name), lambda x: array_of(x).item()
+        window, number = value(name), lambda x: array_of(x).item()
         with contextlib.suppress(*UNREADABLE):
-            for one in (found.state if isinstance(found, PickledCall) else found) or ():
-                entry = {key: number(one[key]) for key in "rlt"} if name == "ep_info_buffer" else number(one)
+            for episode in (window.state if isinstance(window, PickledCall) else window) or ():
+                entry = {key: number(episode[key]) for key in "rlt"} if name == "ep_info_buffer" else number(episode)
                 getattr(agent, name).append(entry)
 
 
-def restore_counters(agent: Agent, model: Model, found: Mapping[str, np.ndarray]) -> None:
+def restore_counters(agent: Agent, model: Model, arrays: Mapping[str, np.ndarray]) -> None:
     """Sets steps, episodes and gradient steps of an agent, which Stable-Baselines3 counts in epochs for PPO."""
     step, episode, n_updates = (model.value(key) for key in ("num_timesteps", "_episode_num", "_n_updates"))
     counts = [value if isinstance(value, int) and 0 <= value < 2**31 else 0 for value in (step, episode, n_updates)]
-    if "optimizer.count" in found:
-        counts[2] = int(found["optimizer.count"])
+    if "optimizer.count" in arrays:
+        counts[2] = int(arrays["optimizer.count"])
     agent.run.step, agent.run.episode, agent.run.n_updates = counts
     names = [name for name in core.names(agent.learner.shapes) if name.split(".")[-1] == "n_updates"]
     agent.set_parameters({name: np.asarray(counts[2], np.int32) for name in names}, exact_match=False)

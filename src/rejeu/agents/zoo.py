@@ -24,20 +24,20 @@ HERE = {"sb3_contrib.": "rejeu.sb3_contrib.", "stable_baselines3.": "rejeu.sb3."
 """Where the wrappers of a package are in rejeu."""
 
 
-def model_in(folder: Path, which: Literal["best", "last"]) -> Path:
+def model_in(folder: Path, wanted: Literal["best", "last"]) -> Path:
     """Returns the zip file of a folder.
 
     Raises:
         FileNotFoundError: unless there is exactly one.
     """
-    names = [path for path in sorted(folder.glob("*.zip")) if (path.stem == BEST) is (which == "best")]
-    found = [path for path in names if which == "best" or not NO_MODEL.fullmatch(path.stem)]
-    if len(found) != 1:
+    names = [path for path in sorted(folder.glob("*.zip")) if (path.stem == BEST) is (wanted == "best")]
+    paths = [path for path in names if wanted == "best" or not NO_MODEL.fullmatch(path.stem)]
+    if len(paths) != 1:
         others = ", ".join(path.name for path in sorted(folder.glob("*.zip"))) or "no zip file"
         raise FileNotFoundError(
-            f"{folder} has {len(found)} files that could be the {which} model, expected one; it holds {others}: name the file"
+            f"{folder} has {len(paths)} files that could be the {wanted} model, expected one; it holds {others}: name the file"
         )
-    return found[0]
+    return paths[0]
 
 
 def folders(path: Path) -> list[Path]:
@@ -52,37 +52,38 @@ def statistics_beside(path: Path) -> Path | None:
     ``PREFIX_vecnormalize_N_steps.pkl`` belongs to ``PREFIX_N_steps.zip``, as ``CheckpointCallback`` writes them.
     """
     prefix, _, steps = path.stem.removesuffix("_steps").rpartition("_")
-    own = [path.with_name(f"{prefix}_vecnormalize_{steps}_steps.pkl"), path.with_name(f"{path.stem}_vecnormalize.pkl")]
-    places = own + [folder / name for folder in folders(path) for name in STATISTICS]
-    return next((place for place in places if place.is_file()), None)
+    names = f"{prefix}_vecnormalize_{steps}_steps.pkl", f"{path.stem}_vecnormalize.pkl"
+    files = [path.with_name(name) for name in names]
+    files += [folder / name for folder in folders(path) for name in STATISTICS]
+    return next((file for file in files if file.is_file()), None)
 
 
-def notes_beside(path: Path, used: Any, given: Any = ()) -> list[str]:
-    """Returns what the files beside a zip file say that rejeu does not do by itself, and which of them are not read.
+def notes_beside(path: Path, used: Any, changes: Any = ()) -> list[str]:
+    """Returns notes about the files beside a zip file: what rejeu does not do by itself, and which of them are not read.
 
     Args:
         path: of the zip file.
         used: the file of the ``VecNormalize`` that is used; None if there is none.
-        given: names of hyperparameters that replace those of the file.
+        changes: names of hyperparameters that replace those of the file.
     """
     notes = []
     unread = {file.name for folder in folders(path)[:-1] for file in folder.glob("*.pkl") if file != used}
     unread |= {file.name for file in path.parent.glob(f"{path.stem}*.pkl") if file != used}
     if unread:
         notes.append(f"not read: {shown(', '.join(sorted(unread)), 200)}")
-    found: dict[str, Any] = {}
+    args: dict[str, Any] = {}
     for name in ("args.yml", "config.yml", "env_kwargs.yml"):
-        place = next((folder / name for folder in folders(path) if (folder / name).is_file()), None)
+        yaml_file = next((folder / name for folder in folders(path) if (folder / name).is_file()), None)
         try:
-            found |= {} if place is None else read_yaml(place)
+            args |= {} if yaml_file is None else read_yaml(yaml_file)
         except (*WRONG, OSError, ImportError) as error:
-            notes.append(f"{place} is not read: {brief(error)}")
-    kwargs = found.get("env_kwargs")
-    if env := found.get("env"):
-        made = f" with {shown(kwargs, 200)}" if kwargs else ""
-        notes.append(f"args.yml: it was trained on {shown(env, 80)}{made}; --env gives the model its environment")
+            notes.append(f"{yaml_file} is not read: {brief(error)}")
+    kwargs = args.get("env_kwargs")
+    if env := args.get("env"):
+        text = f" with {shown(kwargs, 200)}" if kwargs else ""
+        notes.append(f"args.yml: it was trained on {shown(env, 80)}{text}; --env gives the model its environment")
     for key in ("env_wrapper", "vec_env_wrapper"):
-        if wrapper := found.get(key):
+        if wrapper := args.get(key):
             names = re.findall(r"[A-Za-z_]\w*(?:\.\w+)+", shown(wrapper, 300))
             ours = [
                 f"--wrapper {':'.join(f'{HERE[start]}{name.removeprefix(start)}'.rsplit('.', 1))}"
@@ -93,16 +94,16 @@ def notes_beside(path: Path, used: Any, given: Any = ()) -> list[str]:
             notes.append(
                 f"config.yml: it was trained behind {shown(wrapper, 200)}; wrap the environment: {' '.join(ours)}"
             )
-    if found.get("frame_stack"):
-        n = shown(found["frame_stack"], 20)
+    if args.get("frame_stack"):
+        n = shown(args["frame_stack"], 20)
         notes.append(
             f"config.yml: its observations are stacks of {n} frames; wrap the environment in FrameStackObservation"
         )
-    schedules = {key: found[key] for key in ("learning_rate", "clip_range", "delta_std") if key in {*found} - {*given}}
+    schedules = {key: args[key] for key in ("learning_rate", "clip_range", "delta_std") if key in {*args} - {*changes}}
     if schedules:
         written = " ".join(f"{key}={shown(value, 40)}" for key, value in schedules.items())
         notes.append(f"config.yml: it began with {written}; to train on so: --set {written}")
-    if found.get("normalize") and used is None:
+    if args.get("normalize") and used is None:
         notes.append(
             "config.yml: it was trained behind VecNormalize, whose file is missing: without it actions are others"
         )
@@ -137,8 +138,8 @@ def read_yaml(path: Path) -> dict[str, Any]:
     if len(text) > MOST_TEXT:
         raise Malformed(f"it has more than {MOST_TEXT:,} bytes")
     try:
-        found = Reader(text).get_single_data()
+        content = Reader(text).get_single_data()
     except yaml.YAMLError as error:
         raise Malformed(brief(error)) from None
-    check_size(found, 2**20)
-    return {str(key): value for key, value in dict(found[0] if isinstance(found, list) else found or {}).items()}
+    check_size(content, 2**20)
+    return {str(key): value for key, value in dict(content[0] if isinstance(content, list) else content or {}).items()}
