@@ -36,7 +36,7 @@ from rejeu.checkpoints.pickled import (
 )
 from rejeu.core import algorithm as core, checkpoint, normalization, spaces
 from rejeu.core.errors import CheckpointError
-from rejeu.core.records import Malformed, brief, shown
+from rejeu.core.records import Malformed, brief, shown, stored_size
 from rejeu.core.validation import build
 
 MOST_DATA = 16 * 2**20
@@ -133,8 +133,7 @@ def read(path: Path) -> Model:
     Raises:
         Malformed: if it is damaged, too large, or no model of Stable-Baselines3.
     """
-    status = path.stat()
-    room = min(status.st_size, 512 * getattr(status, "st_blocks", status.st_size))
+    room = stored_size(path)
     with path.open("rb") as file:
         if file.read(1) == b"\x80":
             raise Malformed(f"it is a pickle, as statistics of VecNormalize are and {TENSORFLOW}")

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from rejeu.checkpoints.pickled import check_size
-from rejeu.core.records import WRONG, Malformed, brief, shown
+from rejeu.core.records import WRONG, Malformed, brief, read_bytes, shown
 
 BEST = "best_model"
 STATISTICS = ("vecnormalize.pkl", "vec_normalize.pkl")
@@ -133,10 +133,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
     for name in ("object/apply:collections.OrderedDict", "tuple"):
         Reader.add_constructor(f"tag:yaml.org,2002:python/{name}", items)
-    with path.open("rb") as file:
-        text = file.read(MOST_TEXT + 1)
-    if len(text) > MOST_TEXT:
-        raise Malformed(f"it has more than {MOST_TEXT:,} bytes")
+    text = read_bytes(path, MOST_TEXT)
     try:
         content = Reader(text).get_single_data()
     except yaml.YAMLError as error:

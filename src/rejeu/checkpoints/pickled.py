@@ -25,7 +25,7 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 
 from rejeu.core.errors import CheckpointError
-from rejeu.core.records import MAX_DEPTH, WRONG, Malformed, brief, shown
+from rejeu.core.records import MAX_DEPTH, WRONG, Malformed, brief, read_bytes, shown
 
 PACKAGES = {"collections", "copyreg", "gym", "gymnasium", "numpy", "sb3_contrib", "stable_baselines3", "torch"}
 """Packages whose names a pickle may mention."""
@@ -407,11 +407,7 @@ def read_normalization(path: Path) -> dict[str, Any]:
     Raises:
         Malformed: if it is none, or damaged.
     """
-    with path.open("rb") as file:
-        data = file.read(MOST_FIELD + 1)
-    if len(data) > MOST_FIELD:
-        raise Malformed(f"it has more than {MOST_FIELD:,} bytes")
-    wrapper = parse(data)
+    wrapper = parse(read_bytes(path, MOST_FIELD))
     if (
         not isinstance(wrapper, PickledCall)
         or not wrapper.name.endswith("VecNormalize")

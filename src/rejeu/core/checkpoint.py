@@ -29,7 +29,7 @@ from safetensors import SafetensorError, safe_open
 from rejeu.core import atomic
 from rejeu.core.errors import CheckpointError
 from rejeu.core.hardware import physical_memory
-from rejeu.core.records import Malformed, parse_json, shown
+from rejeu.core.records import Malformed, parse_json, shown, stored_size
 
 DTYPES = {"F32": "float32", "F64": "float64", "I64": "int64", "I32": "int32", "I16": "int16", "I8": "int8"}
 DTYPES |= {"U64": "uint64", "U32": "uint32", "U16": "uint16", "U8": "uint8", "BOOL": "bool", "F16": "float16"}
@@ -198,8 +198,7 @@ class Contents:
     @property
     def room(self) -> int:
         """Bytes of the file; of a sparse file, without its holes."""
-        status = self.path.stat()
-        return min(status.st_size, 512 * getattr(status, "st_blocks", status.st_size))
+        return stored_size(self.path)
 
     def read(self, prefix: str = "") -> dict[str, np.ndarray]:
         """Returns the arrays whose names begin with ``prefix``, by their full names.

@@ -68,18 +68,29 @@ def parse_json(text: str | bytes) -> Any:
         raise Malformed(f"it is not valid JSON: {str(error)[:80]}") from None
 
 
-def read_json(path: Path, max_bytes: int) -> Any:
-    """Returns the value of a JSON file of at most ``max_bytes`` bytes.
+def read_bytes(path: Path, max_bytes: int) -> bytes:
+    """Returns the content of a file.
 
     Raises:
-        Malformed: if the file is longer, or no valid document.
+        Malformed: if it has more than ``max_bytes`` bytes; no more of it is read.
         OSError: if it cannot be read.
     """
     with path.open("rb") as file:
         data = file.read(max_bytes + 1)
     if len(data) > max_bytes:
         raise Malformed(f"it has more than {max_bytes:,} bytes")
-    return parse_json(data)
+    return data
+
+
+def stored_size(path: Path) -> int:
+    """Returns the bytes of a file; of a sparse file, without its holes."""
+    status = path.stat()
+    return min(status.st_size, 512 * getattr(status, "st_blocks", status.st_size))
+
+
+def read_json(path: Path, max_bytes: int) -> Any:
+    """Returns the value of a JSON file of at most ``max_bytes`` bytes; raises as :func:`read_bytes` and :func:`parse_json`."""
+    return parse_json(read_bytes(path, max_bytes))
 
 
 def json_text(value: Any, indent: int = 1) -> str:

@@ -24,7 +24,7 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
 from rejeu.core import atomic, spaces
-from rejeu.core.records import WRONG, brief, shown
+from rejeu.core.records import WRONG, brief, shown, stored_size
 
 METADATA, MAIN = "metadata.json", "main_data.hdf5"
 EPISODE = re.compile(r"episode_(\d{1,9})")
@@ -45,9 +45,8 @@ class ArrayReader:
 
     def __init__(self, files: list[Path], is_jpeg: bool) -> None:
         self.is_jpeg = is_jpeg
-        stats = [file.stat() for file in files]
-        real = sum(min(stat.st_size, 512 * getattr(stat, "st_blocks", stat.st_size)) for stat in stats)
-        self.size, self.left = sum(stat.st_size for stat in stats), SLACK + ROOM * real
+        real = sum(map(stored_size, files))
+        self.size, self.left = sum(file.stat().st_size for file in files), SLACK + ROOM * real
         self.unpacked = max(UNPACKED, PACKED * real)
 
     def part(self, group: Any, path: str, space: gym.Space | None) -> Any:
