@@ -96,17 +96,19 @@ def test_a_log_is_full_by_steps_or_by_bytes():
     assert log.is_full
 
 
-def test_a_log_that_nobody_empties_takes_no_more_memory(monkeypatch):
+def test_episodes_of_a_pool_without_checkpoints_are_not_ended(monkeypatch):
     monkeypatch.setattr("rejeu.envs.envpool.MOST_STEPS", 10)
     with closing(make_vector("CartPole-v1", 2, "envpool", seed=3)) as env:
         env.reset()
         for _ in range(9):
             env.step(np.zeros(2, int))
-        assert env.snapshot() is not None
-        env.step(np.zeros(2, int))
-        env.step(np.zeros(2, int))
+            assert not env.must_reset
+        assert env.snapshot() is None
+        env.record()
+        assert env.must_reset
         assert env.snapshot() is None
         env.reset()
+        assert not env.must_reset
         assert env.snapshot()["n_operations"] == 1
 
 
@@ -115,6 +117,7 @@ def test_a_full_log_begins_again_with_another_pool_whose_seed_follows(monkeypatc
     first = []
     for _ in range(2):
         with closing(make_vector("CartPole-v1", 2, "envpool", seed=3)) as env:
+            env.record()
             before = env.reset().copy()
             for _ in range(2):
                 assert not env.must_reset
@@ -133,7 +136,7 @@ def test_a_run_that_fills_its_log_can_be_resumed_before_and_after(algorithm, tmp
     settings |= {"n_steps": 16, "batch_size": 16} if algorithm == "PPO" else {"learning_starts": 10, "batch_size": 8}
     kind = rejeu.AGENTS[algorithm]
     env = lambda: make_vector("CartPole-v1", 2, "envpool", seed=1)  # noqa: E731
-    whole = kind("MlpPolicy", env(), **settings).learn(200)
+    whole = kind("MlpPolicy", env(), **settings).learn(200, Checkpoint(tmp_path / "whole"))
     for cut in (61, 131):
         folder = tmp_path / str(cut)
         stop = lambda agent, turn, cut=cut: turn.step < cut  # noqa: E731
@@ -149,6 +152,7 @@ def test_a_run_that_fills_its_log_can_be_resumed_before_and_after(algorithm, tmp
 def test_a_pool_that_does_not_repeat_its_episodes_begins_new_ones(tmp_path):
     env = lambda: make_vector("CartPole-v1", 2, "envpool", seed=1)  # noqa: E731
     with closing(env()) as one:
+        one.record()
         obs = one.reset().copy()
         with pytest.raises(DivergedError, match="does not repeat"):
             one.restore(one.snapshot(), obs + 1.0)
@@ -165,6 +169,7 @@ def test_a_pool_that_does_not_repeat_its_episodes_begins_new_ones(tmp_path):
 
 def test_a_record_with_more_operations_than_it_says_is_refused_at_the_first_too_many():
     with closing(make_vector("CartPole-v1", 2, "envpool", seed=1)) as env:
+        env.record()
         obs = env.reset().copy()
         many = np.frombuffer(zlib.compress(bytes([action_log.RESET]) * action_log.BLOCK), np.uint8)
         saved = {**env.snapshot(), "blocks": [many]}

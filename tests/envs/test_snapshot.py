@@ -278,6 +278,7 @@ def test_a_vector_continues_from_its_snapshot(backend, n_envs):
         return make_vector("CartPole-v1", n_envs, backend, seed=2)
 
     with closing(make()) as one, closing(make()) as two:
+        one.record()
         obs = one.reset()
         for _ in range(5):
             obs = one.step(np.ones(n_envs, int)).obs

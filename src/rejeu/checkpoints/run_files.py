@@ -118,6 +118,7 @@ class CheckpointFolder:
         except BaseException:
             self.close()
             raise
+        self.agent.run.env.record()
         if self.agent.report_folder is None:
             self.agent.report_folder = self.folder
 

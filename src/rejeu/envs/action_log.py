@@ -43,8 +43,12 @@ class LoggedOperation(NamedTuple):
 class ActionLog:
     """The operations on ``n_envs`` environments since their creation. Mutable."""
 
-    def __init__(self, n_envs: int, action_space: gym.Space, most_steps: int = MOST_STEPS) -> None:
+    def __init__(self, n_envs: int, action_space: gym.Space, most_steps: int = MOST_STEPS, is_on: bool = True) -> None:
         self.n_envs = n_envs
+        self.is_on = is_on
+        """Whether operations are recorded."""
+        self.is_complete = True
+        """Whether all operations were recorded."""
         self.n_steps = 0
         """Number of steps, summed over the environments."""
         self.n_operations = 0
@@ -65,11 +69,6 @@ class ActionLog:
         """Whether the log is so long that a replay would take too much time."""
         return self.n_steps >= self._most_steps
 
-    @property
-    def is_dropped(self) -> bool:
-        """Whether recording has stopped: the environments were not reset for a long time after the log was full."""
-        return self.n_steps >= 2 * self._most_steps
-
     def step(self, action: np.ndarray, indices: np.ndarray | None = None) -> np.ndarray:
         """Records a step and returns the actions as they are recorded, ``(k, ...)``.
 
@@ -88,8 +87,8 @@ class ActionLog:
         self._add(RESET if indices is None else RESET_SOME, indices, b"")
 
     def _add(self, operation: int, indices: np.ndarray | None, action: bytes) -> None:
-        if self.is_dropped:
-            self._blocks, self._open = [], bytearray()
+        self.is_complete &= self.is_on
+        if not self.is_complete:
             return
         self.n_operations += 1
         self._open.append(operation)

@@ -217,6 +217,9 @@ class VectorEnv(ABC):
         """Whether the next call must be :meth:`reset`; an agent begins new episodes then."""
         return False
 
+    def record(self) -> None:  # noqa: B027
+        """Prepares for :meth:`snapshot`, where that takes more than the environments; called before checkpoints are made."""
+
     def snapshot(self) -> Any:
         """Returns the state of the running environments as plain data (see :mod:`rejeu.core.records`).
 

@@ -34,8 +34,8 @@ NO_LIMIT = 2**31 - 1
 class EnvPool(VectorEnv):
     """Environments of the EnvPool package, stepped by C++ threads.
 
-    When the log of its actions is full (:attr:`ActionLog.is_full`), the pool is created again with a seed derived from the
-    previous one, in every run, resumed or not.
+    For checkpoints its actions are logged. When the log is full (:attr:`ActionLog.is_full`), the pool is created again with a
+    seed derived from the previous one, in every run with checkpoints, resumed or not.
     """
 
     backend = "envpool"
@@ -50,7 +50,7 @@ class EnvPool(VectorEnv):
         self.max_episode_steps = limit if 0 < limit < NO_LIMIT else None
         self.reward_threshold = reward_threshold(env_id, self._pool.spec.reward_threshold)
         self._leaves = leaves(self.observation_space)
-        self._log = self._new_log()
+        self._log = self._new_log(is_on=False)
 
     def _make(self, seed: int | Sequence[int]) -> Any:
         self._seed = seed
@@ -62,19 +62,23 @@ class EnvPool(VectorEnv):
             pool.observation_space, pool.action_space  # noqa: B018 - cached at the first access
         return pool
 
-    def _new_log(self) -> ActionLog:
+    def _new_log(self, is_on: bool) -> ActionLog:
         draws_images = any(leaf.kind == "image" for leaf in self._leaves)
-        return ActionLog(self.n_envs, self.action_space, MOST_IMAGE_STEPS if draws_images else MOST_STEPS)
+        return ActionLog(self.n_envs, self.action_space, MOST_IMAGE_STEPS if draws_images else MOST_STEPS, is_on)
 
     @property
     def must_reset(self) -> bool:
-        return self._log.is_full
+        return self._log.is_on and (self._log.is_full or not self._log.is_complete)
+
+    def record(self) -> None:
+        """Logs the actions from now on. A pool that has been used is created again at the next reset."""
+        self._log.is_on = True
 
     def reset(self, seed: Seed = None) -> Any:
         if seed is None and self.must_reset:
             seed = next_seed(self._seed)
         if seed is not None:
-            self._pool, self._log = self._make(seed), self._new_log()
+            self._pool, self._log = self._make(seed), self._new_log(self._log.is_on)
         self._log.reset()
         self._obs = cast(self.observation_space, self._leaves, self._pool.reset()[0])
         return self._obs
@@ -106,7 +110,7 @@ class EnvPool(VectorEnv):
         return self._obs
 
     def snapshot(self) -> dict[str, Any] | None:
-        if self._log.is_dropped:
+        if not self._log.is_complete:
             return None
         seed = self._seed if isinstance(self._seed, int) else list(self._seed)
         return {"seed": seed, **self._log.to_plain()}
@@ -115,7 +119,7 @@ class EnvPool(VectorEnv):
         if not isinstance(saved, dict) or {*saved} != {"seed", "n_operations", "blocks"}:
             raise ValueError("the record of actions is not one of EnvPool")
         self._pool.close()
-        self._pool, self._log = self._make(_saved_seed(saved["seed"], self.n_envs)), self._new_log()
+        self._pool, self._log = self._make(_saved_seed(saved["seed"], self.n_envs)), self._new_log(is_on=True)
         for indices, action in replay(self._log, saved, self.env_id):
             active = np.isin(np.arange(self.n_envs), indices) if indices is not None else None
             if action is None:

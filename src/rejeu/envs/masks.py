@@ -189,6 +189,13 @@ class MaskedVector(VectorEnv):
             return goal_functions(self.inner.env.env)
         return self.inner.goals()
 
+    @property
+    def must_reset(self) -> bool:
+        return self.inner.must_reset
+
+    def record(self) -> None:
+        self.inner.record()
+
     def snapshot(self) -> Any:
         return self.inner.snapshot()
 
