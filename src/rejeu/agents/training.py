@@ -159,7 +159,7 @@ def start_call(
             seconds_before=run.seconds["total"] - agent.reset_seconds,
             last_step=None if limits[0] is None else run.step + agent.steps_to_take(limits[0]),
         )
-    is_touched = run.fingerprint not in (None, snapshot.fingerprint(run.env))
+    is_touched = run.fingerprint is not None and run.fingerprint != snapshot.fingerprint(run.env)
     if is_touched or (run.env.venv is not None and (reset_num_timesteps or resumes)):  # or stepped by hand unseen
         run.obs = run.action = None
     return call

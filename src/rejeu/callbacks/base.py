@@ -79,20 +79,11 @@ def step_before(agent: Any, progress: Progress) -> int:
 
 
 def listed(callback: Callback | Iterable[Callback] | None) -> list[Callback]:
-    """Returns one callback, several or none as a list.
-
-    Raises:
-        TypeError: if one cannot be called.
-    """
-    if callback is None:
-        return []
+    """Returns one callback, several or none as a list; raises ``TypeError`` if one cannot be called."""
     callbacks = [*callback] if isinstance(callback, Iterable) and not callable(callback) else [callback]
-    for function in callbacks:
-        if not callable(function):
-            raise TypeError(
-                f"callback={function!r:.80} must be a function (agent, progress), or a list of such functions"
-            )
-    return callbacks
+    if wrong := [function for function in callbacks if not (function is None or callable(function))]:
+        raise TypeError(f"callback={wrong[0]!r:.80} must be a function (agent, progress), or a list of such functions")
+    return [function for function in callbacks if function is not None]
 
 
 def in_order(callbacks: Iterable[Callback]) -> list[Callback]:

@@ -145,11 +145,7 @@ def touch(path: Path) -> None:
 
 
 def lock(path: str | Path, timeout: float = -1) -> FileLock:
-    """Returns the lock on a file, which is created where it is acquired; ``timeout`` is in seconds, negative for none.
-
-    Raises:
-        OSError: if the path is a symbolic link.
-    """
+    """Returns the lock on a file, no symbolic link, made when it is acquired; ``timeout`` in seconds, negative for none."""
     from filelock import FileLock  # slow to import
 
     check_no_link(Path(path))

@@ -73,12 +73,7 @@ def whole_seed(seed: Any) -> int:
 
 
 def is_number(value: Any) -> bool:
-    """Returns whether a value is a number that is finite as a float, and not True or False; one of 400 digits is not.
-
-    >>> import numpy as np
-    >>> is_number(np.int64(3)), is_number(np.bool_(True)), is_number("3")
-    (True, False, False)
-    """
+    """Returns whether a value is a number that is finite as a float, and not True or False; one of 400 digits is not."""
     is_real = isinstance(value, numbers.Integral | float) and not isinstance(value, bool)
     return bool(is_real and abs(value) <= sys.float_info.max)
 
@@ -105,8 +100,6 @@ def coerce(
     config: Any, keys: str | tuple[str, ...], converter: Callable[..., Any], optional: bool = False, **limits: Any
 ) -> None:
     """Replaces fields of a frozen dataclass by ``converter(key, value, **limits)``; for use in ``__post_init__``.
-
-    Numbers of NumPy are converted to Python's before.
 
     Args:
         config: the dataclass under construction.

@@ -92,6 +92,11 @@ def register(env_id: str) -> bool:
     return env_id in gym.registry or ":" in env_id
 
 
+def has_package(env_id: str) -> bool:
+    """Returns whether a package other than EnvPool registers ``env_id``, installed or not."""
+    return register(env_id) or provider(env_id) is not None
+
+
 def _compare_joints() -> None:
     """Lets Gymnasium-Robotics tell kinds of joints, which equal no NumPy integer any more in MuJoCo 3.12 and later."""
     mujoco = importlib.import_module("mujoco")

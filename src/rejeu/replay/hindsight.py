@@ -297,10 +297,9 @@ def counters(config: HindsightConfig | None) -> tuple[str, ...]:
     >>> counters(HindsightConfig(goal_selection_strategy="future"))
     ('until_end',)
     """
-    strategy = None if config is None else config.goal_selection_strategy
-    strategies = {*dict(strategy.shares)} if isinstance(strategy, MixedStrategies) else {strategy}
-    strategies -= {*ANY_STEP, None}
-    if not strategies:
+    strategy = config and config.goal_selection_strategy
+    names = {*dict(strategy.shares)} if isinstance(strategy, MixedStrategies) else {strategy}
+    if not (strategies := names - {*ANY_STEP, None}):
         return ()
     return ("until_end",) if strategies <= {*FROM_LATER} else ("since_start", "until_end")
 

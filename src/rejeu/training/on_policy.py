@@ -22,7 +22,7 @@ from rejeu.core.spaces import action_scaler
 from rejeu.envs.base import Step
 from rejeu.training.checks import check_state, checked_reset, checked_restart, checked_step
 from rejeu.training.learner import Learner
-from rejeu.training.run import Episode, Progress, Run, clock_of, record_step, start_clock, timed
+from rejeu.training.run import Episode, Progress, Run, clock_of, in_episodes, record_step, start_clock, timed
 
 
 def on_policy(
@@ -49,7 +49,7 @@ def on_policy(
     first, last = run.step, None if n_steps is None else run.step + n_steps
     check_state(run, learner)
     start_clock(run)
-    while last is None or run.step < last or run.in_episodes:
+    while last is None or run.step < last or in_episodes(run):
         if run.obs is None or (env.must_reset and not rollout.length):
             begin_episodes(run, config, learner)
         run.action = act(run, learner, clock_of(run, progress(run.step - first)))

@@ -135,11 +135,6 @@ class Run:
     def replay(self, buffer: Any) -> None:
         self.buffer, self.fetch = buffer, None
 
-    @property
-    def in_episodes(self) -> bool:
-        """Whether a rollout of whole episodes is under way."""
-        return bool(self.playing.any() and self.buffer.length)
-
     def copy_replay(self) -> None:
         """Copies to ``buffer`` what a loop on the device has added to it there."""
         if self.fetch is not None:
@@ -250,6 +245,11 @@ def time_shares(seconds: Mapping[str, float]) -> dict[str, float]:
     return shares | {"rest": 1.0 - sum(shares.values())}
 
 
+def in_episodes(run: Run) -> bool:
+    """Returns whether a rollout of whole episodes is under way."""
+    return bool(run.playing.any() and run.buffer.length)
+
+
 @dataclass
 class TrainingCall:
     """One call of ``learn``. Mutable: ``logged`` is updated with each row of statistics."""
@@ -305,7 +305,7 @@ class TrainingCall:
 
     def is_over(self, run: Run) -> bool:
         """Returns whether one of its limits is reached."""
-        by_steps = self.last_step is not None and run.step >= self.last_step and not run.in_episodes
+        by_steps = self.last_step is not None and run.step >= self.last_step and not in_episodes(run)
         by_episodes = self.n_episodes is not None and run.episode - self.first_episode >= self.n_episodes
         return by_steps or by_episodes or (self.seconds is not None and self.elapsed >= self.seconds)
 

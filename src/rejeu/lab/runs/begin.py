@@ -27,7 +27,7 @@ from rejeu.core import devices, validation
 from rejeu.core.errors import BadEnvironmentError
 from rejeu.core.spaces import leaves
 from rejeu.envs.make import VectorEnv, WorkerOptions, make_vector
-from rejeu.envs.registry import ENVPOOL_SIZE, is_envpool_installed, provider, register, usable_envpool
+from rejeu.envs.registry import ENVPOOL_SIZE, has_package, is_envpool_installed, usable_envpool
 from rejeu.lab.runs.arguments import Train
 from rejeu.lab.runs.config import DecidedRun, merged
 from rejeu.lab.runs.environment import Environment, from_arguments, module_of
@@ -38,13 +38,7 @@ MANY = 64
 
 
 def begin(arguments: Train, stack: ExitStack, report: Report) -> Session:
-    """Returns the session of a new run, for which there is no folder yet.
-
-    Args:
-        arguments: what is asked of it; ``steps``, ``n_envs`` and the like that are None are left to the preset.
-        stack: closes its environments.
-        report: writes its page at the end, unless ``no_report`` is set.
-    """
+    """Returns the session of a new run, without a folder; ``stack`` closes its environments, ``report`` writes its page."""
     devices.start_with("--device", arguments.device)
     check_free(arguments.out)
     seed = int(np.random.default_rng().integers(10_000)) if arguments.seed is None else arguments.seed
@@ -79,11 +73,9 @@ def make_env(arguments: Train, environment: Environment, preset: Preset | None, 
     if arguments.assist:
         return make_vector(environment.rendering, 1, "gymnasium", seed)
     n_envs = arguments.n_envs or (preset.n_envs if preset else 1)
-    backend = preset.backend if preset and environment.is_plain else "auto"
-    is_elsewhere = backend == "envpool" and (register(environment.env_id) or provider(environment.env_id))
-    if is_elsewhere and arguments.backend is None and usable_envpool() is None:
+    backend = arguments.backend or (preset.backend if preset and environment.is_plain else "auto")
+    if backend == "envpool" != arguments.backend and usable_envpool() is None and has_package(environment.env_id):
         backend = "gymnasium"
-    backend = arguments.backend or backend
     workers = WorkerOptions(restart_workers=arguments.restart_workers)
     if backend == "ray" or arguments.ray is not None:
         workers = workers._replace(ray={"address": arguments.ray, "num_cpus": arguments.env_cpus})

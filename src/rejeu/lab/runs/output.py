@@ -153,7 +153,7 @@ def noted_in(path: Path) -> Iterator[None]:
         show(message, *arguments, **options)
         note(message)
 
-    if RunSummary(path=path, name="", warnings=read_warnings(path)).error:
+    if path.exists() and RunSummary(path=path, name="", warnings=read_warnings(path)).error:
         note("the run was resumed after this error")
     warnings.showwarning = show_and_note
     try:
