@@ -97,8 +97,19 @@ def expected_errors() -> tuple[type[Exception], ...]:
 def one_line(error: Exception | Warning | str) -> str:
     r"""Returns an error's or a warning's message on one line and without colors, with its class if it has none or is a key.
 
+    What would move the cursor of a terminal, or set its title, is escaped: names of files may hold anything.
+
     >>> one_line(ValueError("two\n  lines")), one_line(MemoryError()), one_line(KeyError("at"))
     ('two lines', 'MemoryError', "KeyError('at')")
     """
     text = repr(error) if isinstance(error, KeyError) else str(error)
-    return " ".join(re.sub(r"\x1b\[[\d;]*m", "", text).split()) or type(error).__name__
+    return printable(" ".join(re.sub(r"\x1b\[[\d;]*m", "", text).split())) or type(error).__name__
+
+
+def printable(text: str) -> str:
+    r"""Returns a text in which is escaped what is not printed, such as the codes that control a terminal.
+
+    >>> print(printable("h\u00e9ros\x1b[2J\n"))
+    héros\x1b[2J\n
+    """
+    return "".join(character if character.isprintable() else ascii(character)[1:-1] for character in text)

@@ -18,7 +18,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from rejeu.core.errors import CheckpointError
+from rejeu.core.errors import CheckpointError, printable
 
 T = TypeVar("T")
 
@@ -150,7 +150,7 @@ def shown(value: Any, length: int = 100) -> str:
     >>> print(shown("héros\u202e\n"))
     héros\u202e\n
     """
-    text = "".join(char if char.isprintable() else ascii(char)[1:-1] for char in str(value)[: length + 1])
+    text = printable(str(value)[: length + 1])
     return text if len(text) <= length else text[: length - 3] + "..."
 
 
@@ -165,7 +165,7 @@ def utf8(text: object) -> str:
 
 def brief(error: BaseException) -> str:
     """Returns the message of an error on one line, shortened."""
-    text = " ".join((str(error) or type(error).__name__).split())
+    text = printable(" ".join((str(error) or type(error).__name__).split()))
     return text if len(text) <= 400 else text[:397] + "..."
 
 

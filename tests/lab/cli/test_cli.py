@@ -631,6 +631,16 @@ def test_check_leaves_out_what_only_the_authors_of_a_package_can_change(capsys):
     assert "warning: gymnasium.utils.env_checker" in capsys.readouterr().out
 
 
+@pytest.mark.skipif(os.name != "posix", reason="Windows has no such names")
+def test_a_name_of_a_file_cannot_control_the_terminal(capsys, tmp_path):
+    name = "a\x1b]0;title\x07\x1b[2J"
+    (tmp_path / name).mkdir()
+    (tmp_path / name / "config.json").touch()
+    assert main(["evaluate", str(tmp_path)]) == 2
+    assert r"a\x1b]0;title\x07\x1b[2J" in (printed := capsys.readouterr().err)
+    assert "\x1b" not in printed
+
+
 def test_a_warning_is_one_line_on_the_command_line(capsys):
     argv = ["train", "Pendulum-v1", "--algo", "TD3", "--steps", "1"]
     with pytest.MonkeyPatch.context() as patch:
