@@ -397,6 +397,25 @@ def test_one_damaged_episode_is_left_out_with_a_warning_and_the_others_are_read(
     assert len(warned) == 1
 
 
+def test_episodes_beside_a_damaged_main_file_are_read(tmp_path: Path) -> None:
+    data = plain(tmp_path)
+    content = (data / dataset.MAIN).read_bytes()
+    shutil.copy(data / dataset.MAIN, data / "episode_0.hdf5")
+    whole = len(demonstrations.read(data).episodes)
+    (data / dataset.MAIN).write_bytes(content[: len(content) // 2])
+    with pytest.warns(UserWarning, match=r"is read without main_data\.hdf5, which is damaged"):
+        assert len(demonstrations.read(data).episodes) == whole
+
+
+def test_a_thousand_links_to_one_episode_are_refused(tmp_path: Path) -> None:
+    data = plain(tmp_path)
+    with h5py.File(data / dataset.MAIN, "r+") as file:
+        for i in range(2, 1000):
+            file[f"episode_{i}"] = file["episode_0"]
+    with pytest.raises(ValueError, match=r"it has [\d,]+ episodes, more than the file holds"):
+        demonstrations.read(data)
+
+
 @pytest.mark.parametrize("name", ["observations", "actions", *dataset.SERIES])
 def test_an_episode_whose_parts_differ_in_length_is_left_out(name: str, tmp_path: Path) -> None:
     data = plain(tmp_path)

@@ -36,6 +36,8 @@ SLACK, ROOM = 2**20, 16
 """How many bytes may be read: a fixed number, and a multiple of those of the file, because some disks compress files."""
 UNPACKED, PACKED = 2**28, 64
 """Of those that the file itself has compressed as many, or a multiple of those of the file if that is more."""
+LEAST_EPISODE = 512
+"""Fewest bytes of an episode in a file. Links to the same one take 30, and as long to be read."""
 FILTERS = {1: 1032, 2: 1, 3: 1, 32000: 88}
 """The filters of HDF5 that are read, and how many bytes each makes of one at most: deflate, shuffle, checksum, LZF."""
 
@@ -111,6 +113,8 @@ def read(data: Path) -> tuple[list[tuple[Any, ...]], gym.Space, gym.Space, EnvSp
         left_out: list[str] = []
         for path in files:
             with passed_over(path, left_out), h5py.File(path, "r") as file:
+                if len(file) > 1 + stored_size(path) // LEAST_EPISODE:
+                    raise ValueError(f"it has {len(file):,} episodes, more than the file holds")
                 for name in file:
                     if (match := EPISODE.fullmatch(name)) and (i := int(match[1])) not in episodes:
                         episode = tuple(rows.part(file, f"{name}/{key}", space) for key, space in keys.items())
@@ -118,6 +122,8 @@ def read(data: Path) -> tuple[list[tuple[Any, ...]], gym.Space, gym.Space, EnvSp
                             left_out.append(f"{name} of {path.name}, {problem}")
                         else:
                             episodes[i] = name, *episode
+        if left_out and not episodes:
+            raise ValueError(f"nothing is left without {left_out[0]}")
         if left_out:
             more = f", and {len(left_out) - 3} more" if len(left_out) > 3 else ""
             warnings.warn(f"{atomic.shortened(data)} is read without {'; '.join(left_out[:3])}{more}", stacklevel=3)
@@ -129,11 +135,11 @@ def read(data: Path) -> tuple[list[tuple[Any, ...]], gym.Space, gym.Space, EnvSp
 
 @contextmanager
 def passed_over(path: Path, left_out: list[str]) -> Iterator[None]:
-    """Context in which the file of a single episode is read: a damaged one is added to those that are left out."""
+    """Context in which a file of episodes is read: a damaged one is added to those that are left out."""
     try:
         yield
     except (*WRONG, OSError, RuntimeError) as error:
-        if path.name == MAIN:
+        if path.name == MAIN and not isinstance(error, OSError):  # no accident
             raise
         left_out.append(f"{path.name}, which is damaged ({brief(error)})")
 
