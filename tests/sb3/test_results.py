@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import csv
 import json
+import tracemalloc
 
 import numpy as np
 import pytest
 from matplotlib import pyplot
 
+from rejeu.sb3.common.logger import read_csv, read_json
 from rejeu.sb3.common.monitor import LoadMonitorResultsError
 from rejeu.sb3.common.results_plotter import (
     X_EPISODES,
@@ -49,6 +52,16 @@ def test_files_of_several_monitors_are_read_in_the_order_of_time(tmp_path):
 def test_a_folder_without_monitor_files_is_an_error(tmp_path):
     with pytest.raises(LoadMonitorResultsError, match=r"no files \*monitor\.csv"):
         load_results(tmp_path)
+    (tmp_path / "x.monitor.csv").write_bytes(bytes(2**24))  # a line, as of a terabyte of a sparse file
+    tracemalloc.start()
+    with pytest.raises(LoadMonitorResultsError, match="was not written by Monitor"):
+        load_results(tmp_path)
+    with pytest.raises(ValueError, match="Expecting value"):
+        read_json(tmp_path / "x.monitor.csv")
+    with pytest.raises(csv.Error, match="field limit"):
+        read_csv(tmp_path / "x.monitor.csv")
+    assert tracemalloc.get_traced_memory()[1] < 2**24
+    tracemalloc.stop()
     (tmp_path / "x.monitor.csv").write_text("something else\n")
     with pytest.raises(LoadMonitorResultsError, match="was not written by Monitor"):
         load_results(tmp_path)

@@ -10,10 +10,9 @@ from array import array
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
 from itertools import chain, islice
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import IO, Any, AnyStr, BinaryIO
 
 import numpy as np
 
@@ -82,8 +81,10 @@ def flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any
             yield f"{prefix}{name}", value
 
 
-def read_bytes(path: Path, limit: int) -> bytes:
+def read_bytes(path: Path, limit: int, has_holes: bool = True) -> bytes:
     """Returns up to ``limit`` bytes of a regular file; never follows a symbolic link and never waits.
+
+    Without ``has_holes`` it is read up to the first hole: a sparse file takes no room in an archive, and seconds to be read.
 
     Raises:
         OSError: if it cannot be read, or is something else than a regular file.
@@ -92,6 +93,10 @@ def read_bytes(path: Path, limit: int) -> bytes:
         raise OSError(f"{path.name} is not a regular file")
     flags = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
     with os.fdopen(os.open(path, flags), "rb") as file:
+        if not has_holes:
+            with suppress(OSError, AttributeError):  # of an empty file, and of systems without holes
+                limit = min(limit, file.seek(0, os.SEEK_HOLE))
+            file.seek(0)
         return file.read(limit)
 
 
@@ -105,7 +110,7 @@ def read_table(path: Path, only: Collection[str] | None = None, skip_lines: int 
     """
     name = path.name
     try:
-        data = read_bytes(path, MAX_BYTES + 1)
+        data = read_bytes(path, MAX_BYTES + 1, has_holes=False)
     except FileNotFoundError:
         return Table({}, (f"there is no {name}",))
     except OSError as error:
@@ -137,9 +142,10 @@ def read_table(path: Path, only: Collection[str] | None = None, skip_lines: int 
     return Table({names[i]: column for i, column in zip(wanted, columns, strict=True)}, tuple(notes))
 
 
-def lines_of(file: BinaryIO) -> Iterator[bytes]:
+def lines_of(file: IO[AnyStr]) -> Iterator[AnyStr]:
     """Yields the lines of a file; one of more than ``MAX_LINE`` bytes, which is damage, in pieces."""
-    return iter(partial(file.readline, MAX_LINE), b"")
+    while line := file.readline(MAX_LINE):
+        yield line
 
 
 def numbers(file: BinaryIO, n_columns: int, wanted: Sequence[int]) -> tuple[Iterable[np.ndarray], int]:

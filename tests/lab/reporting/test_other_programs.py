@@ -1,15 +1,18 @@
 """Runs of Stable-Baselines3 and TensorBoard; the recorded files are those of real runs (golden/record_monitor.py)."""
 
 import csv
+import os
+import struct
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from rejeu.lab.reporting import run_list
+from rejeu.lab.reporting import other_programs, run_list
 from rejeu.lab.reporting.comparison import compare
 from rejeu.lab.reporting.other_programs import read_monitor
+from rejeu.logs import tables
 from rejeu.sb3.common.monitor import ResultsWriter, load_results
 
 RECORDED = Path(__file__).parents[2] / "golden" / "sb3_monitor"
@@ -88,7 +91,7 @@ def test_tensorboard_files():
 
 
 def test_tensorboard_files_without_the_package_are_left_out(monkeypatch):
-    monkeypatch.setitem(sys.modules, "tensorboard.backend.event_processing.event_file_loader", None)
+    monkeypatch.setitem(sys.modules, "tensorboard.util.tensor_util", None)
     runs, notes = run_list.read_all([ZOO, RECORDED / "tb"])
     assert [run.format for run in runs] == ["monitor"]
     assert "PPO_1 is left out: reading TensorBoard files needs" in notes[0]
@@ -105,6 +108,60 @@ def test_damaged_tensorboard_file(tmp_path):
         assert any("damaged" in note for note in run.notes)
     (tmp_path / source.name).write_bytes(whole)
     assert run_list.read(tmp_path).notes == ()
+
+
+def events(*records):
+    """A TensorBoard file of records, each with its length and checksums."""
+    from tensorboard.compat.tensorflow_stub.pywrap_tensorflow import masked_crc32c
+
+    parts = [(struct.pack("<Q", len(record)), record) for record in records]
+    return b"".join(part + struct.pack("<I", masked_crc32c(part)) for pair in parts for part in pair)
+
+
+def scalar(name, step, value=1.0):
+    from tensorboard.compat.proto.event_pb2 import Event
+
+    event = Event(step=step, wall_time=1.0)
+    event.summary.value.add(tag=name, simple_value=value)
+    return event.SerializeToString()
+
+
+def test_records_too_long_for_scalars_are_passed_over(tmp_path):
+    """Their checksums alone took TensorBoard's own reader a minute."""
+    pytest.importorskip("tensorboard")
+    picture = events(bytes(100)).replace(struct.pack("<Q", 100), struct.pack("<Q", 2**27))
+    start = events(bytes(2**17))[:12]
+    (tmp_path / "events.out.tfevents.1").write_bytes(
+        events(scalar("a", 1)) + start + bytes(2**17 + 4) + events(scalar("a", 2))
+    )
+    run = run_list.read(tmp_path)
+    assert (run.metrics.column("a").tolist(), run.notes) == ([1.0, 1.0], ())
+    (tmp_path / "events.out.tfevents.1").write_bytes(events(scalar("a", 1)) + picture)
+    assert "damaged or incomplete" in run_list.read(tmp_path).notes[0]
+
+
+def test_many_curves_with_steps_of_their_own_are_one_table_of_limited_size(tmp_path, monkeypatch):
+    pytest.importorskip("tensorboard")
+    monkeypatch.setattr(other_programs, "MAX_CELLS", 1000)
+    records = [scalar(f"curve{i}", 100 * i + j) for i in range(20) for j in range(10)]
+    (tmp_path / "events.out.tfevents.1").write_bytes(events(*records))
+    metrics = run_list.read(tmp_path).metrics
+    assert len(metrics.columns) == 22
+    assert 20 <= len(metrics) <= 1000 / 20
+    monkeypatch.setattr(other_programs, "MAX_SCALAR_BYTES", 400)
+    assert "only the first" in run_list.read(tmp_path).notes[0]
+
+
+def test_sparse_monitor_files_are_read_up_to_the_hole(tmp_path, monkeypatch):
+    """Three hundred of a terabyte each fit into an archive of some KiB."""
+    monkeypatch.setattr(tables, "MAX_BYTES", 2**20)
+    with (tmp_path / "monitor.csv").open("wb") as file:
+        file.write(b'#{"t_start": 1.0}\nr,l,t\n1,2,3\n')
+        file.truncate(2**30)
+        if 512 * os.fstat(file.fileno()).st_blocks > 2**20:
+            pytest.skip("the disk has no holes")
+    assert len(read_monitor(tmp_path).episodes) == 1
+    assert len(tables.read_bytes(tmp_path / "monitor.csv", 2**20, has_holes=False)) < 2**16
 
 
 def test_yaml_beside_a_run_is_never_read(tmp_path):

@@ -6,10 +6,11 @@ taken from the names of the folders, as RL Zoo gives them: ``ALGORITHM/ENV_NUMBE
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from rejeu.core.records import Malformed, parse_json, shown
 from rejeu.lab.runs.config import RunConfig
 from rejeu.lab.runs.read import MAX_NAME, MAX_STEP, RunSummary, is_file, ordered
 from rejeu.logs.formatting import counted
-from rejeu.logs.tables import EMPTY, MAX_COLUMNS, Table, read_bytes, read_table
+from rejeu.logs.tables import EMPTY, MAX_CELLS, MAX_COLUMNS, Table, read_bytes, read_table
 
 MONITOR = re.compile(r"(.*\.)?monitor\.csv")
 EVENTS = re.compile(r"events\.out\.tfevents\..+")
@@ -30,9 +31,10 @@ ALGORITHMS["her"] = "HER"
 """Algorithms by the names of RL Zoo's folders."""
 MAX_FILES = 4096
 """Upper limit on the files of one run."""
-MAX_EVENT_BYTES = 2**28
-RECORD_FRAME = 16
-"""Bytes of a record's length and checksums."""
+MAX_SCALAR_BYTES = 2**24
+"""Upper limit on the bytes of the records with scalars of one run: some 300,000 points."""
+MAX_RECORD = 2**16
+"""Upper limit on the bytes of a record with scalars."""
 MAX_EVENTS = 10_000
 """Points that are kept of each curve in TensorBoard files, up to twice as many; of longer ones every second is dropped."""
 
@@ -127,20 +129,22 @@ def read_tensorboard(folder: Path) -> RunSummary:
         MissingExtra: if tensorboard is not installed.
     """
     with requires("reading TensorBoard files", "tensorboard", "tensorboard"):
-        import tensorboard.backend.event_processing.event_file_loader  # noqa: F401 - where it is used it may not fail
+        import tensorboard.util.tensor_util  # noqa: F401 - where it is used it may not fail
     notes = []
     values: dict[str, dict[int, tuple[float, float]]] = {}
-    for file in files(folder, EVENTS):
-        if file.stat().st_size > MAX_EVENT_BYTES:
-            notes.append(f"{file.name} has more than {MAX_EVENT_BYTES >> 20} MiB and was left out")
-            continue
-        try:
-            read = sum(RECORD_FRAME + len(record) for record in take_scalars(file, values))
-        except Exception as error:  # of protobuf or of TensorBoard, for damaged records
-            notes.append(f"{file.name} is damaged: {shown(error)}")
-        else:
-            if read < file.stat().st_size:  # the reader ends at a damaged record without an error
-                notes.append(f"{file.name} is damaged or incomplete after {read:,} bytes, and was read up to there")
+    left = MAX_SCALAR_BYTES
+    for path in files(folder, EVENTS):
+        with path.open("rb") as file:
+            try:
+                for record in records(file):
+                    if (left := left - len(record)) < 0:
+                        break
+                    take_scalars(record, values)
+            except Exception as error:  # of protobuf or of TensorBoard, for damaged records
+                notes.append(f"{path.name} is damaged or incomplete: {shown(error)}")
+            if left < 0:
+                notes.append(f"only the first {MAX_SCALAR_BYTES >> 20} MiB of scalars were read")
+                break
     metrics = ordered(table_of(values)) if values else EMPTY
     algorithm, env_id, number = named(folder)
     seconds = metrics.column("time/time_elapsed")
@@ -156,41 +160,60 @@ def read_tensorboard(folder: Path) -> RunSummary:
     )
 
 
-def take_scalars(file: Path, values: dict[str, dict[int, tuple[float, float]]]) -> Iterator[bytes]:
-    """Yields the records of a TensorBoard file, and adds their scalars to the columns in ``values``."""
-    from tensorboard.backend.event_processing.event_file_loader import RawEventFileLoader
+def records(file: BinaryIO) -> Iterator[bytes]:
+    """Yields the records of a TensorBoard file that are small enough to hold scalars; pictures and texts are passed over.
+
+    TensorBoard's own reader takes a minute for 256 MiB of one record.
+
+    Raises:
+        Malformed: at a damaged or incomplete record.
+    """
+    from tensorboard.compat.tensorflow_stub.pywrap_tensorflow import masked_crc32c
+
+    while head := file.read(12):
+        n, begin = int.from_bytes(head[:8], "little"), file.tell()
+        record = file.read(min(n, MAX_RECORD) + 4)
+        size = os.fstat(file.fileno()).st_size
+        parts = [(head[:8], head[8:]), *([(record[:-4], record[-4:])] if n <= MAX_RECORD else [])]
+        if begin + n + 4 > size or any(masked_crc32c(data) != int.from_bytes(crc, "little") for data, crc in parts):
+            raise Malformed(f"it was read up to byte {begin - 12:,}")
+        if n <= MAX_RECORD:
+            yield record[:-4]
+        file.seek(begin + n + 4)
+
+
+def take_scalars(record: bytes, values: dict[str, dict[int, tuple[float, float]]]) -> None:
+    """Adds the scalars of a record of a TensorBoard file to the columns in ``values``."""
     from tensorboard.compat.proto.event_pb2 import Event
     from tensorboard.util.tensor_util import make_ndarray
 
-    for record in RawEventFileLoader(str(file)).Load():
-        yield record
-        event = Event.FromString(record)
-        for scalar in event.summary.value:
-            if scalar.HasField("simple_value"):
-                value = scalar.simple_value
-            elif scalar.metadata.plugin_data.plugin_name == "scalars" and not scalar.tensor.tensor_shape.dim:
-                value = float(make_ndarray(scalar.tensor).item())
-            else:
-                continue
-            name = shown(scalar.tag, MAX_NAME)
-            if name not in values and len(values) == MAX_COLUMNS:
-                continue
-            column = values.setdefault(name, {})
-            column[event.step] = value, event.wall_time
-            if len(column) > 2 * MAX_EVENTS:
-                values[name] = dict([*column.items()][::2])
+    event = Event.FromString(record)
+    for scalar in event.summary.value:
+        if scalar.HasField("simple_value"):
+            value = scalar.simple_value
+        elif scalar.metadata.plugin_data.plugin_name == "scalars" and not scalar.tensor.tensor_shape.dim:
+            value = float(make_ndarray(scalar.tensor).item())
+        else:
+            continue
+        name = shown(scalar.tag, MAX_NAME)
+        if name not in values and len(values) == MAX_COLUMNS:
+            continue
+        column = values.setdefault(name, {})
+        column[event.step] = value, event.wall_time
+        if len(column) > 2 * MAX_EVENTS:
+            values[name] = dict([*column.items()][::2])
 
 
 def table_of(values: Mapping[str, Mapping[int, tuple[float, float]]]) -> Table:
-    """Returns scalars as one table by step, with the wall time since the first of them."""
+    """Returns scalars as one table by step, with the wall time since the first; of too many steps some are left out."""
     steps = sorted({step for column in values.values() for step in column})
+    steps = steps[:: 1 + len(steps) * len(values) // MAX_CELLS]
     row = {step: i for i, step in enumerate(steps)}
     columns: dict[str, Any] = {"step": np.array(steps, np.float64)}
     wall = np.full(len(steps), np.nan)
     for name, column in values.items():
         columns[name] = np.full(len(steps), np.nan)
-        for step, (value, time) in column.items():
-            columns[name][row[step]] = value
-            wall[row[step]] = time
+        for step in column.keys() & row:
+            columns[name][row[step]], wall[row[step]] = column[step]
     columns.setdefault("time/time_elapsed", wall - np.nanmin(wall))
     return Table(columns)

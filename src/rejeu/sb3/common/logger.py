@@ -27,6 +27,7 @@ from rejeu.core import atomic
 from rejeu.logs import logging
 from rejeu.logs.formatting import LOGS
 from rejeu.logs.logging import CsvFile, JsonLines, TensorBoard, add_text, open_log
+from rejeu.logs.tables import lines_of
 
 __all__ = [
     "DEBUG",
@@ -426,10 +427,11 @@ def configure(folder: str | Path | None = None, format_strings: Sequence[str] | 
 
 def read_json(filename: str | Path) -> list[dict[str, Any]]:
     """Returns the rows of a file of JSON lines."""
-    return [json.loads(line) for line in Path(filename).read_text(encoding="utf-8").splitlines()]
+    with Path(filename).open(encoding="utf-8") as file:
+        return [json.loads(line) for line in lines_of(file)]
 
 
 def read_csv(filename: str | Path) -> list[dict[str, str]]:
     """Returns the rows of a CSV file, as text."""
     with Path(filename).open(encoding="utf-8", newline="") as file:
-        return [*csv.DictReader(file)]
+        return [*csv.DictReader(lines_of(file))]

@@ -17,6 +17,7 @@ import numpy as np
 from rejeu.core import atomic
 from rejeu.core.failed_writes import FailedWrites
 from rejeu.envs.snapshot import check_types
+from rejeu.logs.tables import MAX_LINE, lines_of
 
 __all__ = ["LoadMonitorResultsError", "Monitor", "ResultsWriter", "get_monitor_files", "load_results"]
 
@@ -250,8 +251,8 @@ def load_results(path: str | Path) -> np.recarray:
     for name in files:
         with open(name, newline="", encoding="utf-8") as file:
             try:
-                start = float(json.loads(file.readline().removeprefix("#"))["t_start"])
-                reader = csv.DictReader(file)
+                start = float(json.loads(file.readline(MAX_LINE).removeprefix("#"))["t_start"])
+                reader = csv.DictReader(lines_of(file))
                 found = [{**row, "t": float(row["t"]) + start} for row in reader]
             except (ValueError, KeyError, TypeError, csv.Error) as error:
                 raise LoadMonitorResultsError(f"{name} was not written by Monitor: {error}") from None
