@@ -13,7 +13,9 @@ import pytest
 import rejeu
 from rejeu.core import checkpoint
 from rejeu.core.errors import CheckpointError
+from rejeu.export import numpy_policy
 from rejeu.sb3.common.vec_env import DummyVecEnv, VecNormalize
+from rejeu.teaching.courses import leaderboard
 from tests import hostile_files
 from tests.core.test_schemas import FILES as RECORDED
 from tests.environments import Counter
@@ -182,6 +184,21 @@ def test_a_file_larger_than_the_memory_is_refused_before_it_is_read(tmp_path, mo
     monkeypatch.setattr(checkpoint, "physical_memory", lambda: 2**31)
     with pytest.raises(CheckpointError, match=r"has 4\.0 GiB and the machine 2\.0 GiB"):
         checkpoint.read(path, "agent")
+
+
+@pytest.mark.skipif(os.name != "posix", reason="holes in files are POSIX's")
+def test_a_file_that_is_nearly_all_holes_is_refused_though_the_memory_would_do(tmp_path):
+    """A network of 4 GB of zeros, whose checksums are right, takes no room in an archive."""
+    table = hostile_files.table_of({}, {}, '{"schema": 2, "kind": "agent", "checksums": {"a": 0}}')
+    table["a"] = {"dtype": "U8", "shape": [2**26], "data_offsets": [0, 2**26]}
+    path = tmp_path / "sparse.safetensors"
+    path.write_bytes(content := hostile_files.join(table, b""))
+    os.truncate(path, len(content) + 2**26)
+    with pytest.raises(CheckpointError, match="nearly empty"):
+        checkpoint.read(path, "agent")
+    with pytest.raises(CheckpointError, match="nearly empty"):
+        numpy_policy.read(path)
+    assert leaderboard.equal_files([path, path]) == []
 
 
 @pytest.mark.skipif(os.name != "posix", reason="holes in files are POSIX's")

@@ -294,6 +294,13 @@ def test_images_are_what_convolutions_read():
     assert features == [16, 36 * 36]
 
 
+def test_a_file_of_more_tensors_than_any_algorithm_has_is_refused(tmp_path):
+    """Each may be a pickle that takes a tenth of a second."""
+    more = {f"{i}.pth": torch_file({}) for i in range(20)}
+    with pytest.raises(CheckpointError, match=r"it has \d+ files of tensors, expected at most 16"):
+        load_zip(write(tmp_path, zipped({**members_of(PPO), **more})))
+
+
 @pytest.mark.parametrize("end", only([80], [80, None]))
 def test_hostile_files_end_soon_in_little_memory_and_run_nothing(end, tmp_path):
     """A sample of them."""

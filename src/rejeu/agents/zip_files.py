@@ -41,6 +41,8 @@ from rejeu.core.validation import build
 
 MOST_DATA = 16 * 2**20
 """Upper limit on the bytes of ``data``."""
+MOST_TENSORS = 16
+"""Upper limit on the files of tensors: of the policy, of each optimizer, and of variables."""
 EXPANSION = 16
 """Upper limit on the size of the unpacked content relative to that of the file: weights can hardly be compressed."""
 OWN_NETWORK = (
@@ -143,6 +145,8 @@ def read(path: Path) -> Model:
             raise Malformed(f"it has data and parameters, as {TENSORFLOW}")
         if not {"data", "policy.pth"} <= sizes.keys() or sizes["data"] > MOST_DATA:
             raise Malformed("it has no data and policy.pth, or too much data")
+        if (n_tensors := sum(name.endswith(".pth") for name in sizes)) > MOST_TENSORS:
+            raise Malformed(f"it has {n_tensors} files of tensors, expected at most {MOST_TENSORS}")
         fields = msgspec.json.decode(content_of(archive, "data"), type=dict[str, msgspec.Raw])
         tensors = {}
         for name in sizes:

@@ -29,7 +29,7 @@ from safetensors import SafetensorError, safe_open
 from rejeu.core import atomic
 from rejeu.core.errors import CheckpointError
 from rejeu.core.hardware import physical_memory
-from rejeu.core.records import Malformed, parse_json, shown, stored_size
+from rejeu.core.records import Malformed, is_sparse, parse_json, shown, stored_size
 
 DTYPES = {"F32": "float32", "F64": "float64", "I64": "int64", "I32": "int32", "I16": "int16", "I8": "int8"}
 DTYPES |= {"U64": "uint64", "U32": "uint32", "U16": "uint16", "U8": "uint8", "BOOL": "bool", "F16": "float16"}
@@ -204,9 +204,11 @@ class Contents:
         """Returns the arrays whose names begin with ``prefix``, by their full names.
 
         Raises:
-            CheckpointError: if one is damaged; it says which.
+            CheckpointError: if one is damaged; it says which. Also for a sparse file that is nearly empty.
         """
         arrays = {}
+        if is_sparse(self.path):
+            raise CheckpointError(f"{self.path} is nearly empty, a large file of holes; restore it from a copy")
         with explained(self.path):
             for name in self.specs:
                 if name.startswith(prefix):

@@ -88,6 +88,11 @@ def stored_size(path: Path) -> int:
     return min(status.st_size, 512 * getattr(status, "st_blocks", status.st_size))
 
 
+def is_sparse(path: Path) -> bool:
+    """Returns whether a large file is nearly all holes: it takes no room in an archive, and gigabytes when it is read."""
+    return path.stat().st_size > 2**24 + 16 * stored_size(path)
+
+
 def read_json(path: Path, max_bytes: int) -> Any:
     """Returns the value of a JSON file of at most ``max_bytes`` bytes; raises as :func:`read_bytes` and :func:`parse_json`."""
     return parse_json(read_bytes(path, max_bytes))

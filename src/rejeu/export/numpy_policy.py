@@ -13,7 +13,7 @@ import numpy as np
 
 from rejeu.core import spaces
 from rejeu.core.errors import CheckpointError
-from rejeu.core.records import WRONG, brief, parse_json
+from rejeu.core.records import WRONG, brief, is_sparse, parse_json
 from rejeu.export import PRIMITIVES
 
 POLICY = "policy"
@@ -231,9 +231,10 @@ def read(path: Path) -> NumpyPolicy:
         FileNotFoundError: if there is no such file.
         CheckpointError: if the file is damaged.
     """
-    content = path.read_bytes()
     try:
-        return parse(content)
+        if is_sparse(path):
+            raise ValueError("it is nearly empty, with holes")
+        return parse(path.read_bytes())
     except (*WRONG, EOFError, zipfile.BadZipFile) as error:
         reason = "it holds pickles, which are not read" if "pickle" in str(error) else brief(error)
         raise CheckpointError(

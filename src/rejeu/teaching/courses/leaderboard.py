@@ -25,7 +25,7 @@ from rejeu.agents.policy import policy
 from rejeu.checkpoints.run_folder import RunFolder, find_model
 from rejeu.core import checkpoint, xla
 from rejeu.core.language import Language, said
-from rejeu.core.records import shown
+from rejeu.core.records import is_sparse, shown
 from rejeu.envs.make import VectorEnv
 from rejeu.envs.registry import is_plain_id
 from rejeu.logs.evaluation import Evaluation, evaluate
@@ -143,7 +143,7 @@ def equal_files(paths: Sequence[Path]) -> list[list[Path]]:
     groups: dict[bytes, list[Path]] = {}
     for path in paths:
         with suppress(OSError):
-            if 0 < path.stat().st_size <= MAX_BYTES:
+            if 0 < path.stat().st_size <= MAX_BYTES and not is_sparse(path):
                 groups.setdefault(hashlib.sha256(path.read_bytes()).digest(), []).append(path)
     return [group for group in groups.values() if len(group) > 1]
 
