@@ -128,6 +128,7 @@ MISTAKES = [
     ("seeds = 2", "seeds = [1, 1]", "", "different seeds"),
     ("seeds = 2", "seeds = 'x'", "", "seeds='x': expected"),
     ("seeds = 2", "seeds = nan", "", "not JSON compliant"),
+    ("seeds = 2", f"settings.{'a.' * 1000}a = 1", "", "a line of more than 1,000 dots"),
     ("seeds = 2", "seeds = [", "", "line 5, column 1); expected TOML"),
     ("[settings.fast]", "[settings.default]", "", "line 10"),
     ("evaluate_every = 500", "minutes = 3", "", "exclude each other"),

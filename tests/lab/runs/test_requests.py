@@ -53,6 +53,28 @@ def test_the_model_is_written_only_while_somebody_watches_and_at_most_every_two_
     assert list(asked.folder.path.iterdir()) == []
 
 
+@pytest.mark.skipif(os.name != "posix", reason="links need rights on Windows")
+def test_nothing_is_asked_through_a_folder_that_became_a_link(tmp_path):
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "run").symlink_to("elsewhere")
+    requests.ask(RunFolder(tmp_path / "run").watch)
+    assert list((tmp_path / "elsewhere").iterdir()) == []
+
+
+def test_a_folder_named_stop_stops_nothing(asked):
+    asked.folder.stop.mkdir()
+    asked.callback(asked.agent, None)
+    assert asked.stop.signal is None
+
+
+def test_of_a_folder_of_many_models_so_many_are_listed_as_a_look_a_second_allows(tmp_path, monkeypatch):
+    monkeypatch.setattr(requests, "MOST_ENTRIES", 5)
+    for i in range(10):
+        (tmp_path / f"step_{i:012}.safetensors").touch()
+    assert len(requests.models(tmp_path)) == 5
+    assert requests.models(tmp_path / "missing") == []
+
+
 def test_a_request_to_stop_that_comes_while_a_run_starts_is_answered(asked):
     requests.ask(asked.folder.stop)
     asked.callback.before_training(asked.agent)

@@ -31,6 +31,8 @@ from rejeu.logs.tables import flat
 
 MAX_BYTES = 2**16
 """Upper limit on the size of a plan."""
+MAX_DOTS = 1000
+"""Upper limit on the dots of one of its lines: a key ``a.b.c`` of 30,000 parts takes gigabytes to be read."""
 OWN_OF_JOBS = ("env", "env_kwargs", "wrappers", "imports", "algorithm", "seed", "hyperparameters")
 """Fields of a run that a plan names in another way, or not at all."""
 OF_RUNS = {
@@ -119,6 +121,8 @@ def read_plan(plan: str | Path | Mapping[str, Any]) -> tuple[Plan, str | None]:
             raise ValueError(f"it has more than {MAX_BYTES:,} bytes, the most of a plan")
         try:
             text = path.read_bytes().decode("utf-8-sig").replace("\r\n", "\n")
+            if any(line.count(".") > MAX_DOTS for line in text.split("\n")):
+                raise ValueError(f"it has a line of more than {MAX_DOTS:,} dots")
             content = tomllib.loads(text)
             if is_deep(content, MAX_DEPTH):
                 raise RecursionError("it is nested too deeply")

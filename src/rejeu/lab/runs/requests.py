@@ -5,10 +5,13 @@ Files need no signals and no connection, so that it works on every system, for r
 
 from __future__ import annotations
 
+import os
+import re
 import signal
 import time
 from collections.abc import Sequence
 from contextlib import suppress
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -24,11 +27,15 @@ STALE = 10.0
 """Seconds after which a request to show the policy is over, unless it was renewed."""
 MOST_MODELS = 16
 """Most models of the course of training that are kept; of more every second one is dropped."""
+MOST_ENTRIES = 1000
+"""Most entries of the folder of models that are looked at."""
+MODEL = re.compile(r"step_\d+\.safetensors")
 
 
 def ask(path: Path) -> None:
-    """Makes or renews a request, unless the folder cannot be written to."""
+    """Makes or renews a request, unless the folder cannot be written to, or was replaced by a link while it was shown."""
     with suppress(OSError):
+        atomic.check_no_link(path.parent)
         atomic.touch(path)
 
 
@@ -67,7 +74,7 @@ class Requests(TrainingCallback):
         now = time.monotonic()
         if now < self._next:
             return
-        if self.folder.stop.exists():
+        if self.folder.stop.is_file():
             self.stop.signal = signal.SIGINT
         if is_asked(self.folder.watch):
             show(agent, self.folder.live)
@@ -92,4 +99,9 @@ def keep_model(agent: Any, folder: Path, step: int) -> None:
 
 def models(folder: Path) -> Sequence[Path]:
     """Returns the models of the course of training, oldest first."""
-    return sorted(path for path in folder.glob("step_*.safetensors") if path.stem.removeprefix("step_").isdecimal())
+    try:
+        with os.scandir(folder) as entries:  # the studio looks once a second
+            names = sorted(entry.name for entry in islice(entries, MOST_ENTRIES))
+    except OSError:
+        return []
+    return [folder / name for name in names if MODEL.fullmatch(name)]
