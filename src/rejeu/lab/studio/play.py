@@ -47,7 +47,9 @@ def build(studio: Studio, request: Request) -> None:
         agents.props(f"use-chips max-values={MOST_AGENTS}")
         by_hand = ui.switch("I play", value="watch" not in asked)
         record = ui.switch("record").bind_enabled_from(by_hand, "value")
-        number = ui.number("seed", value=int(seed) if seed.isdecimal() and len(seed) < 16 else None, min=0, precision=0).classes("w-20")
+        number = ui.number(
+            "seed", value=int(seed) if seed.isdecimal() and len(seed) < 16 else None, min=0, precision=0
+        ).classes("w-20")
         start = ui.button("Start", icon="play_arrow").props("no-caps")
     stage = ui.column().classes("w-full")
 
