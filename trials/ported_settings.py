@@ -1307,57 +1307,6 @@ def noise_types(lib: Library) -> Any:
     return [str(kind(zeros, zeros, dtype=dtype)().dtype) for kind in (one, path) for dtype in (np.float32, np.float64)]
 
 
-@case(
-    "DiagGaussianDistribution.action_dim SquashedDiagGaussianDistribution.action_dim CategoricalDistribution.action_dim MultiCategoricalDistribution.action_dims BernoulliDistribution.action_dims kl_divergence.dist_true,dist_pred sum_independent_dims.tensor",
-    1e-4,
-)
-def distributions(lib: Library) -> Any:
-    names = ("DiagGaussianDistribution", "SquashedDiagGaussianDistribution", "CategoricalDistribution")
-    names += ("MultiCategoricalDistribution", "BernoulliDistribution", "kl_divergence", "sum_independent_dims")
-    gauss, squashed, choice, choices, bits, divergence, total = lib("common.distributions", *names)
-    given, other = (lib.tensor(np.array([[0.3, -0.4, 0.9], [x, 0.1, -1.2]], np.float32)) for x in (0.7, -0.2))
-    log_std, found = lib.tensor(np.array([-0.5, 0.2, 0.0], np.float32)), []
-    for made, arguments, action in (
-        (gauss(3), (log_std,), [[0.1, 0.2, 0.3], [1.0, -1.0, 0.0]]),
-        (squashed(3), (log_std,), [[0.1, 0.2, 0.3], [0.9, -0.9, 0.0]]),
-        (choice(3), (), [1, 2]),
-        (choices([2, 1]), (), [[1, 0], [0, 0]]),
-        (bits(3), (), [[1, 0, 1], [0, 0, 1]]),
-    ):
-        first = made.proba_distribution(given, *arguments)
-        dtype = np.float32 if arguments or made.__class__.__name__.startswith("Bernoulli") else np.int64
-        found += [plain(first.log_prob(lib.tensor(np.array(action, dtype)))), plain(first.mode())]
-        entropy = first.entropy()
-        found.append(None if entropy is None else plain(entropy))
-    for make in (lambda: gauss(3), lambda: choice(3), lambda: bits(3)):
-        arguments = (log_std,) if make().__class__.__name__.startswith("Diag") else ()
-        pair = [make().proba_distribution(one, *arguments) for one in (given, other)]
-        found.append(plain(divergence(*pair)))
-    return [*found, plain(total(given))]
-
-
-@case("StateDependentNoiseDistribution.action_dim,use_expln,squash_output,epsilon", 1e-4)
-def distribution_of_states(lib: Library) -> Any:
-    kind, found = lib("common.distributions", "StateDependentNoiseDistribution"), []
-    x = lib.tensor(np.array([[0.3, -0.4], [0.9, 0.1]], np.float32))
-    hidden = lib.tensor(np.array([[0.5, -1.0, 2.0], [0.2, 0.3, 0.1]], np.float32))
-    log_std = lib.tensor(np.array([[-0.5, 0.5], [0.2, -2.0], [0.1, 0.3]], np.float32))
-    for given in ({}, {"use_expln": True}, {"squash_output": True}, {"epsilon": 0.1}):
-        made = kind(2, **given)
-        found += [list(made.proba_distribution_net(4, -1.0, 3)[1].shape), plain(made.proba_distribution_net(3)[1])]
-        made.proba_distribution(x, log_std, hidden)
-        found += [plain(made.log_prob(lib.tensor(np.array([[0.1, 0.2], [-0.3, 0.4]], np.float32)))), plain(made.mode())]
-    return found
-
-
-@case("make_proba_distribution.use_sde,dist_kwargs")
-def kinds_of_distributions(lib: Library) -> Any:
-    make, spaces = lib("common.distributions", "make_proba_distribution"), gym.spaces
-    given = [BOX, THREE, spaces.MultiDiscrete([2, 3]), spaces.MultiBinary(2)]
-    found = [type(make(one)).__name__ for one in given]
-    return [*found, type(make(BOX, use_sde=True, dist_kwargs={"use_expln": True})).__name__]
-
-
 @case("unwrap_wrapper.wrapper_class is_wrapped.wrapper_class unwrap_vec_wrapper.vec_wrapper_class is_vecenv_wrapped.vec_wrapper_class sync_envs_normalization.eval_env VecEnvWrapper.venv DummyVecEnv.env_fns VecEnv.num_envs VecCheckNan.venv VecExtractDictObs.venv VecMonitor.venv VecNormalize.venv VecTransposeImage.venv StackedObservations.num_envs")  # fmt: skip
 def wrapped(lib: Library) -> Any:
     is_in, unwrap = lib("common.env_util", "is_wrapped", "unwrap_wrapper")
@@ -1426,32 +1375,6 @@ def monitor_files(lib: Library) -> Any:
     table = load("m")
     found = [[np.asarray(x, float) for x in curve(table, axis)] for axis in ("timesteps", "episodes", "walltime_hrs")]
     return [[Path(name).name for name in sorted(files("m"))], found, [list(map(float, table[key])) for key in "rlt"]]
-
-
-class Holder:
-    """Something with attributes."""
-
-
-@case(
-    "recursive_getattr.obj,attr recursive_setattr.obj,attr,val open_path.path,mode,verbose,suffix open_path_str.path,mode,suffix open_path_pathlib.path,mode,suffix save_to_pkl.path,obj,verbose load_from_pkl.path,verbose"
-)
-def saving(lib: Library) -> Any:
-    names = ("recursive_getattr", "recursive_setattr", "open_path", "save_to_pkl", "load_from_pkl")
-    get, put, opened, save, load = lib("common.save_util", *names)
-    outer, outer_in = Holder(), Holder()
-    outer.inner, outer_in.value = outer_in, 3
-    put(outer, "inner.value", 5)
-    found: list[Any] = [get(outer, "inner.value")]
-    for path, mode, suffix in (("a", "w", "zip"), (Path("deep/b"), "w", "pkl"), ("a", "r", "zip"), ("c.x", "w", "zip")):
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            for verbose in (0, 2):
-                file = opened(path, mode, verbose, suffix)
-                found.append(Path(getattr(file, "name", str(file))).name)
-                file.close()
-        found.append(len(caught))
-    save("numbers", {"a": [1, 2.5]}, verbose=0)
-    return [found, load("numbers"), sorted(path.name for path in Path().iterdir())]
 
 
 @case(
@@ -1766,6 +1689,7 @@ BY_HAND = "buffers cannot be made by hand; an agent's are compared in its cases"
 NO_EFFECT = "without effect, which a warning says where it matters"
 DEFAULT = "other values than the default are refused or warn"
 REASONS: dict[str, str] = {
+    **dict.fromkeys(("common.distributions.", "maskable.distributions.", "save_util."), "rejeu does not have it"),
     "common.envs.": "environments for the original's own tests, which rejeu does not have",
     **dict.fromkeys((".QNetwork.", ".Actor.", ".ContinuousCritic.", ".Critic.", ".CrossQCritic."), MODULE),
     **dict.fromkeys((".QuantileNetwork.", ".BaseModel.", "torch_layers.", "rmsprop_tf_like", ".BasePolicy."), MODULE),
@@ -1777,9 +1701,8 @@ REASONS: dict[str, str] = {
     **dict.fromkeys(("common.buffers.", "maskable.buffers.", "recurrent.buffers.", "HerReplayBuffer."), BY_HAND),
     **dict.fromkeys(("recurrent.type_aliases",), BY_HAND),
     **dict.fromkeys(("TrainFrequencyUnit.", "GoalSelectionStrategy."), "arguments of every Python Enum"),
-    **dict.fromkeys((".data_to_json.", ".json_to_data.", "_zip_file."), "files are not zip files with pickles"),
     **dict.fromkeys((".optimize_memory_usage", ".use_sde_at_warmup", ".rollout_buffer_", ".sde_support"), NO_EFFECT),
-    **dict.fromkeys((".monitor_wrapper", ".support_multi_env", ".full_std", ".learn_features"), NO_EFFECT),
+    **dict.fromkeys((".monitor_wrapper", ".support_multi_env"), NO_EFFECT),
     **dict.fromkeys((".n_lstm_layers", ".lstm_kwargs", ".clip_mean", ".share_features_extractor"), DEFAULT),
     **dict.fromkeys((".batch_norm", ".with_bias"), DEFAULT),
     "maybe_make_env.verbose": "prints that an environment is made",
@@ -1788,8 +1711,6 @@ REASONS: dict[str, str] = {
     "AsyncEval": "rejeu does not have it",
     **dict.fromkeys((".tile_images.", ".CloudpickleWrapper.", "vec_env.util."), "internal"),
     **dict.fromkeys((".plot_curves.", ".plot_results."), "a figure for people to look at"),
-    "SquashedDiagGaussianDistribution.epsilon": "rejeu's is exact and has none",
-    "BernoulliDistribution.action_dim": "compared by position",
 }
 """Reasons, by a part of module, owner and argument."""
 NOT_COMPARABLE = {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import subprocess
 import sys
@@ -43,6 +44,9 @@ print(type(agent.get_env()).__name__)
 def test_what_is_missing_cannot_be_imported():
     with pytest.raises(ImportError, match="NoSuchAlgorithm"):
         exec("from rejeu.sb3 import NoSuchAlgorithm")
+    for path in ("sb3.common.distributions", "sb3.common.save_util", "sb3_contrib.common.maskable.distributions"):
+        with pytest.raises(ModuleNotFoundError, match=path):
+            importlib.import_module(f"rejeu.{path}")
 
 
 class Corridor(gym.Env):

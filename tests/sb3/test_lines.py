@@ -17,10 +17,8 @@ from rejeu.algorithms import a2c, optimizers
 from rejeu.sb3.common import (
     atari_wrappers,
     base_class,
-    distributions,
     envs,
     logger as loggers,
-    save_util,
     torch_layers,
     utils,
 )
@@ -367,10 +365,6 @@ def test_small_functions(tmp_path):
     assert base_class.maybe_make_env("CartPole-v1").spec.id == "CartPole-v1"
     assert torch_layers.get_actor_critic_arch([8, 4]) == ([8, 4], [8, 4])
     assert torch_layers.get_actor_critic_arch({"pi": [8], "qf": [4]}) == ([8], [4])
-    holder = SimpleNamespace(inner=SimpleNamespace(value=1))
-    save_util.recursive_setattr(holder, "inner.value", 2)
-    assert (save_util.recursive_getattr(holder, "inner.value"), holder.inner.value) == (2, 2)
-    assert distributions.sum_independent_dims(np.ones((2, 3))).tolist() == [3.0, 3.0]
     row = loggers.filter_excluded_keys({"a": 1, "b": 2}, {"a": ("csv",)}, "csv")
     assert row == {"b": 2}
     writer = ResultsWriter(tmp_path / "x", {"t_start": 0.0, "env_id": "E"}, ("won",))
@@ -430,15 +424,3 @@ def test_what_tensorboard_shows(tmp_path):
     assert np.asarray(images["shares"]).tolist() == [[0, 127, 255]]
     video = images["video"]
     assert (video.n_frames, video.size, video.info["duration"], video.info["loop"]) == (3, (5, 4), 250, 0)
-
-
-def test_masks_forbid_choices_and_bits():
-    choice = distributions.CategoricalDistribution(3).proba_distribution(np.zeros((1, 3)))
-    choice.apply_masking([[True, False, True]])
-    np.testing.assert_allclose(np.exp(choice.log_prob(np.array([0]))), 0.5, rtol=1e-6)
-    assert np.exp(choice.log_prob(np.array([1]))) == 0
-    choice.apply_masking(None)
-    np.testing.assert_allclose(np.exp(choice.log_prob(np.array([1]))), 1 / 3, rtol=1e-6)
-    bits = distributions.BernoulliDistribution(3).proba_distribution(np.zeros((1, 3)))
-    bits.apply_masking([[True, True, False, True, True, False]])  # 0 and 1 of each bit
-    assert {tuple(bits.sample()[0].tolist()) for _ in range(20)} == {(0, 1, 0), (1, 1, 0)}

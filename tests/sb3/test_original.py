@@ -19,12 +19,11 @@ from rejeu.algorithms.actor_critic.network import sde_std
 from rejeu.core.distributions import Normal, TanhNormal
 from rejeu.sb3.common import env_checker, envs, logger as loggers, torch_layers
 from rejeu.sb3.common.buffers import HerReplayBuffer
-from rejeu.sb3.common.distributions import Distribution, half_widths
 from rejeu.sb3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise, VectorizedActionNoise
 from rejeu.sb3.common.torch_layers import BaseFeaturesExtractor
 from rejeu.sb3.common.utils import get_parameters_by_name
 from rejeu.sb3.common.vec_env import DummyVecEnv, VecCheckNan, VecNormalize
-from rejeu.sb3.policy import ActorCriticPolicy
+from rejeu.sb3.policy import ActorCriticPolicy, Distribution, half_widths
 from tests.tiers import exhaustive, only
 
 pytestmark = pytest.mark.usefixtures("learners_are_shared")
@@ -432,35 +431,6 @@ def test_contrib_modules_and_masks():
     assert (obs["observation"].tolist(), obs["achieved_goal"].tolist()) == ([100.0, 0.75], [100.0])
     assert goals.observation_space.contains(obs)
     assert goals.observation_space["observation"].low.tolist() == [-200.0, 0.0]
-
-
-def test_files_by_path_or_open(tmp_path):
-    from rejeu.sb3.common.save_util import load_from_pkl, open_path, save_to_pkl
-
-    with open_path(tmp_path / "plain", "w", suffix="pkl") as file:
-        save_to_pkl(file, {"a": [1, 2.5]})
-    assert load_from_pkl(tmp_path / "plain") == load_from_pkl(tmp_path / "plain.pkl") == {"a": [1, 2.5]}
-    with pytest.warns(UserWarning, match="does not exist"):
-        save_to_pkl(tmp_path / "new" / "file", "text")
-    assert (tmp_path / "new" / "file.pkl").is_file()
-    with pytest.raises(ValueError, match="closed"):
-        open_path(file, "w")
-    with pytest.raises(TypeError):
-        save_to_pkl(tmp_path / "agent", ppo)
-
-
-def test_state_dependent_noise_has_the_variance_of_its_matrix():
-    from rejeu.sb3.common.distributions import StateDependentNoiseDistribution
-
-    latent, log_std = np.array([[0.5, -1.0]]).repeat(4000, axis=0), np.log(np.array([[0.4], [0.3]]))
-    distribution = StateDependentNoiseDistribution(1)
-    _, first = distribution.proba_distribution_net(4, latent_sde_dim=2)
-    assert first.tolist() == [[-2.0], [-2.0]]
-    distribution.sample_weights(log_std, batch_size=4000)
-    made = distribution.proba_distribution(np.full((4000, 1), 2.0), log_std, latent)
-    std = np.sqrt((0.5 * 0.4) ** 2 + (1.0 * 0.3) ** 2)
-    assert np.exp(made.distribution.log_std[0, 0]) == pytest.approx(std, rel=1e-4)
-    assert made.get_actions().std() == pytest.approx(std, rel=0.06)
 
 
 def test_stacks_of_observations_by_hand():

@@ -14,8 +14,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from rejeu.core.distributions import TanhNormal
-from rejeu.sb3.common import distributions, envs, logger as loggers, preprocessing, save_util, utils
+from rejeu.sb3.common import envs, logger as loggers, preprocessing, utils
 from rejeu.sb3.common.results_plotter import rolling_window
 from rejeu.sb3.common.torch_layers import create_mlp
 from rejeu.sb3.common.vec_env import DummyVecEnv, VecCheckNan, VecMonitor, VecTransposeImage
@@ -131,100 +130,6 @@ def test_observations_for_networks():
     for nested in (spaces.Dict(a=both), spaces.Tuple([both])):
         with pytest.raises(NotImplementedError):
             preprocessing.check_for_nested_spaces(nested)
-
-
-# distributions
-
-
-def test_divergences_are_expectations_of_log_ratios():
-    p, q = np.array([[0.7, 0.2, 0.1]]), np.array([[0.2, 0.3, 0.5]])
-    one, two = (distributions.CategoricalDistribution(3).proba_distribution(np.log(x)) for x in (p, q))
-    divergence = float((p * np.log(p / q)).sum())
-    assert float(distributions.kl_divergence(one, two)[0]) == pytest.approx(divergence, rel=1e-5)
-    logits = [np.log(np.concatenate([x[:, :2], x], axis=1)) for x in (p, q)]
-    one, two = (distributions.MultiCategoricalDistribution([2, 3]).proba_distribution(x) for x in logits)
-    p, q = (x[0, :2] / x[0, :2].sum() for x in (p, q))
-    first = float((p * np.log(p / q)).sum())
-    assert float(distributions.kl_divergence(one, two)[0]) == pytest.approx(first + divergence, rel=1e-5)
-    one, two = (distributions.BernoulliDistribution(1).proba_distribution(np.log(x[:1] / x[1:])[None]) for x in (p, q))
-    assert float(distributions.kl_divergence(one, two)[0, 0]) == pytest.approx(first, rel=1e-5)
-    normal = distributions.DiagGaussianDistribution
-    one, two = (
-        normal(1).proba_distribution([[1.0]], np.log([2.0])),
-        normal(1).proba_distribution([[4.0]], np.log([3.0])),
-    )
-    expected = np.log(3 / 2) + (2**2 + 3**2) / (2 * 3**2) - 0.5
-    assert float(distributions.kl_divergence(one, two)[0, 0]) == pytest.approx(expected, rel=1e-5)
-    with pytest.raises(TypeError, match="kinds"):
-        distributions.kl_divergence(one, distributions.CategoricalDistribution(2).proba_distribution(np.zeros((1, 2))))
-
-
-@pytest.mark.parametrize(
-    ("space", "name", "n"),
-    [
-        (BOX, "DiagGaussian", 3),
-        (spaces.Discrete(4), "Categorical", 4),
-        (spaces.MultiDiscrete([2, 3]), "MultiCategorical", 5),
-        (spaces.MultiBinary(2), "Bernoulli", 2),
-    ],
-)
-def test_distributions_by_the_space_of_actions(space, name, n):
-    made = distributions.make_proba_distribution(space)
-    assert (type(made).__name__, made.action_dim) == (f"{name}Distribution", n)
-
-
-def test_distributions_take_settings_and_make_layers():
-    make = distributions.make_proba_distribution
-    noisy = make(BOX, use_sde=True, dist_kwargs={"squash_output": True, "epsilon": 0.1})
-    assert (noisy.kind, noisy.epsilon) == (TanhNormal, 0.1)
-    layer, log_std = noisy.proba_distribution_net(4, log_std_init=-2.0)
-    assert (layer.weight.shape, log_std.shape, log_std[0, 0]) == ((3, 4), (4, 3), -2.0)
-    assert make(BOX).proba_distribution_net(4)[1].tolist() == [0.0] * 3
-    with pytest.raises(NotImplementedError):
-        make(spaces.Text(3))
-
-
-def test_choices_bits_and_squashed_actions():
-    several = distributions.MultiCategoricalDistribution([2, 3]).proba_distribution(
-        np.log([[0.25, 0.75, 0.2, 0.3, 0.5]])
-    )
-    assert several.mode().tolist() == several.get_actions(deterministic=True).tolist() == [[1, 2]]
-    assert float(several.log_prob(np.array([[0, 1]]))[0]) == pytest.approx(np.log(0.25 * 0.3), rel=1e-5)
-    squashed = distributions.SquashedDiagGaussianDistribution(1).proba_distribution([[0.5]], np.log([0.1]))
-    action = np.tanh(0.6)
-    density = -0.5 - np.log(0.1 * np.sqrt(2 * np.pi)) - np.log(1 - action**2)
-    assert float(squashed.log_prob(np.array([[action]]))[0]) == pytest.approx(density, rel=1e-4)
-    assert float(squashed.mode()[0, 0]) == pytest.approx(np.tanh(0.5), rel=1e-5)
-
-
-# save_util
-
-
-def test_paths_get_suffixes_and_folders(tmp_path):
-    (tmp_path / "folder.pkl").mkdir()
-    with (
-        pytest.warns(UserWarning, match="folder"),
-        save_util.open_path(tmp_path / "folder", "wb", suffix="pkl") as file,
-    ):
-        assert file.name == str(tmp_path / "folder.pkl_2")
-    save_util.save_to_pkl(tmp_path / "given.any", 1)
-    assert save_util.load_from_pkl(tmp_path / "given.any") == 1
-    save_util.save_to_pkl(tmp_path / "x", 1)
-    with pytest.warns(UserWarning, match="replaced"):
-        save_util.save_to_pkl(tmp_path / "x", 2, verbose=2)
-    with pytest.warns(UserWarning, match="Attempting"):
-        assert save_util.load_from_pkl(tmp_path / "x", verbose=2) == 2
-    stream = io.BytesIO()
-    save_util.save_to_pkl(stream, [1])
-    assert (stream.getvalue(), stream.closed) == (b"[1]", False)
-    (tmp_path / "pickle.pkl").write_bytes(b"\x80\x04.")
-    with pytest.raises(ValueError, match="not written by"):
-        save_util.load_from_pkl(tmp_path / "pickle")
-    for path, mode, error in ((3, "r", TypeError), (tmp_path / "x", "a", ValueError), (file, "r", ValueError)):
-        with pytest.raises(error):
-            save_util.open_path(path, mode)
-    inner = SimpleNamespace(a=SimpleNamespace(b=3))
-    assert (save_util.recursive_getattr(inner, "a.b"), save_util.recursive_getattr(inner, "c", 5)) == (3, 5)
 
 
 # logger

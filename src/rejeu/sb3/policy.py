@@ -21,8 +21,8 @@ import numpy as np
 from gymnasium import spaces
 
 from rejeu.core import spaces as rejeu_spaces
+from rejeu.core.distributions import TanhNormal
 from rejeu.core.spaces import as_batch
-from rejeu.sb3.common.distributions import Distribution, half_widths
 from rejeu.sb3.common.preprocessing import maybe_transpose
 from rejeu.sb3.common.utils import Tensor, is_vectorized_observation
 
@@ -35,6 +35,7 @@ __all__ = [
     "CnnPolicy",
     "ContinuousCritic",
     "DQNPolicy",
+    "Distribution",
     "MlpPolicy",
     "MultiInputActorCriticPolicy",
     "MultiInputPolicy",
@@ -300,6 +301,58 @@ class BasePolicy(BaseModel):
         run = self.model.run
         if run.ended.size and jax.tree.leaves(run.carry):
             run.carry = self.model.learner.initial_carry(len(run.ended))
+
+
+def half_widths(space: spaces.Space) -> tuple[np.ndarray, np.ndarray] | None:
+    """Returns the centers and half widths of Box actions, None for others."""
+    if not isinstance(space, spaces.Box):
+        return None
+    return (space.high + space.low).ravel() / 2, (space.high - space.low).ravel() / 2
+
+
+class Distribution:
+    """A distribution of actions, in NumPy. Random numbers come from NumPy's global generator, which ``set_random_seed`` seeds.
+
+    Args:
+        distribution: of actions in the algorithm's range.
+        widths: centers and half widths of the environment's range; None: it is the same.
+    """
+
+    def __init__(self, distribution: Any = None, widths: tuple[np.ndarray, np.ndarray] | None = None) -> None:
+        self.distribution, self.widths = distribution, widths
+
+    def _own(self, actions: Any) -> Any:
+        actions = np.asarray(actions)
+        return actions if self.widths is None else (actions - self.widths[0]) / self.widths[1]
+
+    def _shown(self, actions: Any) -> np.ndarray:
+        actions = np.asarray(actions)
+        return Tensor.of(actions if self.widths is None else actions * self.widths[1] + self.widths[0])
+
+    def _log_width(self) -> float:
+        return 0.0 if self.widths is None else float(np.sum(np.log(self.widths[1])))
+
+    def log_prob(self, actions: Any) -> np.ndarray:
+        """Returns the log-probabilities or densities of actions, ``(batch,)``, in nats."""
+        return Tensor.of(self.distribution.log_prob(self._own(actions))) - self._log_width()
+
+    def entropy(self) -> np.ndarray | None:
+        """Returns the entropy, ``(batch,)``, in nats; None for a squashed Gaussian, which has no closed form."""
+        if isinstance(self.distribution, TanhNormal):
+            return None
+        return Tensor.of(self.distribution.entropy()) + self._log_width()
+
+    def sample(self) -> np.ndarray:
+        """Returns random actions."""
+        return self._shown(self.distribution.sample(jax.random.key(np.random.randint(2**31))))  # noqa: NPY002
+
+    def mode(self) -> np.ndarray:
+        """Returns the most likely actions; of a Gaussian the means."""
+        return self._shown(self.distribution.mode())
+
+    def get_actions(self, deterministic: bool = False) -> np.ndarray:
+        """Returns the most likely or random actions."""
+        return self.mode() if deterministic else self.sample()
 
 
 class ActorCriticPolicy(BasePolicy):

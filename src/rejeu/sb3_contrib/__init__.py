@@ -19,7 +19,6 @@ from gymnasium import spaces
 
 from rejeu.algorithms.catalog import CATALOG
 from rejeu.sb3.algorithms import ARS, QRDQN, TQC, TRPO, CrossQ, MaskablePPO, RecurrentPPO
-from rejeu.sb3.common import distributions
 from rejeu.sb3.common.callbacks import EvalCallback
 from rejeu.sb3.common.envs import IdentityEnv
 from rejeu.sb3.common.evaluation import evaluate_policy as evaluate_by_masks
@@ -180,11 +179,6 @@ MODULES: dict[str, dict[str, Any]] = {
         "MaskableActorCriticCnnPolicy": CnnPolicy,
         "MaskableMultiInputActorCriticPolicy": MultiInputPolicy,
     },
-    "common.maskable.distributions": {
-        f"Maskable{name}": getattr(distributions, name)
-        for name in ("BernoulliDistribution", "CategoricalDistribution", "MultiCategoricalDistribution", "Distribution")
-    }
-    | {"make_masked_proba_distribution": distributions.make_proba_distribution},
     "common.recurrent": {},
     "common.recurrent.policies": {
         "RecurrentActorCriticPolicy": ActorCriticPolicy,
