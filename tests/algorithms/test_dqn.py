@@ -288,7 +288,7 @@ def test_discrete_actions_of_any_start_are_learnt(n_envs):
     env = rejeu.make_vector(Bandit, n_envs)
     settings = {"gamma": 0.0, "learning_rate": 1e-2, "train_freq": 2, "learning_starts": 50}
     agent = rejeu.DQN("MlpPolicy", env, seed=0, policy_kwargs={"net_arch": [8]}, **settings).learn(400)
-    assert agent.num_timesteps == 400
+    assert agent.num_timesteps == -(-400 // n_envs) * n_envs
     action, _ = agent.predict(np.zeros(1, np.float32), deterministic=True)
     assert action == 6
 

@@ -136,7 +136,7 @@ def test_the_watch_sees_a_pickle_that_runs_code(seen):
     assert ["pickle.find_class", "builtins"] in seen["pickle"]["events"]
 
 
-TYPED = {"arguments.env", "given.env", "full_name(arguments.env)"}
+TYPED = {"arguments.env", "options.env", "full_name(arguments.env)"}
 """Where a person has typed the id of an environment: the arguments of a command."""
 
 

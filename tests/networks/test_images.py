@@ -254,12 +254,12 @@ def test_observations_that_cannot_be_rebuilt_are_refused(env):
         agent.learn(10)
 
 
-def test_a_turn_that_some_environments_sit_out_keeps_its_stacks():
+def test_stacks_are_kept_between_two_calls_of_learn():
     envs = gym.vector.SyncVectorEnv([lambda: FrameStackObservation(Film(), 3)] * 3)
     agent = rejeu.SAC("MlpPolicy", envs, frame_stack=3, **SMALL)
-    agent.learn(10)  # 3 x 3 steps, and one more in the first environment
+    agent.learn(10)  # 4 x 3 steps
     agent.learn(11)
-    assert len(agent.replay_buffer.ring) == 21
+    assert len(agent.replay_buffer.ring) == 24
 
 
 @pytest.mark.parametrize(

@@ -228,8 +228,7 @@ def newer_version(env_id: str) -> str | None:
 def import_envpool() -> Any:
     """Returns the module ``envpool``, which knows all its environments; the code of a game is imported when it is made.
 
-    ``import envpool`` itself imports every game, and Matplotlib with one of them, which takes half a second, only to execute
-    the modules that register their ids. These are executed alone here, where EnvPool's entry imports nothing else.
+    ``import envpool`` takes half a second for every game and Matplotlib, only to register ids, which is done alone here.
 
     Raises:
         MissingExtra: if it is not installed, or a library of the system is missing.

@@ -54,7 +54,7 @@ def test_a_clone_is_a_run_that_is_evaluated_and_trained_on(shown, tmp_path, caps
     assert {"agent.safetensors", "best.safetensors", "evaluations.csv", "config.json"} <= set(found["files"])
     assert printed(capsys, "evaluate", out, "--episodes", 2)["env_id"] == "CartPole-v1"
     resumed = printed(capsys, "resume", out, "--steps", 64, "--no-report", "--no-video")
-    assert resumed["steps"] == 64
+    assert resumed["steps"] == 8 * 64  # a rollout of the preset's environments
 
 
 @exhaustive

@@ -25,7 +25,7 @@ def test_a_run_is_branched_with_other_settings(browser, common):
     config = json.loads((common.folder / "branched" / "config.json").read_text())
     assert config["origin"] == {
         "run": str(common.folder / "trained"),
-        "step": 128,
+        "step": 512,  # 128 steps, rounded up to a rollout of 64 in each of 8 environments
         "changes": {"learning_rate": 0.5},
     }
 

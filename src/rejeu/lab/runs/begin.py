@@ -85,9 +85,8 @@ def make_env(arguments: Train, environment: Environment, preset: Preset | None, 
 def describe_backend(env: VectorEnv, environment: Environment, preset: Preset | None) -> str:
     """Returns the backend, with a hint if the preset uses EnvPool and that is not installed."""
     is_slower = env.backend == "gymnasium" and environment.is_plain and preset and preset.backend == "envpool"
-    if not is_slower or is_envpool_installed():
-        return env.backend
-    return f'{env.backend}; EnvPool would be faster ({ENVPOOL_SIZE}): pip install "rejeu[envpool]"'
+    hint = f'; EnvPool would be faster ({ENVPOOL_SIZE}): pip install "rejeu[envpool]"'
+    return env.backend + (hint if is_slower and not is_envpool_installed() else "")
 
 
 def untuned(algorithm: str, env: VectorEnv) -> Mapping[str, Any]:
