@@ -70,9 +70,9 @@ PLACEHOLDERS = {
     *("rest", "taken", "said", "kept", "left", "place", "answer", "thing", "named", "most", "about"),
 }
 """Names that do not say what they hold."""
-MAX_PLACEHOLDER_SHARE = 7.2
+MAX_PLACEHOLDER_SHARE = 0.5
 """Largest share of placeholders among the names that are bound, in percent. It may only fall."""
-MAX_VAGUE_DOCSTRINGS = 209
+MAX_VAGUE_DOCSTRINGS = 93
 """Largest number of docstrings that paraphrase with "what" or begin with "the same". It may only fall."""
 EXCEPTIONS = PUBLIC_IN_SPITE_OF_ITS_NAME | GYMNASIUM_STATE
 

@@ -299,9 +299,8 @@ def counters(config: HindsightConfig | None) -> tuple[str, ...]:
     """
     strategy = config and config.goal_selection_strategy
     names = {*dict(strategy.shares)} if isinstance(strategy, MixedStrategies) else {strategy}
-    if not (strategies := names - {*ANY_STEP, None}):
-        return ()
-    return ("until_end",) if strategies <= {*FROM_LATER} else ("since_start", "until_end")
+    strategies = names - {*ANY_STEP, None}
+    return () if not strategies else ("until_end",) if strategies <= {*FROM_LATER} else ("since_start", "until_end")
 
 
 class HerReplayBuffer(BaseReplayBuffer):

@@ -131,9 +131,9 @@ class Original(Agent):
             settings: hyperparameters.
         """
         settings |= zip(arguments.POSITIONAL.get(self.name, arguments.OFF_POLICY), args, strict=False)
-        made = None
+        instance = None
         if isinstance(policy, type):
-            env, policy, made = self._prepared(policy, env, settings)
+            env, policy, instance = self._prepared(policy, env, settings)
         replay = settings.get("replay_buffer_kwargs") or {}
         if replay.get("handle_timeout_termination", True) is False and isinstance(env, str | gym.Env):
             env = TimeLimitTerminates(gym.make(env) if isinstance(env, str) else env)
@@ -147,35 +147,36 @@ class Original(Agent):
         except ValueError as error:
             raise (Refused(*error.args) if type(error) is ValueError else error) from None
         self.device = utils.Device(self.device)
-        if made is not None:
-            made.model, made.observation_space, made.action_space = self, self.observation_space, self.action_space
-            self.policy_object = made
+        if instance is not None:
+            instance.model, instance.observation_space = self, self.observation_space
+            instance.action_space = self.action_space
+            self.policy_object = instance
         if settings.get("seed") is not None:
             utils.set_random_seed(self.seed)
 
     @staticmethod
-    def _prepared(kind: type[Any], env: Any, settings: dict[str, Any]) -> tuple[Any, str, BasePolicy | None]:
+    def _prepared(policy_class: type[Any], env: Any, settings: dict[str, Any]) -> tuple[Any, str, BasePolicy | None]:
         """Returns the environment, the name of the policy and the policy, for a class of policies."""
-        if not issubclass(kind, BasePolicy):
-            raise TypeError(f"policy={kind.__name__} must be a name, or a class derived from BasePolicy")
-        mine = [base for base in kind.__mro__ if base.__module__ != policies.__name__]
+        if not issubclass(policy_class, BasePolicy):
+            raise TypeError(f"policy={policy_class.__name__} must be a name, or a class derived from BasePolicy")
+        mine = [base for base in policy_class.__mro__ if base.__module__ != policies.__name__]
         for name in ("forward", "_predict", "evaluate_actions", "predict_values", "get_distribution"):
             if any(name in vars(base) for base in mine):
                 arguments.unsupported(
-                    f"{kind.__name__}.{name}", "your own", "is called neither in training nor by model.predict"
+                    f"{policy_class.__name__}.{name}", "your own", "is called neither in training nor by model.predict"
                 )
-        made = None
+        instance = None
         env = make_vec_env(env) if isinstance(env, str) else env
         space = getattr(env, "single_observation_space", env.observation_space)
-        if kind.__init__ is not BasePolicy.__init__:
+        if policy_class.__init__ is not BasePolicy.__init__:
             action_space = getattr(env, "single_action_space", env.action_space)
             rate = utils.FloatSchedule(settings.get("learning_rate", 3e-4))
-            made = kind(space, action_space, rate, **(settings.get("policy_kwargs") or {}))
-            settings["policy_kwargs"] = made.settings
-        elif kind.__module__ != policies.__name__:
-            made = kind(space, env.action_space)
+            instance = policy_class(space, action_space, rate, **(settings.get("policy_kwargs") or {}))
+            settings["policy_kwargs"] = instance.settings
+        elif policy_class.__module__ != policies.__name__:
+            instance = policy_class(space, env.action_space)
         by_space = "MultiInputPolicy" if isinstance(space, gym.spaces.Dict | gym.spaces.Tuple) else "MlpPolicy"
-        return env, kind.policy_name or by_space, made
+        return env, policy_class.policy_name or by_space, instance
 
     converted = classmethod(arguments.converted)
 
@@ -226,8 +227,8 @@ class Original(Agent):
             ValueError: for a hyperparameter that networks or buffer depend on.
         """
         config: Any = self.__dict__.get("config")
-        known = () if config is None or name in self.STORED else validation.field_names(type(config))
-        if name in known:
+        settings = () if config is None or name in self.STORED else validation.field_names(type(config))
+        if name in settings:
             new = dataclasses.replace(config, **self.converted({name: value}))
             old, number = getattr(config, name), getattr(new, name)
             if isinstance(old, schedules.Live) and isinstance(number, int | float):
@@ -239,9 +240,9 @@ class Original(Agent):
                         new = dataclasses.replace(config, **{name: schedules.Live(number)})
                 self.change(new)
             return
-        if known and name in (fixed := {**FIXED, **dict.fromkeys(policies.NETWORKS, "set_parameters(...)")}):
+        if settings and name in (fixed := {**FIXED, **dict.fromkeys(policies.NETWORKS, "set_parameters(...)")}):
             raise AttributeError(f"{name} of {self.name} cannot be set; use {fixed[name]}")
-        if known and not hasattr(self, name) and (near := difflib.get_close_matches(name, known, 1, 0.85)):
+        if settings and not hasattr(self, name) and (near := difflib.get_close_matches(name, settings, 1, 0.85)):
             warnings.warn(
                 f"{name} is an attribute of your own now; is the hyperparameter {near[0]} meant?", UserWarning, 2
             )
@@ -287,10 +288,10 @@ class Original(Agent):
         """The replay buffer with Stable-Baselines3's attributes; ``run.replay`` is the one that batches are drawn from."""
         if not isinstance(self, OffPolicyAgent) or "replay_buffer_deleted" in self.__dict__:
             raise AttributeError(f"{self.name} has no replay buffer")
-        is_her, kind = self.config.hindsight is not None, buffers.ReplayBuffer
+        is_her, buffer_class = self.config.hindsight is not None, buffers.ReplayBuffer
         if isinstance(self.observation_space, gym.spaces.Dict):
-            kind = buffers.HerReplayBuffer if is_her else buffers.DictReplayBuffer
-        return (buffers.NStepReplayBuffer if self.config.n_steps > 1 and not is_her else kind).of(self)
+            buffer_class = buffers.HerReplayBuffer if is_her else buffers.DictReplayBuffer
+        return (buffers.NStepReplayBuffer if self.config.n_steps > 1 and not is_her else buffer_class).of(self)
 
     @replay_buffer.setter
     def replay_buffer(self, value: Any) -> None:
@@ -301,12 +302,12 @@ class Original(Agent):
             return
         steps = [getattr(value, name) for name in value.SHOWN]
         self.run.replay = self.make_buffer(self.run.env)
-        own = self.replay_buffer
+        buffer = self.replay_buffer
         for i in range(value.pos):
             obs, following, action, reward, done, timeout = (
-                buffers.by_leaf(lambda leaf, i=i: leaf[i], part) for part in steps
+                buffers.by_leaf(lambda leaf, i=i: leaf[i], leaves) for leaves in steps
             )
-            own.add(obs, following, action, reward, done, [{"TimeLimit.truncated": bool(one)} for one in timeout])
+            buffer.add(obs, following, action, reward, done, [{"TimeLimit.truncated": bool(cut)} for cut in timeout])
 
     @replay_buffer.deleter
     def replay_buffer(self) -> None:
@@ -334,18 +335,18 @@ class Original(Agent):
         shown.full = shown.pos == core.n_steps
         obs, next_obs = (jax.tree.unflatten(core.obs_structure, leaves) for leaves in (core.obs, core.next_obs))
         valid = core.valid & (np.arange(core.n_steps) < shown.pos)[:, None]
-        seen = Rollout(obs, core.action, core.reward, next_obs, core.discount, core.ended, valid, (), (), ())
-        seen = jax.tree.map(np.copy, seen)
-        shown.observations, shown.rewards = buffers.by_leaf(buffers.fixed, seen.obs), buffers.fixed(seen.reward)
-        shown.actions = buffers.fixed(seen.action.reshape(*shape, -1))
+        rollout = Rollout(obs, core.action, core.reward, next_obs, core.discount, core.ended, valid, (), (), ())
+        rollout = jax.tree.map(np.copy, rollout)
+        shown.observations, shown.rewards = buffers.by_leaf(buffers.fixed, rollout.obs), buffers.fixed(rollout.reward)
+        shown.actions = buffers.fixed(rollout.action.reshape(*shape, -1))
         first = core.started if core.length else core.previously_started
-        shown.episode_starts = buffers.fixed(np.concatenate([first[None], seen.ended[:-1]]).astype(np.float32))
+        shown.episode_starts = buffers.fixed(np.concatenate([first[None], rollout.ended[:-1]]).astype(np.float32))
         network = getattr(self.state, "network", None)
         if not isinstance(network, ActorCritic):
             return shown
-        found = samples(network, jax.tree.map(jnp.asarray, seen), self.config.gae_lambda)
+        data = samples(network, jax.tree.map(jnp.asarray, rollout), self.config.gae_lambda)
         shown.log_probs, shown.values, shown.advantages, shown.returns = (
-            buffers.fixed(np.where(valid, np.reshape(x, shape), 0.0)) for x in found[2:6]
+            buffers.fixed(np.where(valid, np.reshape(x, shape), 0.0)) for x in data[2:6]
         )
         return shown
 
@@ -481,7 +482,7 @@ class Original(Agent):
         """
         if not use_masking:
             raise ValueError("use_masking=False: MaskablePPO needs masks; use PPO for environments without")
-        given = [] if callback is None else [*callback] if isinstance(callback, list | tuple) else [callback]
+        callback_list = [] if callback is None else [*callback] if isinstance(callback, list | tuple) else [callback]
         interval = 2**62 if log_interval is None else log_interval
         if not self.has_own_logger:
             folder = tb_log_name or self.name
@@ -495,7 +496,7 @@ class Original(Agent):
         if reset_num_timesteps:
             self.ep_info_buffer.clear()
             self.ep_success_buffer.clear()
-        callbacks = [as_callback(one) for one in given]
+        callbacks = [as_callback(original) for original in callback_list]
         flags = (reset_num_timesteps, progress_bar)
         super().learn(total_timesteps, callbacks, interval, tb_log_name, *flags, **limits)
         if isinstance(self.logger, loggers.Logger):  # where scripts look for what the last updates said
@@ -514,9 +515,9 @@ class Original(Agent):
         first = PARTS["actor_optimizer" if any("actor_optimizer" in name for name in arrays) else "optimizer"]
         for name, array in arrays.items():
             fields = name.split(".")
-            found = [PARTS[field] for field in fields if field in PARTS]
-            part = found[0] if found else "policy" if policies.ALL_NETWORKS & {*fields} else first
-            parts.setdefault(part, {})[name] = utils.Tensor.of(array)
+            group_names = [PARTS[field] for field in fields if field in PARTS]
+            group = group_names[0] if group_names else "policy" if policies.ALL_NETWORKS & {*fields} else first
+            parts.setdefault(group, {})[name] = utils.Tensor.of(array)
         return parts
 
     def set_parameters(self, load_path_or_dict: Any, exact_match: bool = True, device: Any = "auto") -> None:
@@ -531,14 +532,14 @@ class Original(Agent):
             ValueError: if a part, name, shape or dtype does not match; the agent is then unchanged.
             RuntimeError: the same error.
         """
-        given = load_path_or_dict
-        if isinstance(given, Mapping) and any(isinstance(part, Mapping) for part in given.values()):
-            unknown = [*given.keys() - (own := self.get_parameters()).keys()]
+        parameters = load_path_or_dict
+        if isinstance(parameters, Mapping) and any(isinstance(group, Mapping) for group in parameters.values()):
+            unknown = [*parameters.keys() - (current := self.get_parameters()).keys()]
             if unknown:
-                raise Mismatch(f"set_parameters got {unknown[0]!r}, and {self.name} has {', '.join(own)}")
-            given = {name: array for part in given.values() for name, array in part.items()}
+                raise Mismatch(f"set_parameters got {unknown[0]!r}, and {self.name} has {', '.join(current)}")
+            parameters = {name: array for group in parameters.values() for name, array in group.items()}
         try:
-            super().set_parameters(given, exact_match)
+            super().set_parameters(parameters, exact_match)
         except CheckpointError as error:
             raise Mismatch(*error.args) from None
 
@@ -562,8 +563,8 @@ class Original(Agent):
         Raises:
             TypeError: if JSON has no such value; ``save_replay_buffer`` writes the replay buffer.
         """
-        kept = {*(include or ())}
-        return written(lambda file: self.snapshot(file, {*(exclude or ())} - kept, kept)(), path, ".zip")
+        included = {*(include or ())}
+        return written(lambda file: self.snapshot(file, {*(exclude or ())} - included, included)(), path, ".zip")
 
     def snapshot(self, path: Any, exclude: Iterable[str] = (), include: Iterable[str] = ()) -> Callable[[], Path]:
         """Returns a function that writes the model as it is now, as :meth:`save` does."""
@@ -592,15 +593,15 @@ class Original(Agent):
     def load_replay_buffer(self, path: Any, truncate_last_traj: bool = True) -> None:
         """Replaces the replay buffer by a saved one; see :meth:`rejeu.OffPolicyAgent.load_replay_buffer`."""
         self.__dict__.pop("replay_buffer_deleted", None)
-        with readable(path, ".pkl") as found:
+        with readable(path, ".pkl") as exact_path:
             if self.run.replay is None and self.config.hindsight is None:  # loaded without environments
-                with checkpoint.opened(found, "replay") as file:
+                with checkpoint.opened(exact_path, "replay") as file:
                     n_envs = file.specs["head"].shape[0]
                 like: Any = SimpleNamespace(
                     n_envs=n_envs, observation_space=self.observation_space, action_space=self.action_space
                 )
                 self.run.replay = self.make_buffer(like)
-            super().load_replay_buffer(found)  # type: ignore[misc]
+            super().load_replay_buffer(exact_path)  # type: ignore[misc]
 
     @classmethod
     def load(
@@ -626,27 +627,27 @@ class Original(Agent):
         """
         if print_system_info:
             utils.get_system_info()
-        known = {*validation.field_names(cls.algorithm.Config), *AGENT_ARGUMENTS}
-        objects = {key: value for key, value in (custom_objects or {}).items() if key in known}
+        setting_names = {*validation.field_names(cls.algorithm.Config), *AGENT_ARGUMENTS}
+        objects = {key: value for key, value in (custom_objects or {}).items() if key in setting_names}
         has_gpu = utils.Device(str(device)).type == "cuda" and utils.get_device(device).type == "cuda"
-        place = str(device) if has_gpu or str(device) in ("auto", "cpu") else "auto"
-        changes = {**objects, "device": place, **kwargs}
-        with readable(path, ".zip") as found:
+        device_name = str(device) if has_gpu or str(device) in ("auto", "cpu") else "auto"
+        changes = {**objects, "device": device_name, **kwargs}
+        with readable(path, ".zip") as file:
             agent: Any
-            if zipfile.is_zipfile(found):
-                statistics = statistics_beside(found) if isinstance(path, str | Path) else None
+            if zipfile.is_zipfile(file):
+                statistics = statistics_beside(file) if isinstance(path, str | Path) else None
                 if statistics is not None and not isinstance(env, VecNormalize):
                     warnings.warn(
                         f"{statistics} lies beside the model, whose observations were normalized by it; use "
                         f"env = VecNormalize.load({str(statistics)!r}, env), and give the model its observations",
                         stacklevel=2,
                     )
-                agent = load_zip(found, env, False, cls, **cls.converted(changes))
+                agent = load_zip(file, env, False, cls, **cls.converted(changes))
             else:
-                header = checkpoint.read_header(found, "agent")
+                header = checkpoint.read_header(file, "agent")
                 shape = header.get("config", {}).get("policy_kwargs")
                 register_again(shape.get("encoder") if isinstance(shape, dict) else None)
-                agent = load_agent(cls, found, env, changes)
+                agent = load_agent(cls, file, env, changes)
                 attributes = header["attributes"] if isinstance(header.get("attributes"), dict) else {}
                 restore_windows(agent, attributes.get)
                 for name in attributes.keys() - {*OUTPUTS}:
@@ -666,18 +667,18 @@ class Original(Agent):
 
 def scaled(buffer: Any, agent: Original) -> Any:
     """Returns a replay buffer that now stores original observations and rewards, and draws them normalized."""
-    kind = type(buffer)
+    buffer_class = type(buffer)
 
     def begin(obs: Any, which: Any = None) -> None:
-        kind.begin(buffer, agent.run.env.original_obs(final=False), which)
+        buffer_class.begin(buffer, agent.run.env.original_obs(final=False), which)
 
     def add(action: Any, reward: Any, terminated: Any, obs: Any) -> None:
         env: Any = agent.run.env
         original = env.vec_normalize.get_original_reward()
-        kind.add(buffer, action, original, terminated, env.original_obs(final=True))
+        buffer_class.add(buffer, action, original, terminated, env.original_obs(final=True))
 
     def draw(*args: Any) -> Any:
-        batch, drawn = kind.draw(buffer, *args)
+        batch, drawn = buffer_class.draw(buffer, *args)
         scale: Any = agent.run.env.vec_normalize
         obs, following = scale.normalize_obs(batch.obs), scale.normalize_obs(batch.next_obs)
         return batch._replace(obs=obs, next_obs=following, reward=scale.normalize_reward(batch.reward)), drawn
@@ -686,9 +687,9 @@ def scaled(buffer: Any, agent: Original) -> Any:
     return buffer
 
 
-def load_agent(kind: type[Original], path: Path, env: Any, changes: Mapping[str, Any]) -> Any:
+def load_agent(agent_class: type[Original], path: Path, env: Any, changes: Mapping[str, Any]) -> Any:
     """Returns the agent of a file by :meth:`Agent.load`."""
-    return Agent.__dict__["load"].method.__get__(None, kind)(path, env, **changes)
+    return Agent.__dict__["load"].method.__get__(None, agent_class)(path, env, **changes)
 
 
 def written(write: Callable[[Path], Path], path: Any, suffix: str) -> Any:
@@ -704,9 +705,9 @@ def written(write: Callable[[Path], Path], path: Any, suffix: str) -> Any:
 def readable(path: Any, suffix: str) -> Iterator[Path]:
     """Yields a path that can be opened: the given one, or with ``suffix``; the content of a file object as a file."""
     if isinstance(path, str | Path):
-        given, with_suffix = Path(path), checkpoint.resolve(path, suffix)
-        is_there = given.exists() or (not with_suffix.is_file() and checkpoint.resolve(given).is_file())
-        yield given if is_there else with_suffix
+        exact_path, with_suffix = Path(path), checkpoint.resolve(path, suffix)
+        is_there = exact_path.exists() or (not with_suffix.is_file() and checkpoint.resolve(exact_path).is_file())
+        yield exact_path if is_there else with_suffix
         return
     path.seek(0)
     with tempfile.TemporaryDirectory() as folder:
@@ -726,7 +727,7 @@ def as_callback(callback: Any) -> Callback:
 def has_channels_last(space: gym.Space) -> bool:
     """Returns whether observations are, or contain, images with the channels last."""
     parts: Any = space.spaces.values() if isinstance(space, gym.spaces.Dict) else [space]
-    return any(is_image_space(part) and not is_image_space_channels_first(part) for part in parts)
+    return any(is_image_space(leaf) and not is_image_space_channels_first(leaf) for leaf in parts)
 
 
 class A2C(Original, agents.A2C):

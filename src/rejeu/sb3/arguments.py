@@ -63,12 +63,12 @@ POSITIONAL = {
 """Arguments after ``policy`` and ``env`` by position."""
 
 
-def converted(kind: type[Agent], settings: Mapping[str, Any]) -> dict[str, Any]:
+def converted(agent_class: type[Agent], settings: Mapping[str, Any]) -> dict[str, Any]:
     """Returns keyword arguments of the constructor or of ``load`` as rejeu's agent takes them."""
-    known = {*validation.field_names(kind.algorithm.Config), *AGENT_ARGUMENTS}
+    setting_names = {*validation.field_names(agent_class.algorithm.Config), *AGENT_ARGUMENTS}
     result: dict[str, Any] = {}
     for key, value in settings.items():
-        if key in WITHOUT_EFFECT or (key not in known and value in NEUTRAL.get(key, ())):
+        if key in WITHOUT_EFFECT or (key not in setting_names and value in NEUTRAL.get(key, ())):
             if value not in NEUTRAL.get(key, (value,)):
                 unsupported(key, value)
             continue
@@ -80,47 +80,47 @@ def converted(kind: type[Agent], settings: Mapping[str, Any]) -> dict[str, Any]:
     if result.get("use_sde") and result.get("action_noise") is not None:
         unsupported("action_noise", result.pop("action_noise"), "is not used: use_sde=True explores by itself")
     if isinstance(frequency := result.get("train_freq"), tuple):
-        result["train_freq"] = tuple(getattr(part, "value", part) for part in frequency)
+        result["train_freq"] = tuple(getattr(unit, "value", unit) for unit in frequency)
     if "device" in result:
         result["device"] = "auto" if result["device"] is None else str(result["device"])
     convert_buffer(result)
     if isinstance(result.get("policy_kwargs"), Mapping):
-        shape, others = shape_of(kind, result["policy_kwargs"])
+        shape, others = shape_of(agent_class, result["policy_kwargs"])
         result = others | result | {"policy_kwargs": shape}
     return result
 
 
 def convert_buffer(settings: dict[str, Any]) -> None:
     """Replaces the settings of a replay buffer by rejeu's."""
-    kind, given = settings.get("replay_buffer_class"), dict(settings.get("replay_buffer_kwargs") or {})
-    if isinstance(kind, type) and issubclass(kind, buffers.ReplayBuffer):
-        if kind.__name__ not in REPLAY_BUFFERS and kind.__module__ != buffers.__name__:
+    buffer, options = (settings.get("replay_buffer_class"), dict(settings.get("replay_buffer_kwargs") or {}))
+    if isinstance(buffer, type) and issubclass(buffer, buffers.ReplayBuffer):
+        if buffer.__name__ not in REPLAY_BUFFERS and buffer.__module__ != buffers.__name__:
             raise TypeError(
-                f"replay_buffer_class={kind.__name__}: a class of your own derives from rejeu.ReplayBuffer, "
+                f"replay_buffer_class={buffer.__name__}: a class of your own derives from rejeu.ReplayBuffer, "
                 "which stores every observation once; the classes of rejeu.sb3.common.buffers show an agent's"
             )
-        if kind is buffers.NStepReplayBuffer:
-            settings["n_steps"] = given.pop("n_steps", settings.get("n_steps", 3))
-            settings["gamma"] = given.pop("gamma", settings.get("gamma", 0.99))
-        settings["replay_buffer_class"] = "HerReplayBuffer" if kind is buffers.HerReplayBuffer else "ReplayBuffer"
-    if given.pop("handle_timeout_termination", True) is False:
+        if buffer is buffers.NStepReplayBuffer:
+            settings["n_steps"] = options.pop("n_steps", settings.get("n_steps", 3))
+            settings["gamma"] = options.pop("gamma", settings.get("gamma", 0.99))
+        settings["replay_buffer_class"] = "HerReplayBuffer" if buffer is buffers.HerReplayBuffer else "ReplayBuffer"
+    if options.pop("handle_timeout_termination", True) is False:
         unsupported(
             "handle_timeout_termination",
             False,
             "is not followed for vector environments: wrap theirs in TimeLimitTerminates",
         )
-    given.pop("optimize_memory_usage", None)
+    options.pop("optimize_memory_usage", None)
     if "replay_buffer_kwargs" in settings:
-        settings["replay_buffer_kwargs"] = given or None
+        settings["replay_buffer_kwargs"] = options or None
 
 
-def shape_of(kind: type[Agent], given: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+def shape_of(agent_class: type[Agent], policy_kwargs: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
     """Returns ``policy_kwargs`` as rejeu takes them, and the hyperparameters that they contain."""
-    config = kind.algorithm.Config
-    fields, known = (validation.field_names(one) for one in (config.policy_kwargs_class, config))
+    config = agent_class.algorithm.Config
+    fields, names = (validation.field_names(owner) for owner in (config.policy_kwargs_class, config))
     shape: dict[str, Any] = {}
     others: dict[str, Any] = {}
-    for key, value in given.items():
+    for key, value in policy_kwargs.items():
         if key in ("features_extractor_class", "optimizer_class", "features_extractor_kwargs", "optimizer_kwargs"):
             continue
         if key == "net_arch" and value is not None:
@@ -128,47 +128,48 @@ def shape_of(kind: type[Agent], given: Mapping[str, Any]) -> tuple[dict[str, Any
         elif key == "activation_fn" and value is not None:
             value = type(value) if is_torch(value) and not isinstance(value, type) else value
             shape[key] = {"LeakyReLU": "leaky_relu"}.get(getattr(value, "__name__", ""), value)
-        elif key == "log_std_init" and "sde_log_std_init" in known:
+        elif key == "log_std_init" and "sde_log_std_init" in names:
             others["sde_log_std_init"] = value
         elif key in fields:
             shape[key] = value
-        elif key in known:
+        elif key in names:
             others[key] = value
         elif key not in NEUTRAL:
             shape[key] = value  # an error that suggests a name
         elif value not in NEUTRAL[key]:
             unsupported(key, value)
-    normalizes = given.get("normalize_images", True)
-    settings = given.get("features_extractor_kwargs") or {}
-    shape |= encoder_of(given.get("features_extractor_class"), settings, normalizes)
-    optimizer = optimizer_of(given.get("optimizer_class"), given.get("optimizer_kwargs") or {})
+    normalizes = policy_kwargs.get("normalize_images", True)
+    settings = policy_kwargs.get("features_extractor_kwargs") or {}
+    shape |= encoder_of(policy_kwargs.get("features_extractor_class"), settings, normalizes)
+    optimizer = optimizer_of(policy_kwargs.get("optimizer_class"), policy_kwargs.get("optimizer_kwargs") or {})
     return {key: value for key, value in shape.items() if value is not None}, others | (
         {} if optimizer is None else {"optimizer": optimizer}
     )
 
 
-def unsupported(name: str, value: Any, what: str = "has no effect") -> None:
+def unsupported(name: str, value: Any, effect: str = "has no effect") -> None:
     """Warns that a setting of Stable-Baselines3 is not followed."""
-    warnings.warn(f"{name}={value!r} {what} in rejeu; see docs/coming-from-sb3.md", UserWarning, stacklevel=5)
+    warnings.warn(f"{name}={value!r} {effect} in rejeu; see docs/coming-from-sb3.md", UserWarning, stacklevel=5)
 
 
-def optimizer_of(kind: Any, settings: Mapping[str, Any]) -> Any:
+def optimizer_of(optimizer_class: Any, settings: Mapping[str, Any]) -> Any:
     """Returns the setting ``optimizer`` for a class of PyTorch's, its name, or one of Optax, and its arguments."""
-    known = OPTIMIZERS.get(kind if isinstance(kind, str) else getattr(kind, "__name__", ""))
-    if known is None and is_torch(kind):
+    label = optimizer_class if isinstance(optimizer_class, str) else getattr(optimizer_class, "__name__", "")
+    defaults = OPTIMIZERS.get(label)
+    if defaults is None and is_torch(optimizer_class):
         raise TypeError(
-            f"optimizer_class={getattr(kind, '__name__', kind)} is of PyTorch; use one of {', '.join(OPTIMIZERS)}, or give "
+            f"optimizer_class={label or optimizer_class} is of PyTorch; use one of {', '.join(OPTIMIZERS)}, or give "
             "the agent one of Optax: optimizer=optax.lamb"
         )
-    if known is None:
-        return kind if kind is not None else {"name": "adam", **settings} if settings else None
+    if defaults is None:
+        return optimizer_class if optimizer_class is not None else {"name": "adam", **settings} if settings else None
     renamed = {"alpha": "decay"}
-    given = {renamed.get(key, key): value for key, value in settings.items() if key not in ("lr", "betas", "centered")}
+    args = {renamed.get(key, key): value for key, value in settings.items() if key not in ("lr", "betas", "centered")}
     if "betas" in settings:
-        given["b1"], given["b2"] = settings["betas"]
-    if given.pop("amsgrad", False):
-        given["name"] = "amsgrad"
-    return {**known, **given} if len(known | given) > 1 else known["name"]
+        args["b1"], args["b2"] = settings["betas"]
+    if args.pop("amsgrad", False):
+        args["name"] = "amsgrad"
+    return {**defaults, **args} if len(defaults | args) > 1 else defaults["name"]
 
 
 def layers_of(net_arch: Any) -> Any:

@@ -37,9 +37,9 @@ def passes_on(path: str) -> None:
     sys.modules[path].__dict__["__getattr__"] = passed_on
 
 
-def n_shared(path: str, other: str) -> int:
+def n_shared(path: str, second: str) -> int:
     """Returns how many packages two modules have in common."""
-    pairs = zip(path.split("."), other.split("."), strict=False)
+    pairs = zip(path.split("."), second.split("."), strict=False)
     return len([*takewhile(lambda pair: pair[0] == pair[1], pairs)])
 
 

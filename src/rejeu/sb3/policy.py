@@ -101,8 +101,8 @@ class BaseModel:
 
     def state_dict(self) -> dict[str, Tensor]:
         """Returns a copy of the parameters as arrays by name."""
-        named = self.model.get_parameters()["policy"].items()
-        return {name: array for name, array in named if self.fields & {*name.split(".")}}
+        arrays = self.model.get_parameters()["policy"].items()
+        return {name: array for name, array in arrays if self.fields & {*name.split(".")}}
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True) -> None:
         """Sets parameters.
@@ -130,10 +130,10 @@ class BaseModel:
 
     def load_from_vector(self, vector: np.ndarray) -> None:
         """Sets the parameters from what :meth:`parameters_to_vector` returned."""
-        own = self.state_dict()
-        ends = np.cumsum([array.size for array in own.values()])[:-1]
-        parts = zip(own.items(), np.split(np.asarray(vector), ends), strict=True)
-        self.load_state_dict({name: part.reshape(array.shape).astype(array.dtype) for (name, array), part in parts})
+        current = self.state_dict()
+        ends = np.cumsum([array.size for array in current.values()])[:-1]
+        parts = zip(current.items(), np.split(np.asarray(vector), ends), strict=True)
+        self.load_state_dict({name: values.reshape(array.shape).astype(array.dtype) for (name, array), values in parts})
 
     def save(self, path: str | Path) -> None:
         """Writes the whole agent; :meth:`load` returns the view of it."""
@@ -163,7 +163,7 @@ class BaseModel:
         """Returns whether an observation is a batch; images may have their channels first or last."""
         if isinstance(self.observation_space, spaces.Dict):
             parts = self.observation_space.spaces.items()
-            observation = {key: maybe_transpose(np.asarray(observation[key]), part) for key, part in parts}
+            observation = {key: maybe_transpose(np.asarray(observation[key]), space) for key, space in parts}
         else:
             observation = maybe_transpose(np.asarray(observation), self.observation_space)
         return is_vectorized_observation(observation, self.observation_space)
@@ -240,7 +240,7 @@ class ContinuousCritic(BaseModel):
         """Returns the values of actions in [-1, 1] by each critic, ``(batch, 1)`` each."""
         scaled = rejeu_spaces.scale_action(self.action_space, np.asarray(actions))
         values = self.model.q_values(self._batch(obs), scaled, "all")
-        return tuple(Tensor.of(one[:, None]) for one in values)
+        return tuple(Tensor.of(value[:, None]) for value in values)
 
     forward = __call__
 
@@ -284,8 +284,8 @@ class BasePolicy(BaseModel):
         if name in NETWORKS and self.model is not None:
             has = {field for field in NETWORKS[name] if getattr(self.model.learner.shapes, field, None) is not None}
             if has:
-                kind = Actor if "actor" in name else ContinuousCritic if "critic" in name else QNetwork
-                return kind.of(self.model, frozenset(has))
+                module_class = Actor if "actor" in name else ContinuousCritic if "critic" in name else QNetwork
+                return module_class.of(self.model, frozenset(has))
         raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
 
     def scale_action(self, action: np.ndarray) -> np.ndarray:
@@ -367,8 +367,8 @@ class ActorCriticPolicy(BasePolicy):
     def get_distribution(self, obs: Any, action_masks: Any = None) -> Distribution:
         """Returns the distribution of actions, in the environment's range."""
         network = self.model.state.network
-        made = network.policy(jax.tree.map(jnp.asarray, self.model.with_masks(self._batch(obs), action_masks)))
-        return Distribution(made, half_widths(self.action_space))
+        distribution = network.policy(jax.tree.map(jnp.asarray, self.model.with_masks(self._batch(obs), action_masks)))
+        return Distribution(distribution, half_widths(self.action_space))
 
     def predict_values(self, obs: Any) -> np.ndarray:
         """Returns the values of observations, ``(batch, 1)``."""

@@ -44,8 +44,8 @@ class ActionMasker(gym.Wrapper):
 
     def __init__(self, env: gym.Env, action_mask_fn: str | Callable[[Any], Any]) -> None:
         super().__init__(env)
-        found: Any = env.get_wrapper_attr(action_mask_fn) if isinstance(action_mask_fn, str) else action_mask_fn
-        self._mask = partial(found, env) if inspect.signature(found).parameters else found
+        mask_function: Any = env.get_wrapper_attr(action_mask_fn) if isinstance(action_mask_fn, str) else action_mask_fn
+        self._mask = partial(mask_function, env) if inspect.signature(mask_function).parameters else mask_function
 
     def action_masks(self) -> np.ndarray:
         """Returns which actions are allowed, ``bool (n,)``."""
@@ -86,10 +86,10 @@ class TimeFeatureWrapper(gym.Wrapper):
         return (self._with_time(obs), *others)
 
     def _with_time(self, obs: Any) -> Any:
-        left = 1.0 if self._test_mode else 1.0 - self._step / self._max_steps
+        time_left = 1.0 if self._test_mode else 1.0 - self._step / self._max_steps
         if isinstance(obs, dict):
-            return {**obs, "observation": np.append(obs["observation"], left).astype(np.float32)}
-        return np.append(obs, left).astype(np.float32)
+            return {**obs, "observation": np.append(obs["observation"], time_left).astype(np.float32)}
+        return np.append(obs, time_left).astype(np.float32)
 
 
 class MaskableEvalCallback(EvalCallback):

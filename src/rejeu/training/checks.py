@@ -31,8 +31,8 @@ def checked_step(run: Run, action: np.ndarray, active: np.ndarray | None = None)
     return step
 
 
-def check_finite(run: Run, step: Step, taken: int) -> None:
-    """Checks the rewards and observations of a step after ``taken`` steps.
+def check_finite(run: Run, step: Step, n_steps: int) -> None:
+    """Checks the rewards and observations of a step after ``n_steps`` steps.
 
     Raises:
         BadEnvironmentError: if a reward or an observation is NaN or infinite: nothing can be learned from it.
@@ -40,8 +40,8 @@ def check_finite(run: Run, step: Step, taken: int) -> None:
         NonFiniteUpdate: if that action came from weights that an update left not finite.
     """
     if not is_finite(step.reward):
-        raise _reward_error(run, step.reward, taken)
-    check_obs(run, step.obs, taken, "returned")
+        raise _reward_error(run, step.reward, n_steps)
+    check_obs(run, step.obs, n_steps, "returned")
 
 
 def checked_restart(run: Run) -> PyTree:
@@ -62,11 +62,11 @@ def checked_reset(run: Run, done: np.ndarray) -> PyTree:
     return obs
 
 
-def check_obs(run: Run, obs: PyTree, taken: int, what: str) -> None:
+def check_obs(run: Run, obs: PyTree, n_steps: int, verb: str) -> None:
     """Raises ``BadEnvironmentError`` if an observation ``(n_envs, ...)`` is NaN or infinite; see :func:`check_finite`."""
     for i, array in enumerate(jax.tree.leaves(obs)):
         if not is_finite(array):
-            raise _observation_error(run, i, array, taken, what)
+            raise _observation_error(run, i, array, n_steps, verb)
 
 
 def check_bounds(run: Run, obs: PyTree) -> None:
@@ -86,36 +86,36 @@ def check_bounds(run: Run, obs: PyTree) -> None:
         )
 
 
-def _reward_error(run: Run, reward: np.ndarray, taken: int) -> Exception:
-    _check_action(run, taken)
-    which = int(np.flatnonzero(~np.isfinite(reward))[0])
+def _reward_error(run: Run, reward: np.ndarray, n_steps: int) -> Exception:
+    _check_action(run, n_steps)
+    index = int(np.flatnonzero(~np.isfinite(reward))[0])
     return BadEnvironmentError(
-        f"{run.env.env_id} returned the reward {reward[which]} in environment {which} after {taken} steps; rewards must be "
+        f"{run.env.env_id} returned the reward {reward[index]} in environment {index} after {n_steps} steps; rewards must be "
         "finite numbers: fix the environment, or wrap it with gymnasium.wrappers.TransformReward"
     )
 
 
-def _observation_error(run: Run, leaf: int, array: np.ndarray, taken: int, what: str) -> Exception:
-    _check_action(run, taken)
+def _observation_error(run: Run, leaf: int, array: np.ndarray, n_steps: int, verb: str) -> Exception:
+    _check_action(run, n_steps)
     where = tuple(np.argwhere(~np.isfinite(array))[0].tolist())
     path, at = leaves(run.env.observation_space)[leaf].path, ", ".join(map(str, where[1:]))
     return BadEnvironmentError(
-        f"{run.env.env_id}: {what} an observation with {array[where]}{f' at [{at}]' if at else ''}"
-        f"{f' of {path!r}' if path else ''} in environment {where[0]} after {taken} steps; observations must be finite "
+        f"{run.env.env_id}: {verb} an observation with {array[where]}{f' at [{at}]' if at else ''}"
+        f"{f' of {path!r}' if path else ''} in environment {where[0]} after {n_steps} steps; observations must be finite "
         "numbers: fix the environment, or wrap it with gymnasium.wrappers.TransformObservation and np.nan_to_num"
     )
 
 
-def _check_action(run: Run, taken: int) -> None:
+def _check_action(run: Run, n_steps: int) -> None:
     if run.action is not None and not is_finite(run.action):
         run.monitor.check(run.state)
-        which = int(np.argwhere(~np.isfinite(run.action))[0][0])
+        index = int(np.argwhere(~np.isfinite(run.action))[0][0])
         raise NonFiniteError(
-            f"the policy chose the action {run.action[which]} in environment {which} after {taken} steps, and "
+            f"the policy chose the action {run.action[index]} in environment {index} after {n_steps} steps, and "
             f"{run.env.env_id} answered with numbers that are not finite. The weights are finite, what they compute is not: "
             "they or the observations are too large; lower learning_rate, or set normalize=True",
             names=("action",),
-            step=taken,
+            step=n_steps,
             n_updates=run.n_updates,
         )
 

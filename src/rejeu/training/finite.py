@@ -200,11 +200,11 @@ def reported(agent: Any, broken: NonFiniteUpdate) -> NonFiniteError:
 def _what(names: list[str], in_a_row: int, cause: str = "") -> str:
     """Returns what happened: what is not finite, or its ``cause``."""
     more = len(names) - 3
-    what = f"{', '.join(names[:3]) or 'an update'}{f' and {more} more' * (more > 0)} became NaN or infinite"
-    what = cause or what
+    event = f"{', '.join(names[:3]) or 'an update'}{f' and {more} more' * (more > 0)} became NaN or infinite"
+    event = cause or event
     if in_a_row < MAX_SKIPPED:
-        return what
-    return f"{in_a_row} updates in a row were skipped, so nothing is learned any more; in the last of them {what}"
+        return event
+    return f"{in_a_row} updates in a row were skipped, so nothing is learned any more; in the last of them {event}"
 
 
 def _last_model(agent: Any) -> str:

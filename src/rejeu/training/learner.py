@@ -310,9 +310,9 @@ def readings(state: Iterable[Array], metrics: Metrics) -> Readings:
 
 def bad_leaves(tree: PyTree) -> list[str]:
     """Returns the dotted names of the leaves that hold NaN or infinity, each with the first such number."""
-    found = []
+    bad = []
     for name, leaf in zip(names(tree), jax.tree.leaves(tree), strict=True):
         array = np.asarray(leaf)
         if array.dtype.kind == "f" and not (ok := np.isfinite(array)).all():
-            found.append(f"{name} ({array[~ok].ravel()[0]})")
-    return found
+            bad.append(f"{name} ({array[~ok].ravel()[0]})")
+    return bad

@@ -75,12 +75,12 @@ def off_policy(
         clock = clock_of(run, done)
         n_updates = due(run, config, len(episodes))
         if config.overlap:
-            chosen = choose(run, learner, config, clock)
+            choice = choose(run, learner, config, clock)
         samples = sample(run, config, n_updates, done)
         update(run, learner, samples, clock)
         if not config.overlap:
-            chosen = choose(run, learner, config, clock)
-        read(run, chosen)
+            choice = choose(run, learner, config, clock)
+        read(run, choice)
         ended = n_updates > 0 or (run.step <= run.learn_from and reaches(run, config, len(episodes)))
         yield Progress(run.step, episodes, run.metrics, action, step, last_obs, ended)
 
@@ -167,10 +167,10 @@ def choose(run: Run, learner: Learner, config: OffPolicyConfig, clock: Clock) ->
 
 
 @timed("update")
-def read(run: Run, chosen: Choice) -> None:
+def read(run: Run, choice: Choice) -> None:
     """Waits for the actions, and checks the updates that were started before them."""
-    run.action = np.asarray(chosen[0])
-    run.monitor.read(chosen[1])
+    run.action = np.asarray(choice[0])
+    run.monitor.read(choice[1])
 
 
 @timed("update")
@@ -206,9 +206,9 @@ def due(run: Run, config: OffPolicyConfig, ended: int) -> int:
     """Returns the number of gradient steps of this turn, and counts the steps since the last update."""
     if run.step <= run.learn_from:
         return 0
-    taken = min(run.env.n_envs, run.step - run.learn_from)
-    run.steps_since_update += taken
-    new, every = (taken, config.train_freq) if isinstance(config.train_freq, int) else (ended, config.train_freq[0])
+    n_counted = min(run.env.n_envs, run.step - run.learn_from)
+    run.steps_since_update += n_counted
+    new, every = (n_counted, config.train_freq) if isinstance(config.train_freq, int) else (ended, config.train_freq[0])
     run.owed += new
     times, run.owed = divmod(run.owed, every)
     if not times or not run.replay.size():
@@ -235,6 +235,6 @@ def batch_shapes(n_updates: int, config: OffPolicyConfig, n_envs: int) -> list[t
     usual = 16
     if isinstance(config.train_freq, int) and config.gradient_steps > 0:
         usual = min(max(n_envs // config.train_freq, 1) * config.gradient_steps, 64)
-    one: tuple[int, ...] = (config.batch_size,)
-    several = one if usual == 1 else (usual, config.batch_size)
-    return [several] * (n_updates // usual) + [one] * (n_updates % usual)
+    single: tuple[int, ...] = (config.batch_size,)
+    several = single if usual == 1 else (usual, config.batch_size)
+    return [several] * (n_updates // usual) + [single] * (n_updates % usual)

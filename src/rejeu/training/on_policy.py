@@ -71,8 +71,8 @@ def on_policy(
 @timed("update")
 def act(run: Run, learner: Learner, clock: Clock) -> np.ndarray:
     """Returns the actions at the current observations, and puts these into the rollout."""
-    chosen, run.carry = learner.act(run.state, run.carry, run.obs, run.ended, run.key, clock)
-    action = np.asarray(chosen)
+    choice, run.carry = learner.act(run.state, run.carry, run.obs, run.ended, run.key, clock)
+    action = np.asarray(choice)
     run.monitor.check(run.state)  # before the rollout of the last update is overwritten
     run.replay.observe(run.obs)
     return action
@@ -136,9 +136,9 @@ def steps_to_take(run: Run, config: RolloutConfig, n_steps: int) -> int:
     if config.n_episodes is not None:
         return n_steps
     n_envs, turns_of_rollout = run.env.n_envs, run.replay.n_steps
-    taken = run.replay.length % turns_of_rollout
-    turns = -(-n_steps // n_envs) + taken
-    return (-(-turns // turns_of_rollout) * turns_of_rollout - taken) * n_envs
+    turns_before = run.replay.length % turns_of_rollout
+    turns = -(-n_steps // n_envs) + turns_before
+    return (-(-turns // turns_of_rollout) * turns_of_rollout - turns_before) * n_envs
 
 
 def end_long_episodes(run: Run, config: RolloutConfig) -> None:

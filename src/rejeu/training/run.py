@@ -241,7 +241,7 @@ def time_shares(seconds: Mapping[str, float]) -> dict[str, float]:
     {'env': 0.125, 'replay': 0.125, 'update': 0.625, 'rest': 0.125}
     """
     total = max(seconds["total"], 1e-9)
-    shares = {part: seconds[part] / total for part in PARTS}
+    shares = {activity: seconds[activity] / total for activity in PARTS}
     return shares | {"rest": 1.0 - sum(shares.values())}
 
 
@@ -343,10 +343,10 @@ def checked_limits(
     )
 
 
-def share(before: float, taken: Any, limit: float | None) -> Any:
-    """Returns the share of ``before + limit`` that is done after ``taken`` more; 0 without a limit.
+def share(before: float, n_done: Any, limit: float | None) -> Any:
+    """Returns the share of ``before + limit`` that is done after ``n_done`` more; 0 without a limit.
 
     >>> share(100, 0, 300), share(100, 300, 300), share(100, 50, None)
     (0.25, 1.0, 0.0)
     """
-    return 0.0 if limit is None else (before + taken) / (before + limit)
+    return 0.0 if limit is None else (before + n_done) / (before + limit)

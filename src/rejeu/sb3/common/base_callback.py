@@ -67,7 +67,7 @@ class BaseCallback(TrainingCallback):
         call = agent.training_call
         assert call is not None
         self.init_callback(agent)
-        known = {
+        attributes = {
             "self": agent,
             "env": agent.get_env(),
             "callback": self,
@@ -75,7 +75,7 @@ class BaseCallback(TrainingCallback):
             "log_interval": call.log_interval,
             "reset_num_timesteps": call.steps_before == 0,
         }
-        self.on_training_start(known, globals())
+        self.on_training_start(attributes, globals())
         self.on_rollout_start()
 
     def __call__(self, agent: Agent, progress: Progress) -> bool:
@@ -213,11 +213,11 @@ class ParentCallback(BaseCallback):
             ValueError: if the callbacks differ.
         """
         super().load_state_dict(state["self"])
-        own, saved = [type(child).__name__ for child in self._children()], [name for name, _ in state["inside"]]
-        if own != saved:
-            raise ValueError(f"the run was saved with the callbacks {', '.join(saved)}, but has {', '.join(own)}")
-        for child, (_, part) in zip(self._children(), state["inside"], strict=True):
-            child.load_state_dict(part)
+        types, saved = [type(child).__name__ for child in self._children()], [name for name, _ in state["inside"]]
+        if types != saved:
+            raise ValueError(f"the run was saved with the callbacks {', '.join(saved)}, but has {', '.join(types)}")
+        for child, (_, child_state) in zip(self._children(), state["inside"], strict=True):
+            child.load_state_dict(child_state)
 
 
 class EventCallback(ParentCallback):
@@ -309,7 +309,7 @@ def env_infos(agent: Agent, progress: Progress) -> list[dict[str, Any]]:
     ]
     for i in np.flatnonzero(result.terminated | result.truncated).tolist():
         if progress.last_obs is not None:
-            infos[i].setdefault(TERMINAL_OBSERVATION, jax.tree.map(lambda part, i=i: part[i], progress.last_obs))
+            infos[i].setdefault(TERMINAL_OBSERVATION, jax.tree.map(lambda leaf, i=i: leaf[i], progress.last_obs))
         if not np.isnan(success := env.success(result, i)):
             infos[i].setdefault("is_success", bool(success))
     for episode in progress.episodes:

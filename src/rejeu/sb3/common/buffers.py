@@ -45,7 +45,7 @@ KEY_TO_GOAL_STRATEGY = {strategy.value: strategy for strategy in GoalSelectionSt
 def by_leaf(function: Callable[..., Any], *observations: Any) -> Any:
     """Returns a function of arrays applied to observations, key by key where they are dicts."""
     if isinstance(observations[0], dict):
-        return {key: by_leaf(function, *(one[key] for one in observations)) for key in observations[0]}
+        return {key: by_leaf(function, *(observation[key] for observation in observations)) for key in observations[0]}
     return function(*observations)
 
 
@@ -211,12 +211,12 @@ class ReplayBuffer(BaseBuffer):
         rng = np.random.default_rng(np.random.randint(2**31))  # noqa: NPY002 - as scripts seed it
         batch = type(self.core).draw(self.core, rng, (batch_size,))[0]
         scaled = (lambda obs: obs) if env is None else env.normalize_obs
-        obs, following = (by_leaf(Tensor.of, scaled(unmasked(part)[0])) for part in (batch.obs, batch.next_obs))
+        obs, following = (by_leaf(Tensor.of, scaled(unmasked(tree)[0])) for tree in (batch.obs, batch.next_obs))
         reward = batch.reward if env is None else env.normalize_reward(batch.reward).astype(np.float32)
-        kind = DictReplayBufferSamples if isinstance(obs, dict) else ReplayBufferSamples
+        samples_class = DictReplayBufferSamples if isinstance(obs, dict) else ReplayBufferSamples
         column = lambda array: self.to_torch(array).reshape(-1, 1)  # noqa: E731
         actions = self.to_torch(batch.action).reshape(batch_size, -1)
-        samples = kind(obs, actions, following, column(np.float32(batch.discount == 0)), column(reward))
+        samples = samples_class(obs, actions, following, column(np.float32(batch.discount == 0)), column(reward))
         return samples._replace(discounts=column(batch.discount)) if self.agent.config.n_steps > 1 else samples
 
 
@@ -289,15 +289,15 @@ class RolloutBuffer(BaseBuffer):
         if not self.full:
             raise AssertionError(f"the rollout has {self.pos} of {self.buffer_size} steps")
         order = np.random.permutation(self.buffer_size * self.n_envs)  # noqa: NPY002
-        kind = DictRolloutBufferSamples if isinstance(self.observations, dict) else RolloutBufferSamples
+        samples_class = DictRolloutBufferSamples if isinstance(self.observations, dict) else RolloutBufferSamples
         for start in range(0, len(order), batch_size or len(order)):
-            which = order[start : start + (batch_size or len(order))]
+            indices = order[start : start + (batch_size or len(order))]
             parts = (self.observations, self.actions, self.values, self.log_probs, self.advantages, self.returns)
             flat = [
-                by_leaf(lambda leaf, which=which: self.to_torch(self.swap_and_flatten(leaf)[which]), part)
-                for part in parts
+                by_leaf(lambda leaf, indices=indices: self.to_torch(self.swap_and_flatten(leaf)[indices]), leaves)
+                for leaves in parts
             ]
-            yield kind(flat[0], flat[1].astype(np.float32), *(part.reshape(-1) for part in flat[2:]))
+            yield samples_class(flat[0], flat[1].astype(np.float32), *(leaves.reshape(-1) for leaves in flat[2:]))
 
     def __getattr__(self, name: str) -> Any:
         raise AttributeError(

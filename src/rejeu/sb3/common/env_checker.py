@@ -35,9 +35,9 @@ def check_env(env: gym.Env, warn: bool = True, skip_render_check: bool = True) -
     if actions is not None and not actions.is_bounded():
         faults = [f"the continuous actions {actions} must have finite bounds"]
     if not faults:
-        seen = env.reset()[0], env.step(env.action_space.sample())[0]
-        found = [validation.bounds_fault(env.observation_space, obs) for obs in seen]
-        faults = [one[1] for one in found if one is not None]
+        observations = env.reset()[0], env.step(env.action_space.sample())[0]
+        bounds_faults = [validation.bounds_fault(env.observation_space, obs) for obs in observations]
+        faults = [one[1] for one in bounds_faults if one is not None]
     if faults:
         raise AssertionError("\n".join(faults))
     if warn:

@@ -88,8 +88,8 @@ def make_atari_env(
     monitor_kwargs: Mapping[str, Any] | None = None,
 ) -> VecEnv:
     """Returns a vector environment of Atari games in ``AtariWrapper``s; see :func:`make_vec_env`."""
-    kinds = (vec_env_cls, vec_env_kwargs, monitor_kwargs, wrapper_kwargs)
-    return make_vec_env(env_id, n_envs, seed, start_index, monitor_dir, AtariWrapper, env_kwargs, *kinds)
+    unsupported = (vec_env_cls, vec_env_kwargs, monitor_kwargs, wrapper_kwargs)
+    return make_vec_env(env_id, n_envs, seed, start_index, monitor_dir, AtariWrapper, env_kwargs, *unsupported)
 
 
 def made(env_id: str | Callable[..., gym.Env], kwargs: Mapping[str, Any]) -> gym.Env:

@@ -71,8 +71,8 @@ def evaluate_policy(
         observations, dones, states = vector.reset(), np.ones(vector.n_envs, bool), None
         while (episode_counts < share).any():
             obs, masks = observations if isinstance(observations, Masked) else (observations, None)
-            given = {"state": states, "episode_start": dones, "deterministic": deterministic}
-            actions, states = model.predict(obs, **given if masks is None else given | {"action_masks": masks})
+            arguments = {"state": states, "episode_start": dones, "deterministic": deterministic}
+            actions, states = model.predict(obs, **arguments if masks is None else arguments | {"action_masks": masks})
             if (signal := interrupt.requested()) is not None:
                 raise interrupt.Stopped(signal)
             step = vector.step(actions)

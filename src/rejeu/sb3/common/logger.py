@@ -249,8 +249,8 @@ def _add(summary: Any, key: str, value: Any) -> None:
             (metadata.EXPERIMENT_TAG, {"experiment": api_pb2.Experiment(metric_infos=names)}),
             (metadata.SESSION_START_INFO_TAG, {"session_start_info": start}),
         ):
-            about = metadata.create_summary_metadata(plugin_data_pb2.HParamsPluginData(**content))
-            summary.value.add(tag=tag, metadata=about)
+            summary_metadata = metadata.create_summary_metadata(plugin_data_pb2.HParamsPluginData(**content))
+            summary.value.add(tag=tag, metadata=summary_metadata)
     elif isinstance(value, Figure):
         image = io.BytesIO()
         value.figure.savefig(image, format="png")
@@ -278,7 +278,7 @@ def _add_image(summary: Any, key: str, frames: Sequence[np.ndarray], fps: float 
     from PIL import Image as Pillow
 
     pixels = [frame if frame.dtype == np.uint8 else (frame * 255).clip(0, 255).astype(np.uint8) for frame in frames]
-    first, *others = [Pillow.fromarray(one[..., 0] if one.ndim == 3 and one.shape[-1] == 1 else one) for one in pixels]
+    first, *others = [Pillow.fromarray(x[..., 0] if x.ndim == 3 and x.shape[-1] == 1 else x) for x in pixels]
     image = io.BytesIO()
     if others:
         first.save(image, "gif", save_all=True, append_images=others, duration=1000 / fps, loop=0)
@@ -392,16 +392,16 @@ def make_output_format(_format: str, log_dir: str | Path, log_suffix: str = "") 
     """
     folder = Path(log_dir)
     folder.mkdir(parents=True, exist_ok=True)
-    kinds: dict[str, Callable[[], KVWriter]] = {
+    formats: dict[str, Callable[[], KVWriter]] = {
         "stdout": lambda: HumanOutputFormat(sys.stdout),
         "log": lambda: HumanOutputFormat(folder / f"log{log_suffix}.txt"),
         "json": lambda: JSONOutputFormat(folder / f"progress{log_suffix}.json"),
         "csv": lambda: CSVOutputFormat(folder / f"progress{log_suffix}.csv"),
         "tensorboard": lambda: TensorBoardOutputFormat(folder),
     }
-    if _format not in kinds:
+    if _format not in formats:
         raise ValueError(f"Unknown format specified: {_format}")
-    return kinds[_format]()
+    return formats[_format]()
 
 
 def configure(folder: str | Path | None = None, format_strings: Sequence[str] | None = None) -> Logger:
@@ -417,11 +417,11 @@ def configure(folder: str | Path | None = None, format_strings: Sequence[str] | 
     """
     name = time.strftime("SB3-%Y-%m-%d-%H-%M-%S")
     folder = folder or os.getenv("SB3_LOGDIR") or str(Path(tempfile.gettempdir()) / name)
-    kinds = format_strings or os.getenv("SB3_LOG_FORMAT", "stdout,log,csv").split(",")
-    trackers = [kind for kind in kinds if kind in LOGS and kind not in ("csv", "json", "tensorboard")]
-    formats = [make_output_format(kind, folder) for kind in kinds if kind and kind not in trackers]
+    names = format_strings or os.getenv("SB3_LOG_FORMAT", "stdout,log,csv").split(",")
+    trackers = [log_name for log_name in names if log_name in LOGS and log_name not in ("csv", "json", "tensorboard")]
+    formats = [make_output_format(log_name, folder) for log_name in names if log_name and log_name not in trackers]
     logger = Logger(str(folder), formats)
-    logger.outputs += [open_log(kind, Path(folder)) for kind in trackers]
+    logger.outputs += [open_log(log_name, Path(folder)) for log_name in trackers]
     return logger
 
 

@@ -270,9 +270,9 @@ def load_results(path: str | Path) -> np.recarray:
 
 def _column(values: list[Any]) -> np.ndarray:
     """Returns values as integers if possible, else as floats, else as strings."""
-    for kind in (np.int64, np.float64):
+    for dtype in (np.int64, np.float64):
         try:
-            return np.array(values, dtype=kind)
+            return np.array(values, dtype=dtype)
         except ValueError:
             continue
     return np.array(values, dtype=str)

@@ -57,7 +57,7 @@ def maybe_transpose(observation: np.ndarray, observation_space: spaces.Space) ->
     if observation.shape[-3:] == shape or observation.ndim < 3 or not is_image_space(observation_space):
         return observation
     moved = (np.moveaxis(observation, source, target) for source, target in ((-1, -3), (-3, -1)))
-    return next((one for one in moved if one.shape[-3:] == shape), observation)
+    return next((candidate for candidate in moved if candidate.shape[-3:] == shape), observation)
 
 
 def preprocess_obs(obs: Any, observation_space: spaces.Space, normalize_images: bool = True) -> Any:
@@ -68,7 +68,7 @@ def preprocess_obs(obs: Any, observation_space: spaces.Space, normalize_images: 
     """
     if isinstance(observation_space, spaces.Dict):
         inner = observation_space.spaces.items()
-        return {key: preprocess_obs(obs[key], part, normalize_images) for key, part in inner}
+        return {key: preprocess_obs(obs[key], space, normalize_images) for key, space in inner}
     values = jnp.asarray(obs if isinstance(obs, jax.Array) else np.asarray(obs))
     if isinstance(observation_space, spaces.Box):
         scale = 255.0 if normalize_images and is_image_space(observation_space) else 1.0
@@ -87,7 +87,7 @@ def preprocess_obs(obs: Any, observation_space: spaces.Space, normalize_images: 
 def get_obs_shape(observation_space: spaces.Space) -> Any:
     """Returns the shape of an observation: ``(1,)`` for Discrete, a dict of shapes for Dict."""
     if isinstance(observation_space, spaces.Dict):
-        return {key: get_obs_shape(part) for key, part in observation_space.spaces.items()}
+        return {key: get_obs_shape(space) for key, space in observation_space.spaces.items()}
     if isinstance(observation_space, spaces.Discrete):
         return (1,)
     if isinstance(observation_space, spaces.MultiDiscrete):
@@ -115,5 +115,5 @@ def check_for_nested_spaces(obs_space: spaces.Space) -> None:
     """Raises ``NotImplementedError`` for a Dict or Tuple inside a Dict or Tuple. Agents of rejeu take any nesting."""
     if isinstance(obs_space, spaces.Dict | spaces.Tuple):
         parts = obs_space.spaces.values() if isinstance(obs_space, spaces.Dict) else obs_space.spaces
-        if any(isinstance(part, spaces.Dict | spaces.Tuple) for part in parts):
+        if any(isinstance(space, spaces.Dict | spaces.Tuple) for space in parts):
             raise NotImplementedError(f"Nested observation spaces are not supported: {obs_space}")

@@ -127,8 +127,8 @@ def get_actor_critic_arch(net_arch: Any) -> tuple[list[int], list[int]]:
 
 def is_torch(value: Any) -> bool:
     """Returns whether something is a class or an object of PyTorch, which need not be installed."""
-    kind = value if isinstance(value, type) else type(value)
-    return any(base.__module__.partition(".")[0] == "torch" for base in kind.__mro__)
+    value_class = value if isinstance(value, type) else type(value)
+    return any(base.__module__.partition(".")[0] == "torch" for base in value_class.__mro__)
 
 
 class Prepared(eqx.Module):
@@ -177,15 +177,15 @@ def encoder_of(extractor: Any, settings: Mapping[str, Any], normalize_images: bo
     Raises:
         TypeError: for a class that is no ``equinox.Module``, such as one of PyTorch.
     """
-    known = {
+    encoders = {
         None: ("features_dim", "cnn_output_dim"),
         NatureCNN: ("features_dim",),
         CombinedExtractor: ("cnn_output_dim",),
     }
     if isinstance(extractor, str):
         return {"encoder": extractor}
-    if extractor in known:
-        widths = [settings[key] for key in known[extractor] if key in settings]
+    if extractor in encoders:
+        widths = [settings[key] for key in encoders[extractor] if key in settings]
         return {"cnn_features": widths[0]} if widths else {}
     if not (isinstance(extractor, type) and issubclass(extractor, eqx.Module)):
         raise TypeError(
@@ -223,8 +223,8 @@ def register_again(name: Any) -> None:
         return
     title, _, text = name.removeprefix(PREFIX).partition(" ")
     settings, normalize_images = convert(parse_json(text), tuple[dict[str, Any], bool])
-    each = [one for value in settings.values() for one in (value if isinstance(value, list) else [value])]
-    if not all(one is None or are_plain({"value": one}) for one in each):
+    each = [item for value in settings.values() for item in (value if isinstance(value, list) else [value])]
+    if not all(item is None or are_plain({"value": item}) for item in each):
         return  # a file may ask the user's class for no path and no size without end
     for extractor in subclasses(BaseFeaturesExtractor):
         if extractor.__name__ == title:

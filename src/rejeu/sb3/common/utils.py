@@ -238,10 +238,10 @@ def explained_variance(y_pred: np.ndarray, y_true: np.ndarray) -> float:
 def get_latest_run_id(log_path: str | Path = "", log_name: str = "") -> int:
     """Returns the highest k of the folders ``{log_name}_{k}`` in ``log_path``, 0 if there is none."""
     name = re.compile(re.escape(log_name) + r"_(\d+)")
-    found = (
+    run_ids = (
         name.fullmatch(os.path.basename(path)) for path in glob.glob(os.path.join(glob.escape(str(log_path)), "*"))
     )
-    return max((int(match[1]) for match in found if match), default=0)
+    return max((int(match[1]) for match in run_ids if match), default=0)
 
 
 def configure_logger(
@@ -250,11 +250,11 @@ def configure_logger(
     """Returns the logger of an agent with these arguments; a run that continues keeps its folder."""
     from rejeu.sb3.common import logger as loggers  # which needs what callbacks do
 
-    folder, kinds = os.getenv("SB3_LOGDIR"), ["stdout"] * (verbose >= 1)
+    folder, names = os.getenv("SB3_LOGDIR"), ["stdout"] * (verbose >= 1)
     if tensorboard_log is not None:
         k = get_latest_run_id(tensorboard_log, tb_log_name) + reset_num_timesteps
-        folder, kinds = str(Path(tensorboard_log) / f"{tb_log_name}_{k}"), [*kinds, "tensorboard"]
-    return loggers.Logger(folder, [loggers.make_output_format(kind, folder or ".") for kind in kinds])
+        folder, names = str(Path(tensorboard_log) / f"{tb_log_name}_{k}"), [*names, "tensorboard"]
+    return loggers.Logger(folder, [loggers.make_output_format(name, folder or ".") for name in names])
 
 
 def update_learning_rate(optimizer: Any, learning_rate: float) -> None:
@@ -277,7 +277,7 @@ def is_vectorized_observation(observation: Any, observation_space: gym.Space) ->
         ValueError: if it is neither a batch nor a single one, or some parts of a Dict are batches and others not.
     """
     if isinstance(observation_space, spaces.Dict):
-        parts = [is_vectorized_observation(observation[key], part) for key, part in observation_space.spaces.items()]
+        parts = [is_vectorized_observation(observation[key], space) for key, space in observation_space.spaces.items()]
         if len(set(parts)) > 1:
             raise ValueError(f"some parts of the observation are batches and others are not: {observation_space}")
         return parts[0]
@@ -314,12 +314,12 @@ def polyak_update(params: Iterable[np.ndarray], target_params: Iterable[np.ndarr
 
 def get_parameters_by_name(model: Any, included_names: Iterable[str]) -> list[Any]:
     """Returns the parameters of a policy, or of a part of one, whose names contain one of these."""
-    return [value for name, value in model.state_dict().items() if any(part in name for part in included_names)]
+    return [value for name, value in model.state_dict().items() if any(pattern in name for pattern in included_names)]
 
 
 def obs_as_tensor(obs: Any, device: Any = "auto") -> Any:
     """Returns observations as arrays, which is what stands for tensors here."""
-    return {key: Tensor.of(part) for key, part in obs.items()} if isinstance(obs, Mapping) else Tensor.of(obs)
+    return {key: Tensor.of(leaf) for key, leaf in obs.items()} if isinstance(obs, Mapping) else Tensor.of(obs)
 
 
 def should_collect_more_steps(train_freq: Any, num_collected_steps: int, num_collected_episodes: int) -> bool:

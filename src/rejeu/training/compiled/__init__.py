@@ -79,8 +79,8 @@ def train(
         NonFiniteSteps: if an update leaves numbers that are not finite. The run has the state before that chunk.
         ValueError: if the steps are too many to be counted with 32 bits.
     """
-    kind: Any = OnPolicyProgram if isinstance(config, RolloutConfig) else OffPolicyProgram
-    program = kind.of(
+    program_class: Any = OnPolicyProgram if isinstance(config, RolloutConfig) else OffPolicyProgram
+    program = program_class.of(
         runs[0],
         config,
         algorithm=learner.algorithm,
@@ -120,13 +120,13 @@ def take_chunks(
     for run in runs:
         start_clock(run)
     pace = Pace(capacity)
-    known, trained = list[Any](), list[int]()
+    identical, trained = list[Any](), list[int]()
     while active and (last is None or runs[active[0]].step < last):
         leader, began = runs[active[0]], time.perf_counter()
         for run in runs:
             if run.obs is None or run.env.must_reset:
                 trainer.program.begin_episodes(run)
-        if trained != [*active] or any(now is not then for now, then in zip(held(runs), known, strict=True)):
+        if trained != [*active] or any(now is not then for now, then in zip(held(runs), identical, strict=True)):
             trained = [*active]
             trainer.push(float(progress(leader.step - first)), active[0])
         for run in runs:
@@ -152,16 +152,16 @@ def take_chunks(
         pace.note(n_turns, clock() - paced)
         if step <= leader.learn_from <= leader.step:
             pace.turns = min(8, pace.turns)
-        known = held(runs)
+        identical = held(runs)
         yield turns
 
 
-def raise_fault(trainer: DeviceTrainer, which: int, first_step: int, before: tuple[Any, int]) -> NoReturn:
+def raise_fault(trainer: DeviceTrainer, run_number: int, first_step: int, before: tuple[Any, int]) -> NoReturn:
     """Raises the error of a run in a chunk after ``first_step``, before which its state and updates were ``before``.
 
     Its experience holds what is finite; a rollout is dropped.
     """
-    run, report, after = trainer.runs[which], trainer.reports[which], trainer.carries[which].state
+    run, report, after = trainer.runs[run_number], trainer.reports[run_number], trainer.carries[run_number].state
     run.state, run.n_updates = before
     if isinstance(trainer.program, OnPolicyProgram):
         run.replay.length = 0
@@ -173,13 +173,13 @@ def raise_fault(trainer: DeviceTrainer, which: int, first_step: int, before: tup
         )
     metrics = {name: value for name, value in report.metrics.items() if not trainer.program.skips}
     names = [*bad_leaves(checked(metrics)), *(f"{leaf} of the state" for leaf in trainer.learner.bad_leaves(after))]
-    in_a_row = int(trainer.carries[which].in_a_row) if trainer.program.skips else 0
-    raise NonFiniteSteps(which, range(first_step + 1, run.step + 1), names, in_a_row)
+    in_a_row = int(trainer.carries[run_number].in_a_row) if trainer.program.skips else 0
+    raise NonFiniteSteps(run_number, range(first_step + 1, run.step + 1), names, in_a_row)
 
 
 def held(runs: Sequence[Run]) -> list[Any]:
     """Returns the objects of the runs that others may replace between chunks."""
-    return [one for run in runs for one in (run.state, run.obs, run.action, run.buffer, run.env)]
+    return [content for run in runs for content in (run.state, run.obs, run.action, run.buffer, run.env)]
 
 
 def turns_left(step: int, n_envs: int, last: int | None, stops: Stops) -> int:
@@ -193,9 +193,9 @@ def turns_left(step: int, n_envs: int, last: int | None, stops: Stops) -> int:
     return -(-(nearest - step) // n_envs)
 
 
-def schedule(progress: Callable[[Any], Any], taken: int, n_turns: int, n_envs: int, capacity: int) -> np.ndarray:
+def schedule(progress: Callable[[Any], Any], first_step: int, n_turns: int, n_envs: int, capacity: int) -> np.ndarray:
     """Returns the progress after 0 to ``n_turns`` turns, ``float32 (capacity + 1,)``, padded."""
-    steps = taken + n_envs * np.arange(n_turns + 1)
+    steps = first_step + n_envs * np.arange(n_turns + 1)
     values = np.broadcast_to(np.asarray(progress(steps), np.float32), steps.shape)
     return np.pad(values, (0, capacity - n_turns), mode="edge")
 

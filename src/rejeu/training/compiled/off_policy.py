@@ -76,8 +76,8 @@ class OffPolicyProgram(Program):
         return self.draw(env, experience, key, clock.progress)[0]
 
     def turns(self, env: FunctionalEnv, loop: Loop, limits: Limits, may_go_on: Callable[[Array, Loop], Array]) -> Loop:
-        one = lambda loop: (loop[0] + 1, take_turn(self, env, loop[1], limits, loop[0]))  # noqa: E731
-        return jax.lax.while_loop(lambda loop: may_go_on(*loop), one, (jnp.int32(0), loop))[1]
+        next_turn = lambda loop: (loop[0] + 1, take_turn(self, env, loop[1], limits, loop[0]))  # noqa: E731
+        return jax.lax.while_loop(lambda loop: may_go_on(*loop), next_turn, (jnp.int32(0), loop))[1]
 
     def choose(self, env: FunctionalEnv, carry: Carry, state: PyTree, clock: Clock) -> Carry:
         """Returns the carry with the actions of the next turn; see :func:`rejeu.training.off_policy.choose`."""
@@ -145,7 +145,7 @@ class OffPolicyProgram(Program):
         run.td_errors = [
             (Draw(position.astype(np.int64), time.astype(np.int64), ring.version), jnp.array(td_error))
             for position, time, td_error in zip(
-                *(np.asarray(part)[: int(counts.pending)] for part in priorities.pending), strict=True
+                *(np.asarray(pending)[: int(counts.pending)] for pending in priorities.pending), strict=True
             )
         ]
 

@@ -82,10 +82,10 @@ class OnPolicyProgram(Program):
         buffer.length = n
         buffer.started, buffer.carry = np.array(experience.started), jax.tree.map(jnp.array, experience.carry)
         if n:
-            own, found = (
-                jax.tree.leaves(one._replace(started=None, carry=None)) for one in (buffer.rollout(), experience)
+            stores, downloaded = (
+                jax.tree.leaves(data._replace(started=None, carry=None)) for data in (buffer.rollout(), experience)
             )
-            for host, device in zip(own, found, strict=True):
+            for host, device in zip(stores, downloaded, strict=True):
                 host[:n] = np.asarray(device)[:n]
 
     def pull_counts(self, run: Run, carry: Carry) -> None:

@@ -253,8 +253,8 @@ class Program(ABC):
             clock = Clock(jnp.uint32(0), jnp.uint32(0), jnp.float32(0))
             return self.algorithm.update(state, self.batch(env, carry, experience, clock, 0), clock)
 
-        _, found = jax.eval_shape(update, state, carry, experience)
-        metrics = {name: jnp.float32(0) for name in found if name != TD_ERROR}
+        _, shapes = jax.eval_shape(update, state, carry, experience)
+        metrics = {name: jnp.float32(0) for name in shapes if name != TD_ERROR}
         return Learned(state, metrics, jnp.int32(0), jnp.int32(0), carry.in_a_row)
 
     def learn(self, learned: Learned, batch: Transition | Rollout, clock: Clock) -> tuple[Learned, Array | None]:
@@ -262,19 +262,19 @@ class Program(ABC):
 
         With ``skips``, an update that leaves NaN is undone, and its TD errors are NaN.
         """
-        after, found = self.algorithm.update(learned.state, batch, clock)
-        td_error = td_error_of(found, batch)
-        found = {name: jnp.mean(jnp.asarray(value, jnp.float32)) for name, value in found.items() if name != TD_ERROR}
-        n = found[GRADIENT_STEPS].astype(jnp.int32) if GRADIENT_STEPS in found else 1
+        after, stats = self.algorithm.update(learned.state, batch, clock)
+        td_error = td_error_of(stats, batch)
+        stats = {name: jnp.mean(jnp.asarray(value, jnp.float32)) for name, value in stats.items() if name != TD_ERROR}
+        n = stats[GRADIENT_STEPS].astype(jnp.int32) if GRADIENT_STEPS in stats else 1
         if self.skips:
-            after, found = undo(learned.state, after, found)
-            is_bad = ~found.pop(FINITE)
+            after, stats = undo(learned.state, after, stats)
+            is_bad = ~stats.pop(FINITE)
             td_error = None if td_error is None else jnp.where(is_bad, jnp.nan, td_error)
         else:
-            is_bad = ~check((), found)
+            is_bad = ~check((), stats)
         is_over = learned.in_a_row >= MAX_SKIPPED  # the turns after it, in the same chunk, do not count
         in_a_row = jnp.where(is_bad | is_over, learned.in_a_row + ~is_over, 0)
-        return Learned(after, found, learned.n_updates + n, learned.n_bad + is_bad, in_a_row), td_error
+        return Learned(after, stats, learned.n_updates + n, learned.n_bad + is_bad, in_a_row), td_error
 
 
 def capacity_of(n_envs: int) -> int:
@@ -285,9 +285,9 @@ def capacity_of(n_envs: int) -> int:
 def changed(config: Any, hyper: dict[str, Array]) -> Any:
     """Returns a configuration with traced numbers, whose checks are left out, since they need the values."""
     copied = copy.copy(config)
-    kinds = {field.name: str(field.type) for field in dataclasses.fields(config)}
+    type_names = {field.name: str(field.type) for field in dataclasses.fields(config)}
     for name, value in hyper.items():
-        is_schedule = "Schedule" in kinds[name]
+        is_schedule = "Schedule" in type_names[name]
         object.__setattr__(copied, name, (lambda progress, value=value: value) if is_schedule else value)
     return copied
 
@@ -325,8 +325,8 @@ def step_envs(program: Program, env: FunctionalEnv, loop: Loop, action: Array, t
     """
     before = loop.carry.episodes
     assert before.env is not None
-    taken = spaces.scale_action(env.action_space, action, jnp)
-    vstate, obs, reward, terminated, truncated, success = step_all(env, before.env, taken)
+    scaled_action = spaces.scale_action(env.action_space, action, jnp)
+    vstate, obs, reward, terminated, truncated, success = step_all(env, before.env, scaled_action)
     obs, reward = observed(env, obs), reward.astype(jnp.float32)
     episode_return, length = before.episode_return + reward, before.length + 1
     ended = terminated | truncated
@@ -364,7 +364,7 @@ def random_action(space: gym.Space, n: int, key: Array, mask: Array | None = Non
     if isinstance(space, gym.spaces.Dict | gym.spaces.Tuple):
         keys = [jax.random.fold_in(key, i) for i in range(len(space.spaces))]
         pairs = zip(spaces.members(space), keys, strict=True)
-        parts = [random_action(part, n, own).reshape(n, -1).astype(jnp.float32) for part, own in pairs]
+        parts = [random_action(member, n, part_key).reshape(n, -1).astype(jnp.float32) for member, part_key in pairs]
         return jnp.concatenate(parts, axis=-1)
     return jnp.asarray(spaces.random_action(space, n, KeyGenerator(key), mask))
 

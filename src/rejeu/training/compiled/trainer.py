@@ -57,9 +57,9 @@ class DeviceTrainer:
         self.reports: list[ChunkReport] = []
         """Of the last chunk by run, on the host."""
 
-    def carry_of(self, which: int, progress: float) -> Carry:
+    def carry_of(self, run_number: int, progress: float) -> Carry:
         """Returns the carry of a run, which may choose its first actions."""
-        run = self.runs[which]
+        run = self.runs[run_number]
         carry = Carry(
             state=run.state,
             key=jnp.asarray(run.key),
@@ -68,7 +68,7 @@ class DeviceTrainer:
             episodes=episodes_of(run),
             counts=self.program.counts_of(run),
             in_a_row=jnp.int32(0),
-            hyper={name: jnp.float32(value) for name, value in self.hyper[which].items()},
+            hyper={name: jnp.float32(value) for name, value in self.hyper[run_number].items()},
         )
         if carry.action is not None and run.action is None:
             run.action = np.array(self.compiled(first_action)(carry, np.float32(progress)))
@@ -108,7 +108,7 @@ class DeviceTrainer:
             self.carries = [carry._replace(episodes=episodes, action=small[1], counts=counts, in_a_row=small[2])]
         else:
             views = unstacked(jax.device_get(carry._replace(counts=None)), n)
-            self.carries = [one._replace(counts=counts) for one in views]
+            self.carries = [view._replace(counts=counts) for view in views]
 
     def pull(self, active: Iterable[int]) -> list[Progress | None]:
         """Puts what the chunk did into the runs ``active``, and returns it by run; experience follows when it is read."""
@@ -117,8 +117,8 @@ class DeviceTrainer:
             pulled[i] = self._pull(i)
         return pulled
 
-    def _pull(self, which: int) -> Progress:
-        run, carry, report = self.runs[which], self.carries[which], self.reports[which]
+    def _pull(self, run_number: int) -> Progress:
+        run, carry, report = self.runs[run_number], self.carries[run_number], self.reports[run_number]
         first_step, run.step = run.step, int(carry.counts.step)
         run.state, run.carry = carry.state, carry.explorer
         put_episodes(run, carry.episodes)
@@ -128,22 +128,22 @@ class DeviceTrainer:
             values = [*report.metrics.values(), report.n_bad]
             run.metrics = Readings(tuple(report.metrics), np.array(values, np.float32))  # type: ignore[arg-type]
         self.program.pull_counts(run, carry)
-        run.fetch = partial(self._fetch, which)
+        run.fetch = partial(self._fetch, run_number)
         if run.step >= run.next_look:
             check_bounds(run, run.obs)
         episodes = episodes_in(run, report.log, first_step)
         return Progress(run.step, episodes, run.metrics, rollout_ended=bool(report.n_updates))
 
-    def fault(self, which: int) -> bool:
+    def fault(self, run_number: int) -> bool:
         """Returns whether the last chunk left something that is not finite in a run."""
-        report = self.reports[which]
-        stops = report.n_bad > 0 and (not self.program.skips or self.carries[which].in_a_row >= MAX_SKIPPED)
+        report = self.reports[run_number]
+        stops = report.n_bad > 0 and (not self.program.skips or self.carries[run_number].in_a_row >= MAX_SKIPPED)
         return bool(report.nonfinite_env or not report.is_finite or stops)
 
-    def _fetch(self, which: int) -> None:
+    def _fetch(self, run_number: int) -> None:
         """Copies the experience of a run to its buffer on the host."""
-        experience = self.experience if len(self.runs) == 1 else of_run(self.experience, which)
-        self.program.download(self.runs[which], experience, copies(self.carry.counts))
+        experience = self.experience if len(self.runs) == 1 else of_run(self.experience, run_number)
+        self.program.download(self.runs[run_number], experience, copies(self.carry.counts))
 
     def close(self, active: Iterable[int]) -> None:
         """Copies what is on the device to the runs, also a chunk during which training was interrupted."""
@@ -164,11 +164,11 @@ def take_chunk(
     program: Program, env: FunctionalEnv, carry: Any, limits: Limits, experience: Any
 ) -> tuple[Any, Any, ChunkReport]:
     """Returns carry, experience and report after a chunk, of several runs if there is an axis of them."""
-    one = lambda carry, limits, experience: program.chunk(env, carry, experience, limits)  # noqa: E731
+    take = lambda carry, limits, experience: program.chunk(env, carry, experience, limits)  # noqa: E731
     if np.ndim(carry.in_a_row) == 0:
-        return one(carry, limits, experience)
+        return take(carry, limits, experience)
     axes = axes_of(carry), None, axes_of(experience)
-    return jax.vmap(for_runs(one, len(carry.in_a_row)), axes, (axes[0], axes[2], 0))(carry, limits, experience)
+    return jax.vmap(for_runs(take, len(carry.in_a_row)), axes, (axes[0], axes[2], 0))(carry, limits, experience)
 
 
 def first_action(program: Program, env: FunctionalEnv, carry: Carry, progress: Any) -> jax.Array | None:
@@ -183,9 +183,9 @@ def axes_of(tree: Any) -> Any:
     return type(tree)(**{name: None if name in SHARED else 0 for name in tree._fields})
 
 
-def of_run(tree: Any, which: int) -> Any:
+def of_run(tree: Any, i: int) -> Any:
     """Returns the experience of one of several runs."""
-    parts = {name: jax.tree.map(lambda leaf: leaf[which], getattr(tree, name)) for name in {*tree._fields} - {*SHARED}}
+    parts = {name: jax.tree.map(lambda leaf: leaf[i], getattr(tree, name)) for name in {*tree._fields} - {*SHARED}}
     return tree._replace(**parts)
 
 
@@ -239,7 +239,7 @@ def episodes_in(run: Run, log: EpisodeLog, first_step: int) -> list[Episode]:
     """
     threshold = run.env.reward_threshold if run.success_threshold is None else run.success_threshold
     episodes = []
-    for turn, env in zip(*(found.tolist() for found in np.nonzero(log.length)), strict=True):
+    for turn, env in zip(*(indices.tolist() for indices in np.nonzero(log.length)), strict=True):
         value = float(log.episode_return[turn, env])
         success = success_by(float(log.success[turn, env]), value, threshold)
         step = first_step + (turn + 1) * run.env.n_envs

@@ -123,10 +123,10 @@ class VecEnvAdapter(VectorEnv):
 
     def _step_all(self, action: np.ndarray) -> Step:
         self.n_steps += 1
-        answer = self.venv.step(action)
-        if not isinstance(answer, tuple) or len(answer) != 4:
-            raise self._bad(f"step returned {validation.describe_value(answer)}, expected (obs, rewards, dones, infos)")
-        returned, reward, dones, infos = answer
+        result = self.venv.step(action)
+        if not isinstance(result, tuple) or len(result) != 4:
+            raise self._bad(f"step returned {validation.describe_value(result)}, expected (obs, rewards, dones, infos)")
+        returned, reward, dones, infos = result
         try:
             done = validation.to_vector("dones", dones, self.n_envs, bool)
             reward = validation.to_vector("rewards", reward, self.n_envs, np.float32)
@@ -155,14 +155,14 @@ class VecEnvAdapter(VectorEnv):
                 f"{TERMINAL_OBSERVATION!r}; step_wait must store the last observation there before it resets the environment"
             )
         last = jax.tree.leaves(plain(self.observation_space, info[TERMINAL_OBSERVATION]))
-        for store, part in zip(jax.tree.leaves(obs), last, strict=True):
-            if np.shape(part) != store.shape[1:]:
+        for store, leaf in zip(jax.tree.leaves(obs), last, strict=True):
+            if np.shape(leaf) != store.shape[1:]:
                 raise BadEnvironmentError(
-                    f"infos[{i}][{TERMINAL_OBSERVATION!r}] has the shape {np.shape(part)}, but observations have "
+                    f"infos[{i}][{TERMINAL_OBSERVATION!r}] has the shape {np.shape(leaf)}, but observations have "
                     f"{store.shape[1:]}; a wrapper that changes observations must also change it (outermost wrapper: "
                     f"{type(self.venv).__name__})"
                 )
-            store[i] = part
+            store[i] = leaf
 
     def _step_some(self, action: np.ndarray, active: np.ndarray) -> Step:
         step = step_whole(self._step_all, self._obs, action, active)
@@ -181,7 +181,6 @@ class VecEnvAdapter(VectorEnv):
                 f"{type(self.venv).__name__} resets by itself and was stepped while some environments were inactive, so "
                 "single environments cannot be reset; use rejeu.make_vector, or leave out n_episodes"
             )
-        self._desynced = self._desynced & ~done
         return self._obs
 
     def infos(self, begun: bool = False) -> list[dict[str, Any]]:
@@ -239,10 +238,10 @@ class VecEnvAdapter(VectorEnv):
 def _first_attr(venv: VecEnv, name: str) -> Any:
     """Returns an attribute of the first environment, or None."""
     try:
-        found = venv.get_attr(name, [0])
+        attributes = venv.get_attr(name, [0])
     except (AttributeError, NotImplementedError):
         return None
-    return found[0] if found else None
+    return attributes[0] if attributes else None
 
 
 class AutoResetView(SingleEnvs):

@@ -175,7 +175,7 @@ class VecEnv(ABC):
                 stacklevel=2,
             )
             return None
-        image = tile_images([one for one in self.get_images() if one is not None])
+        image = tile_images([image_of_env for image_of_env in self.get_images() if image_of_env is not None])
         if mode == "rgb_array":
             return image
         show(image)
@@ -205,8 +205,8 @@ class VecEnv(ABC):
 
     def _get_indices(self, indices: VecEnvIndices) -> list[int]:
         is_index = isinstance(indices, int | np.integer)
-        chosen: Any = range(self.num_envs) if indices is None else [indices] if is_index else indices
-        return [range(self.num_envs)[i] for i in chosen]
+        indices_chosen: Any = range(self.num_envs) if indices is None else [indices] if is_index else indices
+        return [range(self.num_envs)[i] for i in indices_chosen]
 
 
 class SingleEnvs(VecEnv):

@@ -43,15 +43,15 @@ class StackedObservations:
         if isinstance(channels_order, Mapping) and not is_dict:
             raise TypeError(f"channels_order={channels_order!r} must be one value for observations {observation_space}")
         stacked: dict[str, Any] = {}
-        for key, part in parts.items():
-            if not isinstance(part, spaces.Box):
-                raise TypeError(f"VecFrameStack stacks Box observations, got {part}" + f" under {key!r}" * bool(key))
+        for key, space in parts.items():
+            if not isinstance(space, spaces.Box):
+                raise TypeError(f"VecFrameStack stacks Box observations, got {space}" + f" under {key!r}" * bool(key))
             order = channels_order.get(key) if isinstance(channels_order, Mapping) else channels_order
-            _, _, shape, axis = self.compute_stacking(n_stack, part, order)
+            _, _, shape, axis = self.compute_stacking(n_stack, space, order)
             self._axes[key] = axis % len(shape)
-            low, high = (np.repeat(bound, n_stack, axis=axis) for bound in (part.low, part.high))
-            stacked[key] = spaces.Box(low, high, dtype=part.dtype.type)
-            self._stack[key] = np.zeros((num_envs, *shape), part.dtype)
+            low, high = (np.repeat(bound, n_stack, axis=axis) for bound in (space.low, space.high))
+            stacked[key] = spaces.Box(low, high, dtype=space.dtype.type)
+            self._stack[key] = np.zeros((num_envs, *shape), space.dtype)
         self.stacked_observation_space = spaces.Dict(stacked) if is_dict else stacked[""]
 
     @staticmethod

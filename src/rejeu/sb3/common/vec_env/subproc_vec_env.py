@@ -109,24 +109,24 @@ class SubprocVecEnv(SingleEnvs):
         Raises:
             AttributeError: if the function does; the processes then keep running.
         """
-        chosen = self._get_indices(indices)
-        self.workers.send(dict.fromkeys(chosen, ("call", function, *arguments)))
-        replies = self._receive(chosen, attribute_errors=True)
+        env_indices = self._get_indices(indices)
+        self.workers.send(dict.fromkeys(env_indices, ("call", function, *arguments)))
+        replies = self._receive(env_indices, attribute_errors=True)
         for i, reply in replies.items():
             if isinstance(reply, Restarted):
                 self.close()
                 raise WorkerError(f"the process of environment {i} was lost outside of a step: {reply.why}")
-        return [replies[i] for i in chosen]
+        return [replies[i] for i in env_indices]
 
     def _receive(self, indices: Any, attribute_errors: bool = False) -> dict[int, Any]:
         """Returns the replies of some processes; ends all processes if one of the replies is a failure."""
         replies = self.workers.answers(indices)
-        for i, answer in replies.items():
-            if isinstance(answer, WorkerFailure):
-                if attribute_errors and answer.cause == "no attribute":
-                    raise AttributeError(answer.message)
+        for i, reply in replies.items():
+            if isinstance(reply, WorkerFailure):
+                if attribute_errors and reply.cause == "no attribute":
+                    raise AttributeError(reply.message)
                 self.close()
-                if answer.cause == "bad answer":
-                    raise BadEnvironmentError(with_location(type(self).__name__, i, self._n_steps, answer.message))
-                raise WorkerError(f"environment {i} raised an error:\n{answer.trace}")
+                if reply.cause == "bad answer":
+                    raise BadEnvironmentError(with_location(type(self).__name__, i, self._n_steps, reply.message))
+                raise WorkerError(f"environment {i} raised an error:\n{reply.trace}")
         return replies

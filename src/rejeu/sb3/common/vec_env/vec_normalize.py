@@ -137,7 +137,7 @@ class VecNormalize(VecEnvWrapper):
                 )
             _check_box(parts[key], key)
         moments = {key: RunningMeanStd(shape=parts[key].shape or ()) for key in keys}
-        normalized = {key: self._box(part) if key in keys else part for key, part in parts.items()}
+        normalized = {key: self._box(member) if key in keys else member for key, member in parts.items()}
         self.norm_obs_keys = keys if is_dict else None
         self.obs_rms = moments if is_dict else moments[""]
         self.observation_space = spaces.Dict(normalized) if is_dict else normalized[""]
@@ -151,12 +151,12 @@ class VecNormalize(VecEnvWrapper):
         Raises:
             ValueError: if the spaces differ.
         """
-        other = VecNormalize(venv, norm_obs=self.norm_obs, clip_obs=self.clip_obs, norm_obs_keys=self.norm_obs_keys)
-        if other.observation_space != self.observation_space:
+        view = VecNormalize(venv, norm_obs=self.norm_obs, clip_obs=self.clip_obs, norm_obs_keys=self.norm_obs_keys)
+        if view.observation_space != self.observation_space:
             raise ValueError(
                 f"the environment has the observation space {venv.observation_space}, which does not fit these statistics"
             )
-        VecEnvWrapper.__init__(self, venv, other.observation_space)
+        VecEnvWrapper.__init__(self, venv, view.observation_space)
         self.returns, self.old_reward = np.zeros(self.num_envs), np.zeros(self.num_envs, np.float32)
 
     def reset(self) -> Any:
@@ -279,8 +279,8 @@ class VecNormalize(VecEnvWrapper):
             CheckpointError: if the file is damaged or belongs to other observations.
         """
         path = checkpoint.existing(load_path)
-        with path.open("rb") as found:
-            if found.read(3) in PICKLES:
+        with path.open("rb") as pickle_file:
+            if pickle_file.read(3) in PICKLES:
                 return of_original(path, venv)
         with checkpoint.opened(load_path, KIND) as file:
             try:

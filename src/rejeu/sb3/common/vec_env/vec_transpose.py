@@ -26,10 +26,10 @@ class VecTransposeImage(ObservationWrapper):
         self.skip = skip
         space = venv.observation_space
         parts = space.spaces if isinstance(space, spaces.Dict) else {"": space}
-        self._keys = [] if skip else [key for key, part in parts.items() if is_image(part)]
+        self._keys = [] if skip else [key for key, leaf in parts.items() if is_image(leaf)]
         if not skip and not self._keys:
             raise ValueError(f"VecTransposeImage needs uint8 images with three axes, got {space}")
-        transposed = {key: self.transpose_space(part) if key in self._keys else part for key, part in parts.items()}
+        transposed = {key: self.transpose_space(leaf) if key in self._keys else leaf for key, leaf in parts.items()}
         super().__init__(venv, spaces.Dict(transposed) if isinstance(space, spaces.Dict) else transposed[""])
 
     @staticmethod
@@ -47,7 +47,7 @@ class VecTransposeImage(ObservationWrapper):
     def transpose_observations(self, observations: Any) -> Any:
         """Returns observations with their images transposed."""
         parts = by_key(observations)
-        transposed = {key: self.transpose_image(part) if key in self._keys else part for key, part in parts.items()}
+        transposed = {key: self.transpose_image(image) if key in self._keys else image for key, image in parts.items()}
         return transposed.get("", transposed)
 
     def map_observation(self, obs: Any) -> Any:
