@@ -74,7 +74,7 @@ def twice(closed: Any) -> set[str]:
             elif name in ("scan", "while"):
                 body = params["jaxpr" if name == "scan" else "body_jaxpr"]
                 skipped = 0 if name == "scan" else params["cond_nconsts"]
-                kept = given[skipped:][: params["num_consts" if name == "scan" else "body_nconsts"]]
+                kept = given[skipped:][: params["body_nconsts"] if name == "while" else n_consts(params)]
                 for _ in range(2):
                     carried = [next(fresh) for _ in range(len(body.jaxpr.invars) - len(kept))]
                     uses += walk_closed(body, [*kept, *carried])[1]
@@ -96,6 +96,13 @@ def twice(closed: Any) -> set[str]:
     return {f"{n} times" for n in drawn.values() if n > 1} | {
         "split as well" for key in drawn if ("random_split", key) in uses
     }
+
+
+def n_consts(params: Any) -> int:
+    """Returns how many arguments of a scan are the same at every turn, by its parameters before and since JAX 0.12."""
+    if "num_consts" in params:
+        return params["num_consts"]
+    return len(jax.tree.leaves(params["ft_in"][0], is_leaf=lambda leaf: leaf is None))
 
 
 def draw_in_turns(key: Any) -> Any:

@@ -174,12 +174,13 @@ def resumed_from(run, folder):
 @pytest.mark.parametrize("run", only(["replay"], ["replay", "rollout"]), indirect=True)
 def test_a_hostile_file_of_a_run_is_refused_by_our_own_error_alone(run, tmp_path):
     """A sample of the corpus; ``trials/hostile.py`` tries all of it."""
+    outcomes = []
     for path in files_of(run[1]):
         content = path.read_bytes()
         variants = [*hostile_files.variants(content), *hostile_files.bad_runs(content)]
-        outcomes = [replaced(run, tmp_path / "run", path, one.content) for one in variants[::60]]
-        assert {*outcomes} <= {"refused", "read"}
-        assert outcomes.count("refused") > 0.8 * len(outcomes)  # some values may be others, or missing
+        outcomes += [replaced(run, tmp_path / "run", path, variant.content) for variant in variants[::60]]
+    assert {*outcomes} <= {"refused", "read"}
+    assert outcomes.count("refused") > 0.8 * len(outcomes)  # some values may be others, or missing
 
 
 @pytest.mark.skipif(os.name != "posix", reason="holes in files are POSIX's")
