@@ -14,7 +14,6 @@ import warnings
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any, NamedTuple
 
-import envpool
 import jax
 import numpy as np
 import pytest
@@ -24,6 +23,8 @@ from rejeu.agents import presets
 from rejeu.core import spaces
 from rejeu.envs.make import make_vector
 from tests.tiers import only
+
+envpool = pytest.importorskip("envpool", exc_type=ImportError)
 
 LANDERS = "LunarLander-v3", "LunarLanderContinuous-v3"
 

@@ -17,7 +17,7 @@ from rejeu.envs.action_log import ActionLog
 from rejeu.envs.make import make_vector
 from tests.tiers import only
 
-pytest.importorskip("envpool")
+pytest.importorskip("envpool", exc_type=ImportError)
 
 SPACES = {
     "Discrete": gym.spaces.Discrete(3, start=2),
