@@ -146,7 +146,7 @@ class BitFlippingEnv(gym.Env):
         flipped = np.asarray(action) > 0 if self.continuous else np.arange(len(self.state)) == action
         self.state = self.state ^ flipped.astype(np.int8)
         self.current_step += 1
-        reward = float(self.compute_reward(self.state, self.desired_goal, {}))
+        reward = float(np.asarray(self.compute_reward(self.state, self.desired_goal, None)).item())
         ends = reward == 0.0, self.current_step >= self.max_steps
         return self._observation(), reward, *ends, {"is_success": ends[0]}
 
