@@ -72,7 +72,6 @@ OPENED_ELSEWHERE = {
     ("atomic.py", "replacing"),  # a new file of a name of its own
     ("notebooks.py", "_write_new"),  # a new file
     ("logging.py", "__init__"),  # likewise
-    ("ray.py", "write_marker"),  # likewise, of a name of its own
     ("hub.py", "lay_out"),  # in a new folder
     ("branch.py", "branch"),
     ("branch.py", "begin"),

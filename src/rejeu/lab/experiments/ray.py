@@ -256,7 +256,7 @@ class RayLauncher:
 def write_marker(folder: Path) -> str:
     """Writes an empty file with a name of its own to a folder, and returns its path."""
     path = folder / f"marker-{secrets.token_hex(16)}"
-    path.touch()
+    atomic.touch(path)
     return str(path)
 
 
