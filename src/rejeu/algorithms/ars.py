@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -36,6 +36,7 @@ from rejeu.core.algorithm import Algorithm, Clock, Explorer, Metrics, PyTree, Ro
 from rejeu.core.prng import nth
 from rejeu.core.schedules import Schedule, at
 from rejeu.core.spaces import action_dimension, check_action
+from rejeu.core.types import Scalar
 from rejeu.core.validation import coerce, flag, number, whole
 from rejeu.networks import Network, Widths
 
@@ -152,7 +153,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
             return jnp.argmax(outputs, axis=-1).astype(jnp.int32)
         return jnp.tanh(outputs) if widths else jnp.clip(outputs, -1.0, 1.0)
 
-    def choose(actor: Perturbation, obs: PyTree, *_: Any) -> Array:
+    def choose(actor: Perturbation, obs: PyTree, *_: object) -> Array:
         return act(actor.network, obs)
 
     def begin(actor: Perturbation, n_envs: int) -> Playing:
@@ -212,7 +213,7 @@ def direction(actor: Perturbation, k: Array) -> Network:
     return jax.tree.unflatten(structure, drawn)
 
 
-def perturbed(actor: Perturbation, candidate: Array, std: Any, n_delta: int) -> Network:
+def perturbed(actor: Perturbation, candidate: Array, std: Scalar, n_delta: int) -> Network:
     """Returns the parameters of an episode of an iteration.
 
     Episodes are numbered from 0: first all directions forward, then all backward, and so on for each of the evaluations.

@@ -8,7 +8,7 @@ configuration is created.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -23,6 +23,7 @@ from rejeu.core.errors import MissingObjectError
 from rejeu.core.normalization import NormalizationConfig
 from rejeu.core.schedules import Schedule
 from rejeu.core.spaces import Leaf, leaves
+from rejeu.core.types import JsonObject, PyTree, Settings
 from rejeu.core.validation import C, assign, build, choice, coerce, flag, nested, number, whole
 from rejeu.exploration import noise as action_noises
 from rejeu.exploration.parameter_space import ParameterNoise
@@ -41,7 +42,7 @@ registered: dict[str, Any] = {}
 """The configurations of algorithms that are not rejeu's, by name; :func:`rejeu.register` adds to it."""
 OWN_MODULES = ("encoder", "torso", "head")
 """Settings of ``policy_kwargs`` that are modules of the user's own."""
-NAMED: Mapping[str, Mapping[str, Any]] = {"encoder": ENCODERS, "goal_selection_strategy": STRATEGIES}
+NAMED: Mapping[str, Mapping[str, Callable[..., Any]]] = {"encoder": ENCODERS, "goal_selection_strategy": STRATEGIES}
 """Settings that a registered name may stand for, and what is registered."""
 
 
@@ -64,7 +65,7 @@ class RndConfig:
         coerce(self, ("n_features", "batch_size"), whole, least=1)
 
     @classmethod
-    def parse(cls, key: str, value: Any) -> RndConfig | None:
+    def parse(cls, key: str, value: object) -> RndConfig | None:
         """Returns the settings that a weight, a dict or None stands for; None for the weight 0."""
         if isinstance(value, int | float) and not isinstance(value, bool):
             value = {"coefficient": value} if value else None
@@ -116,7 +117,7 @@ class AlgorithmConfig:
     """Default widths of the networks."""
     hidden_layers_on_images: ClassVar[Widths] = hidden_layers
     """The same where the observation is an image."""
-    for_many: ClassVar[Mapping[str, Any]] = {}
+    for_many: ClassVar[Mapping[str, object]] = {}
     """Hyperparameters that ``rejeu train`` uses with 64 environments or more, without a preset."""
     search_space: ClassVar[SearchSpace] = {}
     """Where ``rejeu tune`` searches, by the name of the hyperparameter."""
@@ -170,7 +171,7 @@ class OffPolicyConfig(AlgorithmConfig):
     replay_buffer_class: str | type = "ReplayBuffer"
     """``HerReplayBuffer`` relabels goals in hindsight and needs a goal environment; ``ReplayBuffer`` or None does not.
     Or a class of your own with the constructor and methods of one of them, such as a subclass; see ``rejeu.replay``."""
-    replay_buffer_kwargs: HindsightConfig | tuple[tuple[str, Any], ...] | None = None
+    replay_buffer_kwargs: HindsightConfig | tuple[tuple[str, object], ...] | None = None
     """Settings of the replay buffer: ``n_sampled_goal`` and ``goal_selection_strategy`` for ``HerReplayBuffer``;
     further keyword arguments for a class of your own."""
     n_steps: int = 1
@@ -269,7 +270,7 @@ class OffPolicyConfig(AlgorithmConfig):
         return settings if isinstance(settings, HindsightConfig) else None
 
 
-def rebuild(config_class: type[C], saved: Mapping[str, Any], changes: Mapping[str, Any]) -> C:
+def rebuild(config_class: type[C], saved: Mapping[str, object], changes: Mapping[str, object]) -> C:
     """Returns the configuration of a file with some settings changed; of ``policy_kwargs`` only the given ones.
 
     Raises:
@@ -291,7 +292,7 @@ def rebuild(config_class: type[C], saved: Mapping[str, Any], changes: Mapping[st
     return build(config_class, merged)
 
 
-def own_names(saved: Mapping[str, Any]) -> Iterator[tuple[tuple[str, ...], str]]:
+def own_names(saved: Mapping[str, object]) -> Iterator[tuple[tuple[str, ...], str]]:
     """Yields the path and the name of each object of the user's own that the configuration of a file mentions."""
     for key, value in saved.items():
         if isinstance(value, Mapping) and set(value) == {OWN}:
@@ -303,7 +304,7 @@ def own_names(saved: Mapping[str, Any]) -> Iterator[tuple[tuple[str, ...], str]]
             yield from (((key, *keys), name) for keys, name in own_names(value))
 
 
-def own_changes(saved: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+def own_changes(saved: Mapping[str, object], changes: Mapping[str, object]) -> Settings:
     """Returns of changed settings only those that replace objects of the user's own, which a file cannot do without."""
     mentioned = {keys[0] for keys, _ in own_names(saved)} - {"policy_kwargs"}
     policy = changes.get("policy_kwargs")
@@ -312,7 +313,7 @@ def own_changes(saved: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[st
     return replacements | ({"policy_kwargs": modules} if modules else {})
 
 
-def is_own(value: Any) -> bool:
+def is_own(value: object) -> bool:
     """Returns whether a setting is code of the user's own, which a file can only mention."""
     return callable(value) or isinstance(value, optax.GradientTransformation | action_noises.NoiseProcess)
 
@@ -322,7 +323,7 @@ def with_widths(config: C, obs_leaves: tuple[Leaf, ...]) -> C:
 
     These depend on the observation, whose leaves are given.
     """
-    config_class: Any = type(config)
+    config_class: type[PyTree] = type(config)
     shape = config.policy_kwargs  # type: ignore[attr-defined]
     widths = config_class.hidden_layers_on_images if reads_image(obs_leaves, shape) else config_class.hidden_layers
     missing = settled(vars(shape), widths)
@@ -339,7 +340,7 @@ def network_inputs(config: Any, observation_space: spaces.Space) -> tuple[tuple[
     return obs_leaves, with_widths(config, obs_leaves).policy_kwargs
 
 
-def to_json(config: Any) -> dict[str, Any]:
+def to_json(config: Any) -> JsonObject:
     """Returns a configuration as plain JSON values, from which :func:`build` makes it again.
 
     Objects of the user's own, such as a ``torso``, are only mentioned, and must be given again (:func:`rebuild`).
@@ -347,7 +348,7 @@ def to_json(config: Any) -> dict[str, Any]:
     return {field.name: value_to_json(getattr(config, field.name)) for field in dataclasses.fields(config)}
 
 
-def value_to_json(value: Any) -> Any:
+def value_to_json(value: object) -> Any:
     """Returns the JSON form of the value of a setting."""
     if isinstance(value, schedules.Live):
         return value.value
@@ -366,7 +367,7 @@ def value_to_json(value: Any) -> Any:
     return list(value) if isinstance(value, tuple) else value
 
 
-def buffer_name(key: str, value: Any) -> str | type:
+def buffer_name(key: str, value: object) -> str | type:
     """Returns the name of a replay buffer from its name, its class or None, or a class of the user's own."""
     if value is None:
         return "ReplayBuffer"
@@ -392,7 +393,7 @@ def buffer_settings(key: str, value: Any, buffer: str | type) -> Any:
     return None
 
 
-def train_freq(key: str, value: Any) -> int | tuple[int, Literal["step", "episode"]]:
+def train_freq(key: str, value: object) -> int | tuple[int, Literal["step", "episode"]]:
     """Returns a frequency in steps, or ``(n, "episode")``."""
     if isinstance(value, tuple | list) and len(value) == 2 and value[1] in ("step", "episode"):
         count = whole(key, value[0], least=1)

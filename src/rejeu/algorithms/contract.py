@@ -13,6 +13,7 @@ from jax import Array
 
 from rejeu.core.algorithm import TD_ERROR, Algorithm, Clock, Metrics, PyTree, names
 from rejeu.core.spaces import random_action
+from rejeu.core.types import Action
 
 
 def checked(algorithm: Algorithm, action_space: spaces.Space) -> Algorithm:
@@ -29,7 +30,7 @@ def checked(algorithm: Algorithm, action_space: spaces.Space) -> Algorithm:
         check_action(action, obs, sample, "exploit")
         return action
 
-    def update(state: PyTree, batch: Any, clock: Clock) -> tuple[PyTree, Metrics]:
+    def update(state: PyTree, batch: PyTree, clock: Clock) -> tuple[PyTree, Metrics]:
         returned = algorithm.update(state, batch, clock)
         check_update(returned)
         check_state(returned[0], state, "update")
@@ -47,7 +48,7 @@ def check_config(config: Any) -> None:
         )
 
 
-def check_action(action: Any, obs: PyTree, sample: np.ndarray, function: str) -> None:
+def check_action(action: Action, obs: PyTree, sample: np.ndarray, function: str) -> None:
     """Raises ``TypeError`` if actions for the observations ``obs`` differ in shape or kind from ``sample``.
 
     Args:
@@ -66,7 +67,7 @@ def check_action(action: Any, obs: PyTree, sample: np.ndarray, function: str) ->
         )
 
 
-def check_update(returned: Any) -> None:
+def check_update(returned: object) -> None:
     """Raises ``TypeError`` unless ``update`` returned a state and a dict of scalars."""
     if not isinstance(returned, tuple) or len(returned) != 2 or not isinstance(returned[1], Mapping):
         items = returned if isinstance(returned, tuple) else (returned,)

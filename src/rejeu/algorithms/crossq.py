@@ -79,7 +79,7 @@ class Config(EntropyConfig):
         coerce(self, "renorm_warmup_steps", whole, least=0)
         check_shape(self.policy_kwargs, self.name)
 
-    def torso(self, key: Array, n_inputs: int, widths: tuple[int, ...]) -> Any:
+    def torso(self, key: Array, n_inputs: int, widths: tuple[int, ...]) -> PyTree:
         """Returns hidden layers."""
         return RenormalizedMLP(key, n_inputs, widths, self.policy_kwargs.activation_fn, self.renorm_warmup_steps)
 
@@ -99,21 +99,21 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
 class Equations(NamedTuple):
     """What CrossQ, FlashSAC and XQC do each in their own way."""
 
-    target: Callable[[Any, Transition, Array, Array], Array]
+    target: Callable[[PyTree, Transition, Array, Array], Array]
     """``target(target_critics, batch, next_action, next_entropy_cost)``: what the critics learn."""
-    critics_loss: Callable[[Any, Transition, Array, Array], tuple[Array, Any]]
+    critics_loss: Callable[[PyTree, Transition, Array, Array], tuple[Array, PyTree]]
     """``critics_loss(critics, batch, next_action, target)``, as :func:`critics_loss`."""
-    values: Callable[[Any, PyTree, Array], Array]
+    values: Callable[[PyTree, PyTree, Array], Array]
     """``values(critics, obs, action)``: by the running statistics, ``(n_critics, batch)``."""
-    measure: Callable[[Any, Any], tuple[Array, Array]] = lambda errors, target: errors
+    measure: Callable[[PyTree, PyTree], tuple[Array, Array]] = lambda errors, target: errors
     """``measure(extra, (next_action, target))``, as of :class:`rejeu.algorithms.soft.SoftCritic`."""
     n_outputs: int = 1
     """Of each critic."""
-    head: Callable[[Array, int, int], Any] = Linear
+    head: Callable[[Array, int, int], PyTree] = Linear
     """``head(key, n_inputs, n_outputs)``: the last layer of a network."""
     log_std: Callable[[Array], Array] = clipped
     """``log_std(outputs)``: the policy's log standard deviations from outputs of the actor."""
-    after_step: Callable[[Any], Any] = lambda network: network
+    after_step: Callable[[PyTree], PyTree] = lambda network: network
     """``after_step(network)``: a network after a step of the optimizer."""
     seen: Callable[[Transition], PyTree] = lambda batch: batch.obs
     """``seen(batch)``: by which observations the actor normalizes; those of the batch are the first."""
@@ -139,19 +139,23 @@ def make_with(
         torso = lambda key, n_inputs: config.torso(key, n_inputs, widths)  # noqa: E731
         return RenormalizedNetwork(key, obs_leaves, n_actions, n_outputs, torso, equations.head)
 
-    def critics(key: Array) -> Any:
+    def critics(key: Array) -> PyTree:
         widths = shape.critic_widths(config.hidden_layers.critics)
         return ensemble(lambda key: network(key, action_dim, equations.n_outputs, widths), key, config.n_critics)
 
-    def target(actor: Any, target_critics: Any, alpha: Array, batch: Transition, key: Array) -> tuple[Array, Array]:
+    def target(
+        actor: PyTree, target_critics: PyTree, alpha: Array, batch: Transition, key: Array
+    ) -> tuple[Array, Array]:
         next_action, next_log_prob = policy(actor, batch.next_obs).sample_and_log_prob(key)
         return next_action, equations.target(target_critics, batch, next_action, alpha * next_log_prob)
 
-    def policy_loss(actor: Any, critics: Any, alpha: Array, batch: Transition, key: Array) -> tuple[Array, Any]:
+    def policy_loss(
+        actor: PyTree, critics: PyTree, alpha: Array, batch: Transition, key: Array
+    ) -> tuple[Array, PyTree]:
         obs = equations.seen(batch)
         return actor_loss(actor, critics, alpha, batch.obs, key, obs, distribution, equations.values)
 
-    def step(*arguments: Any) -> tuple[Any, PyTree, Array, Any]:
+    def step(*arguments: PyTree) -> tuple[PyTree, PyTree, Array, PyTree]:
         network, optimizer_state, loss, (extra, trained) = minimize(*arguments)
         return equations.after_step(with_statistics(network, trained)), optimizer_state, loss, extra
 
@@ -195,7 +199,7 @@ def check_shape(shape: PolicyConfig, name: str) -> None:
         )
 
 
-def joint_outputs(critics: Any, batch: Transition, next_action: Array) -> tuple[Array, Array, Any]:
+def joint_outputs(critics: PyTree, batch: Transition, next_action: Array) -> tuple[Array, Array, PyTree]:
     """Returns the outputs for ``(s, a)`` and for ``(s', a')``, ``(n_critics, batch, n_outputs)`` each, from one pass of both.
 
     The critics are in training; they are returned as they are after having seen the batch.
@@ -238,13 +242,13 @@ def critics_loss(
 
 def actor_loss(
     actor: RenormalizedNetwork,
-    critics: Any,
+    critics: PyTree,
     alpha: Array,
     obs: PyTree,
     key: Array,
     seen: PyTree,
     policy: Callable[[Array], TanhNormal],
-    values: Callable[[Any, PyTree, Array], Array] = action_values,
+    values: Callable[[PyTree, PyTree, Array], Array] = action_values,
 ) -> tuple[Array, tuple[Array, RenormalizedNetwork]]:
     """Returns the soft policy loss at ``obs``, the critics judging by their running statistics.
 

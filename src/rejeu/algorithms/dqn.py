@@ -70,6 +70,7 @@ from rejeu.core.distributions import forbid
 from rejeu.core.prng import nth
 from rejeu.core.schedules import Exponential, Linear, Schedule, at
 from rejeu.core.spaces import Leaf, check_discrete_action, nth_allowed
+from rejeu.core.types import Scalar
 from rejeu.core.validation import LARGEST_VALUE, choice, coerce, flag, number, whole
 from rejeu.exploration.noise import NoiseProcess
 from rejeu.networks import MLP, Network, PolicyConfig, Torso, Widths, make_encoder, make_head, make_torso, with_memory
@@ -196,9 +197,9 @@ class Config(QLearningConfig):
 class State(eqx.Module):
     """Everything that DQN, QR-DQN or IQN learns; every leaf is an array."""
 
-    network: Any
+    network: PyTree
     """Maps observations to the values of all actions, or to what describes the returns of all actions."""
-    target_network: Any = eqx.field(metadata=AVERAGED)
+    target_network: PyTree = eqx.field(metadata=AVERAGED)
     optimizer: PyTree
     step: Array
     """Environment steps at the newest gradient step, ``uint32[]``: determines the next update of the target."""
@@ -222,17 +223,17 @@ class Returns(NamedTuple):
     Keys are for what is drawn at random: noise on the weights, or the fractions of quantiles. None stands for no noise.
     """
 
-    build: Callable[[Array, tuple[Leaf, ...], Any, int, bool], Any]
+    build: Callable[[Array, tuple[Leaf, ...], PyTree, int, bool], PyTree]
     """``build(key, leaves, shape, n_actions, dueling)``: the network."""
-    values: Callable[[Any, PyTree, Array | None], Array]
+    values: Callable[[PyTree, PyTree, Array | None], Array]
     """``values(network, obs, key)``: the mean of the return of every action, ``(batch, n_actions)``."""
-    describe: Callable[[Any, PyTree, Any], Array]
+    describe: Callable[[PyTree, PyTree, Any], Array]
     """``describe(network, obs, key)``: values, quantiles or probabilities, of which a mean over actions makes sense,
     ``(batch, n_actions, ...)``."""
     target: Callable[[Array, Array, Array], Array]
     """``target(reward, discount, following)``: what is learned from ``(batch,)`` twice and what describes the return that
     follows, ``(batch, ...)``."""
-    loss: Callable[[Any, PyTree, Array, Array, Any], tuple[Array, Array, Array]]
+    loss: Callable[[PyTree, PyTree, Array, Array, Any], tuple[Array, Array, Array]]
     """``loss(network, obs, action, target, key)``: the loss, the error that priorities go by, and the mean of the
     prediction, ``(batch,)`` each."""
     is_random: bool = False
@@ -287,18 +288,18 @@ def q_learning(
 
 
 def epsilon_greedy_algorithm(
-    init: Callable[[Array], Any],
-    update: Callable[..., Any],
+    init: Callable[[Array], PyTree],
+    update: Callable[..., PyTree],
     epsilon: Schedule,
     state_value: Callable[..., Array] | None = None,
-    values: Callable[[Any, PyTree, Array | None], Array] = lambda network, obs, key: network(obs),
+    values: Callable[[PyTree, PyTree, Array | None], Array] = lambda network, obs, key: network(obs),
 ) -> Algorithm:
     """Returns the algorithm that explores by :func:`epsilon_greedy` actions, of a state with a field ``network``.
 
     ``values`` is as in :class:`Returns`, ``epsilon`` a function of the progress; the rest is of :class:`Algorithm`.
     """
 
-    def explore(network: Any, obs: PyTree, key: Array, clock: Clock) -> Array:
+    def explore(network: PyTree, obs: PyTree, key: Array, clock: Clock) -> Array:
         return epsilon_greedy(values(network, obs, key), at(epsilon, clock.progress), key, unmasked(obs)[1])
 
     return Algorithm(
@@ -336,7 +337,7 @@ def metrics_of(loss: Array, q_value: Array, epsilon: Schedule, clock: Clock) -> 
 
 def value_network(
     key: Array, leaves: tuple[Leaf, ...], shape: PolicyConfig, n_actions: int, dueling: bool, n: int | None = None
-) -> Any:
+) -> PyTree:
     """Returns a network from observations to values ``(batch, n_actions)``, or ``(batch, n_actions, n)`` for a number n."""
     network_class, widths, n_outputs = (
         Dueling if dueling else Network,
@@ -350,7 +351,7 @@ def value_network(
 class DistributionalNetwork(eqx.Module):
     """Observation to what describes the return of every action, such as quantiles."""
 
-    outputs: Any
+    outputs: PyTree
     n: int = eqx.field(static=True)
 
     def __call__(self, obs: PyTree) -> Array:
@@ -366,12 +367,12 @@ class Dueling(eqx.Module):
     one linear map.
     """
 
-    encoder: Any
+    encoder: PyTree
     torso: Torso
     value: MLP
     advantage: MLP
-    value_head: Any
-    advantage_head: Any
+    value_head: PyTree
+    advantage_head: PyTree
 
     def __init__(
         self,
@@ -423,7 +424,9 @@ def joined(value: Array, advantage: Array) -> Array:
 def expected(penalty: Callable[[Array], Array]) -> Returns:
     """Returns what learns the mean of the return, with this function of the TD error as the loss."""
 
-    def loss(network: Any, obs: PyTree, action: Array, target: Array, key: Any) -> tuple[Array, Array, Array]:
+    def loss(
+        network: PyTree, obs: PyTree, action: Array, target: Array, key: Array | None
+    ) -> tuple[Array, Array, Array]:
         value = taken(network(obs), action)
         return penalty(value - target), value - target, value
 
@@ -445,7 +448,9 @@ def categorical_returns(atoms: Array) -> Returns:
     def target(reward: Array, discount: Array, following: Array) -> Array:
         return categorical.project(reward[:, None] + discount[:, None] * atoms[None], following, atoms)
 
-    def loss(network: Any, obs: PyTree, action: Array, target: Array, key: Any) -> tuple[Array, Array, Array]:
+    def loss(
+        network: PyTree, obs: PyTree, action: Array, target: Array, key: Array | None
+    ) -> tuple[Array, Array, Array]:
         logits = taken(network(obs), action)
         entropy = -jnp.sum(jax.scipy.special.xlogy(target, target), axis=-1)
         loss = categorical.cross_entropy(logits, target)
@@ -466,7 +471,12 @@ def with_noise(returns: Returns) -> Returns:
 
 
 def td_target(
-    network: Any, target_network: Any, batch: Transition, double_q: bool, returns: Returns = MEAN, keys: Any = NO_KEYS
+    network: PyTree,
+    target_network: PyTree,
+    batch: Transition,
+    double_q: bool,
+    returns: Returns = MEAN,
+    keys: Array | tuple[None, None] = NO_KEYS,
 ) -> Array:
     """Returns the TD targets, ``(batch,)`` or ``(batch, ...)``; ``keys`` are for the network and the target network."""
     chooser, key = (network, keys[0]) if double_q else (target_network, keys[1])
@@ -511,7 +521,7 @@ def munchausen_target(
 
 
 def td_loss(
-    network: Any,
+    network: PyTree,
     batch: Transition,
     target: Array,
     returns: Returns | Callable[[Array], Array],
@@ -540,7 +550,7 @@ def greedy(values: Array, mask: Array | None = None) -> Array:
     return jnp.argmax(forbid(values, mask), axis=-1).astype(jnp.int32)
 
 
-def epsilon_greedy(values: Array, epsilon: Any, key: Array, mask: Array | None = None) -> Array:
+def epsilon_greedy(values: Array, epsilon: Scalar, key: Array, mask: Array | None = None) -> Array:
     """Returns the best action by values ``(batch, n_actions)``, or any with probability ``epsilon``; ``(batch,)``.
 
     With ``mask``, ``bool (batch, n_actions)``, both are among the allowed ones.
@@ -573,7 +583,7 @@ def epsilon_schedule(config: Any) -> Schedule:
     return schedule_class(config.exploration_initial_eps, config.exploration_final_eps, config.exploration_fraction)
 
 
-def moves_due(last_step: Array, step: Any, interval: Any) -> Array:
+def moves_due(last_step: Array, step: Scalar, interval: Scalar) -> Array:
     """Returns how many multiples of ``interval`` lie above ``last_step`` and not above ``step``, ``int32[]``.
 
     >>> int(moves_due(jnp.uint32(599), jnp.uint32(608), 600))

@@ -25,7 +25,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -101,7 +101,7 @@ class Config(EntropyConfig):
                     "block, such as [64, 64]"
                 )
 
-    def torso(self, key: Array, n_inputs: int, widths: tuple[int, ...]) -> Any:
+    def torso(self, key: Array, n_inputs: int, widths: tuple[int, ...]) -> PyTree:
         """Returns hidden layers."""
         return InvertedResidual(key, n_inputs, widths, self.policy_kwargs.activation_fn)
 
@@ -134,13 +134,13 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     return make_with(config, observation_space, action_space, equations, optimizer)
 
 
-def action_values(critics: Any, obs: PyTree, action: Array, atoms: Array) -> Array:
+def action_values(critics: PyTree, obs: PyTree, action: Array, atoms: Array) -> Array:
     """Returns the mean of each critic's distribution by the running statistics, ``(n_critics, batch)``."""
     return mean_of(jax.vmap(lambda critic: critic(obs, action))(critics), atoms)
 
 
 def td_target(
-    target_critics: Any, batch: Transition, next_action: Array, next_entropy_cost: Array, atoms: Array
+    target_critics: PyTree, batch: Transition, next_action: Array, next_entropy_cost: Array, atoms: Array
 ) -> Array:
     """Returns the distributions that the critics should predict, ``(batch, n_bins)``.
 
@@ -158,7 +158,9 @@ def td_target(
     return project(following, jax.nn.softmax(least_logits), atoms)
 
 
-def critics_loss(critics: Any, batch: Transition, next_action: Array, target: Array) -> tuple[Array, tuple[Array, Any]]:
+def critics_loss(
+    critics: PyTree, batch: Transition, next_action: Array, target: Array
+) -> tuple[Array, tuple[Array, PyTree]]:
     """Returns the cross-entropy of ``target`` and the predictions, averaged over the batch and summed over critics.
 
     With it come the predicted logits ``(n_critics, batch, n_bins)`` and the critics that have seen the batch.

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -80,11 +80,11 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
 class ImplicitNetwork(eqx.Module):
     """Observation and fractions to the quantiles of the return of every action at these fractions."""
 
-    encoder: Any
+    encoder: PyTree
     torso: Torso
     """Hidden layers before the product with the description of the fractions."""
     embedding: Linear
-    reader: Any
+    reader: PyTree
     """Maps the product to the quantiles of all actions."""
 
     def __init__(
@@ -115,14 +115,14 @@ class ImplicitNetwork(eqx.Module):
 def implicit_returns(n_quantiles: int, n_target_quantiles: int, n_policy_quantiles: int, n_cosines: int) -> Returns:
     """Returns what learns the quantiles of the return at random fractions."""
 
-    def values(network: Any, obs: PyTree, key: Array | None) -> Array:
+    def values(network: PyTree, obs: PyTree, key: Array | None) -> Array:
         return jnp.mean(network(obs, quantile_fractions(n_policy_quantiles)[None]), axis=-1)
 
-    def describe(network: Any, obs: PyTree, key: Any) -> Array:
+    def describe(network: PyTree, obs: PyTree, key: Array) -> Array:
         n = jax.tree.leaves(rows_read(obs))[0].shape[0]
         return network(obs, jax.random.uniform(key, (n, n_target_quantiles), jnp.float32))
 
-    def loss(network: Any, obs: PyTree, action: Array, target: Array, key: Any) -> tuple[Array, Array, Array]:
+    def loss(network: PyTree, obs: PyTree, action: Array, target: Array, key: Array) -> tuple[Array, Array, Array]:
         fractions = jax.random.uniform(key, (target.shape[0], n_quantiles), jnp.float32)
         return quantile_loss(taken(network(obs, fractions), action), target, fractions)
 

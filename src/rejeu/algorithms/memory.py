@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import jax.numpy as jnp
 from jax import Array
@@ -13,7 +12,7 @@ from rejeu.networks import MemoryConfig, Recurrent
 
 
 def remembering(
-    algorithm: Algorithm, shape: MemoryConfig, networks: Callable[[Any], tuple[Recurrent, ...]]
+    algorithm: Algorithm, shape: MemoryConfig, networks: Callable[[PyTree], tuple[Recurrent, ...]]
 ) -> Algorithm:
     """Returns an algorithm whose networks may have a memory as one that acts with it; unchanged if they have none.
 
@@ -26,7 +25,7 @@ def remembering(
     return algorithm if shape.lstm_hidden_size is None else acting_from_memory(algorithm, networks)
 
 
-def acting_from_memory(algorithm: Algorithm, networks: Callable[[Any], tuple[Recurrent, ...]]) -> Algorithm:
+def acting_from_memory(algorithm: Algorithm, networks: Callable[[PyTree], tuple[Recurrent, ...]]) -> Algorithm:
     """Returns an algorithm that acts with the memory of its networks.
 
     The memory is one array ``(n_envs, n_numbers)``, of all networks with memory in the order of their slots, so that critics

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import optax
 
 from rejeu.core.algorithm import Clipped, Elementwise, Optimizer
+from rejeu.core.types import Settings
 
 WEIGHT_DECAY = 1e-4
 """Decoupled weight decay of ``"adamw"``, which is multiplied by the learning rate as well."""
@@ -42,7 +43,7 @@ OPTIMIZERS: dict[str, Callable[..., optax.GradientTransformation]] = {
     "sgd": lambda **settings: optax.identity(),
 }
 """The values of ``optimizer`` by name; those that are variants of Adam take an algorithm's settings ``b1`` and ``eps``."""
-DEFAULTS: dict[str, dict[str, Any]] = {"adamw": {"weight_decay": WEIGHT_DECAY}, "rmsprop": {"decay": RMSPROP_DECAY}}
+DEFAULTS: dict[str, Settings] = {"adamw": {"weight_decay": WEIGHT_DECAY}, "rmsprop": {"decay": RMSPROP_DECAY}}
 """Settings of an optimizer that is given as a dict, where they differ from Optax's."""
 
 
@@ -50,7 +51,7 @@ class Named(NamedTuple):
     """An optimizer by its name, with settings that a file contains: ``{"name": "adamw", "weight_decay": 1e-2}``."""
 
     name: str
-    settings: tuple[tuple[str, Any], ...]
+    settings: tuple[tuple[str, object], ...]
     """Arguments of the Optax transformation (``b1``, ``b2``, ``eps``, ``decay``), and ``weight_decay`` and ``momentum``."""
 
     def make(self, **adam: float) -> optax.GradientTransformation:
@@ -67,7 +68,7 @@ class Named(NamedTuple):
         return optax.chain(*steps, *decays) if self.name in ("adamw", "lion") else optax.chain(*decays, *steps)
 
 
-def parse(key: str, value: Any) -> Any:
+def parse(key: str, value: object) -> Any:
     """Returns the setting ``optimizer``, checked.
 
     Raises:
@@ -123,7 +124,7 @@ def _unlimited(optimizer: Any, **adam: float) -> optax.GradientTransformation:
     return optax.chain(transformation, optax.scale(-1.0))  # Optax adds updates; the direction is subtracted
 
 
-def name(optimizer: Any) -> str:
+def name(optimizer: object) -> str:
     """Returns the name under which a file mentions an optimizer of the user's own."""
     function = optimizer.func if isinstance(optimizer, partial) else optimizer
     return getattr(function, "__name__", type(function).__name__)

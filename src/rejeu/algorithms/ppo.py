@@ -52,6 +52,7 @@ from rejeu.core import schedules
 from rejeu.core.algorithm import EXPLAINED_VARIANCE, GRADIENT_STEPS, Algorithm, Clock, Metrics, PyTree, Rollout
 from rejeu.core.prng import nth
 from rejeu.core.schedules import Schedule, at
+from rejeu.core.types import Scalar
 from rejeu.core.validation import coerce, number, whole
 
 ADAM_EPSILON = 1e-5
@@ -138,7 +139,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
 
 
 def metrics_of(
-    network: Any,
+    network: PyTree,
     n_steps: Array,
     losses: Losses,
     value: Array,
@@ -165,15 +166,15 @@ def metrics_of(
 
 
 def epochs(
-    loss: Callable[[Any, Any, Any, Clock], tuple[Array, Losses]],
-    network: Any,
+    loss: Callable[[PyTree, PyTree, PyTree, Clock], tuple[Array, Losses]],
+    network: PyTree,
     optimizer_state: PyTree,
-    minibatch: Callable[[Array], Any],
+    minibatch: Callable[[Array], PyTree],
     n_minibatches: Array,
     optimizer: optax.GradientTransformation,
     config: Config,
     clock: Clock,
-) -> tuple[Any, PyTree, Array, Losses]:
+) -> tuple[PyTree, PyTree, Array, Losses]:
     """Takes a gradient step on each minibatch, and returns network, optimizer, steps taken and mean losses.
 
     Args:
@@ -187,13 +188,13 @@ def epochs(
         clock: the progress of the run.
     """
 
-    def continues(carry: tuple[Array, Array, Any, PyTree, Losses]) -> Array:
+    def continues(carry: tuple[Array, Array, PyTree, PyTree, Losses]) -> Array:
         i, stopped, *_ = carry
         return (i < n_minibatches) & ~stopped
 
     def step(
-        carry: tuple[Array, Array, Any, PyTree, Losses],
-    ) -> tuple[Array, Array, Any, PyTree, Losses]:
+        carry: tuple[Array, Array, PyTree, PyTree, Losses],
+    ) -> tuple[Array, Array, PyTree, PyTree, Losses]:
         i, stopped, network, optimizer_state, sums = carry
         (_, losses), gradients = jax.value_and_grad(loss, has_aux=True)(network, minibatch(i), config, clock)
         after, after_state = clip_and_descend(network, gradients, optimizer_state, optimizer, config, clock.progress)
@@ -236,6 +237,6 @@ def loss_of(distribution: Any, value: Array, batch: Samples, config: Config, clo
     return total, Losses(policy_loss, value_loss, entropy, approx_kl, clip_fraction)
 
 
-def surrogate(ratio: Array, advantage: Array, clip: Any) -> Array:
+def surrogate(ratio: Array, advantage: Array, clip: Scalar) -> Array:
     """Returns the clipped policy loss of each step (arXiv 1707.06347, equation 7, negated)."""
     return -jnp.minimum(ratio * advantage, jnp.clip(ratio, 1.0 - clip, 1.0 + clip) * advantage)

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax.numpy as jnp
 from gymnasium import spaces
@@ -65,7 +65,9 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
 def quantile_returns(n_quantiles: int) -> Returns:
     """Returns what learns so many quantiles of the return. Priorities go by the difference of the two means."""
 
-    def loss(network: Any, obs: PyTree, action: Array, target: Array, key: Any) -> tuple[Array, Array, Array]:
+    def loss(
+        network: PyTree, obs: PyTree, action: Array, target: Array, key: Array | None
+    ) -> tuple[Array, Array, Array]:
         return quantile_loss(taken(network(obs), action), target)
 
     return Returns(

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import equinox as eqx
 import jax
@@ -128,8 +128,8 @@ Memory = tuple[tuple[Array, ...], ...]
 class RecurrentActorCritic(eqx.Module):
     """Observation and memory to a distribution over actions and to a value."""
 
-    encoder: Any
-    value_encoder: Any
+    encoder: PyTree
+    value_encoder: PyTree
     """Of the value's cell; None where the policy's is shared."""
     cells: tuple[Cell, ...]
     """The policy's, and the value's where it has its own."""

@@ -16,7 +16,7 @@ last observation.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -42,7 +42,7 @@ OPTIMIZER = optimizers.make("adam")
 class State(eqx.Module):
     """The state of an algorithm, and that of its bonus."""
 
-    learner: Any
+    learner: PyTree
     predictor: Network
     target: Network
     """Its weights never change."""
@@ -75,7 +75,7 @@ def with_rnd(algorithm: Algorithm, obs_leaves: tuple[Leaf, ...], config: RndConf
         optimizer = OPTIMIZER.init(predictor)
         return State(algorithm.init(key), predictor, target, optimizer, normalizer.init(), keys[2], jnp.int32(0))
 
-    def update(state: State, batch: Any, clock: Clock) -> tuple[State, Metrics]:
+    def update(state: State, batch: PyTree, clock: Clock) -> tuple[State, Metrics]:
         next_obs, valid = rows_read(batch.next_obs), jnp.ones_like(batch.reward, bool)
         if isinstance(batch, Rollout):
             next_obs, valid = flat(next_obs), batch.valid.reshape(-1)

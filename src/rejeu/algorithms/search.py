@@ -48,7 +48,7 @@ class Range:
         """Returns whether a value lies in the range."""
         return is_number(value) and self.low <= value <= self.high and not (self.is_whole and value != int(value))
 
-    def ends(self) -> tuple[Any, ...]:
+    def ends(self) -> tuple[float, ...]:
         """Returns the extreme values."""
         return self.low, self.high
 
@@ -91,21 +91,21 @@ class Integers(Range):
 class Choice:
     """One of several values, which may be anything that JSON can express."""
 
-    values: tuple[Any, ...]
+    values: tuple[object, ...]
 
     def __post_init__(self) -> None:
         if len({plain(value) for value in self.values}) < max(len(self.values), 2):
             raise ValueError(f"a choice needs two or more different values, got {list(self.values)}")
 
-    def contains(self, value: Any) -> bool:
+    def contains(self, value: object) -> bool:
         """Returns whether a value is one of them."""
         return plain(value) in map(plain, self.values)
 
-    def index(self, value: Any) -> int:
+    def index(self, value: object) -> int:
         """Returns the position of a value, which is one of them; 1 and 1.0 are the same."""
         return [*map(plain, self.values)].index(plain(value))
 
-    def ends(self) -> tuple[Any, ...]:
+    def ends(self) -> tuple[object, ...]:
         """Returns all values."""
         return self.values
 
@@ -119,7 +119,7 @@ SearchSpace = Mapping[str, Dimension]
 """Where hyperparameters are searched, by their names."""
 
 
-def plain(value: Any) -> str:
+def plain(value: object) -> str:
     """Returns a value as JSON text, the same for equal numbers of different types.
 
     >>> plain((1, True)) == plain([1.0, True])

@@ -44,6 +44,7 @@ from rejeu.core.algorithm import (
 )
 from rejeu.core.prng import nth
 from rejeu.core.schedules import at
+from rejeu.core.types import Scalar
 from rejeu.core.validation import coerce, is_number, number, whole
 
 ALPHA_OPTIMIZER = optimizers.make("adam")
@@ -98,11 +99,11 @@ class EntropyConfig(OffPolicyConfig):
 class State(eqx.Module):
     """Everything that a soft actor-critic learns; every leaf is an array."""
 
-    actor: Any
+    actor: PyTree
     """The network of the policy, with its running statistics if it has any."""
-    critics: Any
+    critics: PyTree
     """All critics, stacked along a leading axis."""
-    target_critics: Any = eqx.field(metadata=AVERAGED)
+    target_critics: PyTree = eqx.field(metadata=AVERAGED)
     """None without target networks."""
     log_alpha: Array
     actor_optimizer: PyTree
@@ -124,24 +125,24 @@ class SoftCritic(NamedTuple):
     Keys are for what is drawn at random, such as actions.
     """
 
-    actor: Callable[[Array], Any]
+    actor: Callable[[Array], PyTree]
     """``actor(key)``: the network of the policy."""
-    critics: Callable[[Array], Any]
+    critics: Callable[[Array], PyTree]
     """``critics(key)``: all critics, stacked along a leading axis."""
-    target: Callable[[Any, Any, Array, Transition, Array], Any]
+    target: Callable[[PyTree, PyTree, Array, Transition, Array], PyTree]
     """``target(actor, target_critics, alpha, batch, key)``: what the critics learn. It is not differentiated."""
-    critics_loss: Callable[[Any, Transition, Any, Array], tuple[Array, Any]]
+    critics_loss: Callable[[PyTree, Transition, PyTree, Array], tuple[Array, PyTree]]
     """``critics_loss(critics, batch, target, key)``: the loss, and what ``measure`` takes. The key is that of
     ``actor_loss``."""
-    actor_loss: Callable[[Any, Any, Array, Transition, Array], tuple[Array, Any]]
+    actor_loss: Callable[[PyTree, PyTree, Array, Transition, Array], tuple[Array, PyTree]]
     """``actor_loss(actor, critics, alpha, batch, key)``: the loss; the log-probabilities of the policy's actions,
     ``(batch,)``, or ``(batch, n)`` for n temperatures."""
-    target_entropy: Callable[[PyTree], Any]
+    target_entropy: Callable[[PyTree], Scalar]
     """``target_entropy(obs)``: the entropy that the temperature keeps the policy at, in nats, ``()`` or ``(1, n)``."""
-    measure: Callable[[Any, Any], tuple[Array, Array]] = lambda errors, target: errors
+    measure: Callable[[PyTree, PyTree], tuple[Array, Array]] = lambda errors, target: errors
     """``measure(extra, target)``: the values of the actions taken and the TD errors, ``(n_critics, batch)`` each, of what came
     with the loss, which may be they."""
-    minimize: Callable[..., tuple[Any, PyTree, Array, Any]] = minimize
+    minimize: Callable[..., tuple[PyTree, PyTree, Array, PyTree]] = minimize
     """How a network takes a step on its loss, as :func:`rejeu.core.algorithm.minimize`."""
     has_targets: bool = True
     """Whether there are target critics."""
@@ -153,7 +154,9 @@ class SoftCritic(NamedTuple):
     """``()`` for one temperature, ``(n,)`` for n."""
 
 
-def soft_actor_critic(parts: SoftCritic, config: Any, explore: Any, exploit: Any, optimizer: Optimizer) -> Algorithm:
+def soft_actor_critic(
+    parts: SoftCritic, config: Any, explore: Callable[..., Array], exploit: Callable[..., Array], optimizer: Optimizer
+) -> Algorithm:
     """Returns the algorithm with these networks and equations, which acts by ``explore`` and ``exploit`` of an algorithm."""
     settings = {"parts": parts, "config": config, "optimizer": optimizer}
     init, learn = partial(initial_state, **settings), partial(update, **settings)
@@ -209,7 +212,7 @@ def update(
     return state, metrics | {"q_value": jnp.mean(values), TD_ERROR: jnp.mean(jnp.abs(error), axis=0)}
 
 
-def after_critics(state: State, critics: Any, optimizer_state: PyTree, config: Any) -> State:
+def after_critics(state: State, critics: PyTree, optimizer_state: PyTree, config: Any) -> State:
     """Returns the state with new critics, their optimizer's state, and the targets moved by ``config.tau`` if they are due."""
     n_updates, targets = state.n_updates + 1, state.target_critics
     if targets is not None:
@@ -220,7 +223,13 @@ def after_critics(state: State, critics: Any, optimizer_state: PyTree, config: A
 
 
 def after_actor(
-    state: State, actor: Any, optimizer_state: PyTree, log_prob: Array, target_entropy: Any, config: Any, rate: Any
+    state: State,
+    actor: PyTree,
+    optimizer_state: PyTree,
+    log_prob: Array,
+    target_entropy: Scalar,
+    config: Any,
+    rate: Scalar,
 ) -> State:
     """Returns the state with a new actor and its optimizer's state, after a step of the temperature if it is learned.
 
@@ -236,7 +245,7 @@ def after_actor(
 
 def every(
     policy_delay: int, state: State, improve: Callable[[State], tuple[State, Array, Array]]
-) -> tuple[State, Any, Any]:
+) -> tuple[State, PyTree, PyTree]:
     """Returns ``improve(state)`` at every ``policy_delay``-th update of the critics, which ``state.n_updates`` counts.
 
     That is the state after a step of the actor, its loss and the entropy; at other updates those of its latest step.
@@ -252,7 +261,7 @@ def every(
     return state, state.actor_loss, state.entropy
 
 
-def temperature_loss(log_alpha: Array, log_prob: Array, target_entropy: Any) -> Array:
+def temperature_loss(log_alpha: Array, log_prob: Array, target_entropy: Scalar) -> Array:
     """Returns the loss that raises the temperature while the policy's entropy is below its target.
 
     Of several temperatures ``(n,)``, with ``log_prob (batch, n)`` and targets ``(1, n)``, it is the sum.
@@ -261,7 +270,7 @@ def temperature_loss(log_alpha: Array, log_prob: Array, target_entropy: Any) -> 
     return -jnp.sum(jnp.mean(weight * (jax.lax.stop_gradient(log_prob) + target_entropy), axis=0))
 
 
-def entropy_target(key: str, value: Any) -> float | str:
+def entropy_target(key: str, value: object) -> float | str:
     """Returns a target entropy: ``"auto"``, ``"std_"`` and a positive number, or a number."""
     if isinstance(value, str) and value != "auto":
         try:

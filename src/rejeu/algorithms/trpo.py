@@ -23,7 +23,7 @@ import math
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -190,12 +190,12 @@ def policy_step(network: ActorCritic, data: Samples, config: Config) -> tuple[Ac
     of_value, policy = eqx.partition(network, is_value(network))
     before = jax.lax.stop_gradient(network.policy(data.obs))
 
-    def objective(policy: Any) -> Array:
+    def objective(policy: PyTree) -> Array:
         distribution = eqx.combine(policy, of_value).policy(data.obs)
         log_ratio = jnp.where(data.valid, distribution.log_prob(data.action) - data.log_prob, 0.0)
         return masked_mean(jnp.exp(log_ratio) * data.advantage, data.valid)
 
-    def divergence(policy: Any) -> Array:
+    def divergence(policy: PyTree) -> Array:
         after = eqx.combine(policy, of_value).policy(data.obs)
         return masked_mean(before.kl_divergence(after), data.valid)
 
@@ -205,7 +205,7 @@ def policy_step(network: ActorCritic, data: Samples, config: Config) -> tuple[Ac
     curvature = dot(direction, product(direction))
     longest = jnp.sqrt(2.0 * config.target_kl / jnp.maximum(curvature, jnp.finfo(jnp.float32).tiny))
 
-    def moved(attempt: Array) -> Any:
+    def moved(attempt: Array) -> PyTree:
         length = longest * config.line_search_shrinking_factor ** attempt.astype(jnp.float32)
         return jax.tree.map(lambda p, d: p + length * d, policy, direction)
 
@@ -225,17 +225,17 @@ def policy_step(network: ActorCritic, data: Samples, config: Config) -> tuple[Ac
     return eqx.combine(policy, of_value), step
 
 
-def damped_product(function: Callable[[Any], Array], at_point: Any, damping: float) -> Callable[[Any], Any]:
+def damped_product(function: Callable[[PyTree], Array], at_point: PyTree, damping: float) -> Callable[[PyTree], PyTree]:
     """Returns the product of a vector with the Hessian of ``function`` at ``at_point``, plus ``damping`` times the vector."""
 
-    def product(vector: Any) -> Any:
+    def product(vector: PyTree) -> PyTree:
         _, curved = jax.jvp(jax.grad(function), (at_point,), (vector,))
         return jax.tree.map(lambda h, v: h + damping * v, curved, vector)
 
     return product
 
 
-def dot(first: Any, right: Any) -> Array:
+def dot(first: PyTree, right: PyTree) -> Array:
     """Returns the sum of the products of all numbers of two trees, ``float32[]``."""
     return jnp.sum(jnp.stack(jax.tree.leaves(jax.tree.map(lambda a, b: jnp.sum(a * b), first, right))))
 

@@ -11,13 +11,14 @@ held. Unlike in the authors' code, the actor's learning rate falls with that of 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax.numpy as jnp
 from jax import Array
 
 from rejeu.algorithms import flashsac
 from rejeu.algorithms.flashsac import LOG_STD_RANGE, make
+from rejeu.core.algorithm import PyTree
 from rejeu.core.normalization import NormalizationConfig
 from rejeu.core.schedules import Linear, Schedule
 from rejeu.networks import Widths
@@ -53,7 +54,7 @@ class Config(flashsac.Config):
     def check_widths(self) -> None:
         """Raises nothing: layers may have any width."""
 
-    def torso(self, key: Array, n_inputs: int, widths: tuple[int, ...]) -> Any:
+    def torso(self, key: Array, n_inputs: int, widths: tuple[int, ...]) -> PyTree:
         return NormalizedMLP(key, n_inputs, widths, self.policy_kwargs.activation_fn)
 
     def log_std(self, outputs: Array) -> Array:

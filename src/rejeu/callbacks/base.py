@@ -11,6 +11,7 @@ from typing import Any, ClassVar, Protocol, runtime_checkable
 from rejeu.core.errors import CheckpointError
 from rejeu.core.interrupt import Stopped
 from rejeu.core.records import WRONG, brief, shown
+from rejeu.core.types import JsonObject
 from rejeu.training.run import Progress
 
 Callback = Callable[[Any, Progress], bool | None]
@@ -49,10 +50,10 @@ class TrainingCallback(ABC):
 class Stateful(Protocol):
     """A callback whose state a checkpoint contains."""
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> JsonObject:
         """Returns its state: numbers, strings, lists, dicts and arrays."""
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+    def load_state_dict(self, state: Mapping[str, object]) -> None:
         """Restores what :meth:`state_dict` returned."""
 
 
@@ -96,7 +97,7 @@ def runs_last(callback: Callback) -> bool:
     return isinstance(callback, TrainingCallback) and callback.runs_last
 
 
-def stateful(callbacks: Iterable[Any]) -> list[Stateful]:
+def stateful(callbacks: Iterable[object]) -> list[Stateful]:
     """Returns the callbacks whose state a checkpoint contains."""
     return [callback for callback in callbacks if isinstance(callback, Stateful)]
 

@@ -11,6 +11,7 @@ import gymnasium as gym
 import numpy as np
 
 from rejeu.callbacks.base import TrainingCallback, crossed, step_before
+from rejeu.core.types import JsonObject
 from rejeu.core.validation import whole
 from rejeu.envs.make import VectorEnv, make_vector
 from rejeu.logs.evaluation import Evaluation
@@ -117,7 +118,7 @@ class Evaluate(TrainingCallback):
             self.report(result, is_best)
         return result
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> JsonObject:
         """Returns its results for a checkpoint."""
         parts = [r.evaluation for r in self.results]
         columns = {key: [getattr(evaluated, key) for evaluated in parts] for key in EVALUATED}

@@ -10,6 +10,7 @@ from typing import Any
 import gymnasium as gym
 
 from rejeu.callbacks.base import crossed, step_before
+from rejeu.core.types import JsonObject
 from rejeu.core.validation import whole
 from rejeu.logs.video import record_video
 from rejeu.training.run import Progress
@@ -81,7 +82,7 @@ class RecordVideo:
                 self.paths.append(path)
                 agent.logger.write_video(progress.step, path)
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> JsonObject:
         """Returns its state for a checkpoint."""
         return {"n_episodes": self._n_episodes, "paths": [str(path) for path in self.paths]}
 

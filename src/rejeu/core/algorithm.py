@@ -9,16 +9,16 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import optax
 from jax import Array
 
+from rejeu.core.types import Action, AnyArray, PyTree, Scalar
 from rejeu.core.xla import one_kernel, outlined
 
-PyTree = Any
 Metrics = dict[str, Array]
 """Named scalars of one update, still on the device."""
 
@@ -33,20 +33,20 @@ class Transition(NamedTuple):
 
     obs: PyTree
     """Observation, any pytree of arrays ``(batch, ...)``."""
-    action: Any
+    action: Action
     """Action, ``(batch, action_dim)`` in [-1, 1] for continuous actions, ``(batch,)`` indices for discrete ones."""
-    reward: Any
+    reward: AnyArray
     """Reward, ``(batch,)``, summed and discounted over n steps for n-step returns."""
     next_obs: PyTree
     """The observation that the target bootstraps from, same structure as ``obs``."""
-    discount: Any
+    discount: AnyArray
     """Weight of the bootstrapped value, ``(batch,)`` in [0, 1]."""
-    weight: Any = None
+    weight: PyTree = None
     """Importance weights of prioritized replay, ``(batch,)`` in (0, 1]; None where all steps are equally likely."""
-    rewards: Any = None
+    rewards: AnyArray = None
     """The discounted rewards that ``reward`` is the sum of, ``(batch, n)``, where normalization clips each; None
     elsewhere. Algorithms do not see them."""
-    next_action: Any = None
+    next_action: Action = None
     """The action that was taken at ``next_obs``, as ``action``, NaN where there was none; None unless the algorithm's
     configuration has ``needs_next_action``."""
 
@@ -56,12 +56,12 @@ class Masked(NamedTuple):
 
     obs: PyTree
     """The observation itself."""
-    mask: Any
+    mask: AnyArray
     """Whether each choice is allowed, ``bool (batch, n)``: n is the number of actions of a Discrete space, the sum of the
     numbers of a MultiDiscrete one, and of MultiBinary the bits that may be 1."""
 
 
-def unmasked(obs: PyTree) -> tuple[PyTree, Any]:
+def unmasked(obs: PyTree) -> tuple[PyTree, AnyArray]:
     """Returns observations and their mask, None where they have none."""
     return (obs.obs, obs.mask) if isinstance(obs, Masked) else (obs, None)
 
@@ -76,7 +76,7 @@ def some_allowed(obs: PyTree) -> PyTree:
 class Remembered(NamedTuple):
     """The memory that networks keep of the observations up to the present one, in place of it."""
 
-    memory: Any
+    memory: PyTree
     """``(batch, n_numbers)``, of all networks of an algorithm."""
 
 
@@ -89,13 +89,13 @@ class Sequences(NamedTuple):
 
     obs: PyTree
     """Observations in the order in which they were made, ``(n, rows, ...)``; also final ones, without a step."""
-    begins: Any
+    begins: AnyArray
     """Where an episode begins with a row, ``bool (n, rows)``."""
-    n_absent: Any
+    n_absent: AnyArray
     """How many of the first rows were no longer there and stand for nothing, ``int32 (n,)``."""
-    memory: Any
+    memory: PyTree
     """The memory before the first row that is there, ``(n, n_numbers)``."""
-    reads: Any
+    reads: AnyArray
     """Which rows are read, ``int32 (n, n_reads)``."""
 
 
@@ -118,22 +118,22 @@ class Rollout(NamedTuple):
 
     obs: PyTree
     """Observations, as of :class:`Transition`."""
-    action: Any
+    action: Action
     """Actions as they were drawn: of continuous ones, not clipped."""
-    reward: Any
+    reward: AnyArray
     """Rewards, ``(steps, n_envs)``."""
     next_obs: PyTree
     """True successors of ``obs``, also where an episode ended."""
-    discount: Any
+    discount: AnyArray
     """0 where the MDP terminated, gamma elsewhere, ``(steps, n_envs)``."""
-    ended: Any
+    ended: AnyArray
     """Where an episode ended, by terminal state or time limit, ``bool (steps, n_envs)``: the step after it belongs to
     another."""
-    valid: Any
+    valid: AnyArray
     """Which steps there are, ``bool (steps, n_envs)``; the others are padding. Padding follows what is valid."""
-    running_return: Any
+    running_return: AnyArray
     """The discounted sum of the rewards of the episode so far, ``sum_k gamma^k r_{t-k}``, ``(steps, n_envs)``."""
-    started: Any
+    started: AnyArray
     """Where an episode began with the first step, ``bool (n_envs,)``."""
     carry: PyTree
     """The memory of a policy before the first step, leaves ``(n_envs, ...)``; ``()`` without memory."""
@@ -142,13 +142,13 @@ class Rollout(NamedTuple):
 class Clock(NamedTuple):
     """Where a run stands; passed to exploration and update so that schedules are pure functions of it."""
 
-    step: Any
+    step: Scalar
     """Environment steps taken so far, over all environments."""
-    episode: Any
+    episode: Scalar
     """Episodes finished so far, over all environments."""
-    progress: Any
+    progress: Scalar
     """How far schedules are, in [0, 1]: the fraction that is done of the present ``learn`` call and those it continues."""
-    n_envs: Any = 1
+    n_envs: Scalar = 1
     """Environments that step at once, by which ``step`` grows."""
 
 
@@ -179,7 +179,7 @@ class Algorithm(NamedTuple):
     """``explore(actor, obs, key, clock) -> action`` for training, ``(batch, ...)``."""
     exploit: Callable[[PyTree, PyTree], Array]
     """``exploit(actor, obs) -> action``, the deterministic policy, ``(batch, ...)``."""
-    update: Callable[[PyTree, Any, Clock], tuple[PyTree, Metrics]]
+    update: Callable[[PyTree, PyTree, Clock], tuple[PyTree, Metrics]]
     """``update(state, batch, clock) -> (state, metrics)``: one gradient step of everything that learns on a batch of
     :class:`Transition`, or for on-policy algorithms all the steps that one :class:`Rollout` is good for. The metrics are
     scalars, and under ``TD_ERROR`` the absolute TD errors ``(batch,)`` that prioritized replay goes by."""
@@ -189,14 +189,14 @@ class Algorithm(NamedTuple):
     recall: Callable[[PyTree, PyTree, PyTree, Array], tuple[Array, PyTree]] | None = None
     """``recall(carry, actor, obs, ended) -> (action, carry)``: the deterministic policy where it has a memory, with the
     carry of ``explorer``. None where the present observation is all that it needs."""
-    action_values: Callable[[PyTree, PyTree, Any], Array] | None = None
+    action_values: Callable[[PyTree, PyTree, Action], Array] | None = None
     """``action_values(state, obs, action)``: the critics' values of actions ``(batch, action_dim)`` in [-1, 1],
     ``(n_critics, batch)``; for Discrete actions the values of all of them, ``(n_critics, batch, n_actions)``, and
     ``action`` is None. None for algorithms without such critics."""
     state_value: Callable[[PyTree, PyTree, PyTree, Array], Array] | None = None
     """``state_value(carry, actor, obs, ended) -> (batch,)``: the critic's values of observations, with the carry of
     ``explorer`` where the policy has a memory and ``()`` elsewhere. None for algorithms without such a critic."""
-    imitation: Callable[[PyTree, PyTree, Any], Array] | None = None
+    imitation: Callable[[PyTree, PyTree, Action], Array] | None = None
     """``imitation(actor, obs, action) -> (batch,)``: the loss of an actor for actions that were demonstrated. None: the
     squared error of ``exploit``, for continuous actions."""
     observe: Callable[[PyTree, PyTree, Array], PyTree] | None = None
@@ -222,16 +222,16 @@ AVERAGED = {"averaged": True}
 An agent's summary leaves such fields out."""
 
 
-def value_and_grad(loss: Callable[..., Any], has_aux: bool = False) -> Callable[..., Any]:
+def value_and_grad(loss: Callable[..., PyTree], has_aux: bool = False) -> Callable[..., tuple[PyTree, PyTree]]:
     """Returns ``jax.value_and_grad(loss, has_aux=has_aux)``, in a form that XLA runs faster on a CPU."""
     return outlined(jax.value_and_grad(loss, has_aux=has_aux))
 
 
-def without_gradient(function: Callable[..., Any]) -> Callable[..., Any]:
+def without_gradient(function: Callable[..., PyTree]) -> Callable[..., PyTree]:
     """Returns ``function`` with outputs that are not differentiated, in a form that XLA runs faster on a CPU."""
 
     @functools.wraps(function)
-    def stopped(*arguments: Any) -> Any:
+    def stopped(*arguments: object) -> PyTree:
         return jax.lax.stop_gradient(function(*arguments))
 
     return outlined(stopped)
@@ -258,7 +258,7 @@ Optimizer: TypeAlias = optax.GradientTransformation | Clipped
 
 
 def descend(
-    params: PyTree, gradients: PyTree, optimizer_state: PyTree, optimizer: Optimizer, rate: Any
+    params: PyTree, gradients: PyTree, optimizer_state: PyTree, optimizer: Optimizer, rate: Scalar
 ) -> tuple[PyTree, PyTree]:
     """Returns the parameters and the optimizer state after one step of ``rate`` against ``gradients``.
 
@@ -277,20 +277,22 @@ def descend(
     return step(params, gradients, optimizer_state, optimizer, rate)
 
 
-def _descend(params: PyTree, gradients: PyTree, optimizer_state: PyTree, optimizer: Any, rate: Any) -> Any:
+def _descend(
+    params: PyTree, gradients: PyTree, optimizer_state: PyTree, optimizer: optax.GradientTransformation, rate: Scalar
+) -> tuple[PyTree, PyTree]:
     direction, optimizer_state = optimizer.update(gradients, optimizer_state, params)
     step = lambda rate, weights, d: jax.tree.map(lambda p, d: p - rate * d, weights, d)  # noqa: E731
     return jax.tree.map(step, rate, params, direction), optimizer_state
 
 
 def minimize(
-    loss: Callable[..., tuple[Array, Any]],
+    loss: Callable[..., tuple[Array, PyTree]],
     params: PyTree,
     optimizer_state: PyTree,
     optimizer: Optimizer,
-    rate: Any,
-    *arguments: Any,
-) -> tuple[PyTree, PyTree, Array, Any]:
+    rate: Scalar,
+    *arguments: object,
+) -> tuple[PyTree, PyTree, Array, PyTree]:
     """Takes one gradient step on ``loss(params, *arguments)``, which returns a value and something else.
 
     Returns the parameters and the optimizer state after the step, the loss, and the other value that ``loss`` returned.
@@ -318,12 +320,12 @@ def weighted_mean(values: Array, weight: Array | None) -> Array:
 
 
 @one_kernel
-def polyak(target: PyTree, online: PyTree, tau: Any) -> PyTree:
+def polyak(target: PyTree, online: PyTree, tau: Scalar) -> PyTree:
     """Returns ``tau * online + (1 - tau) * target``, leaf by leaf."""
     return optax.incremental_update(online, target, tau)
 
 
-def tau_at(n_updates: Array, tau: float, interval: int) -> Any:
+def tau_at(n_updates: Array, tau: float, interval: int) -> Scalar:
     """Returns ``tau`` at every ``interval``-th update and 0 at the others, at which :func:`polyak` keeps the targets.
 
     >>> [float(tau_at(jnp.int32(n), 0.5, 3)) for n in (1, 2, 3, 4)]

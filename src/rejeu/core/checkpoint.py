@@ -30,6 +30,7 @@ from rejeu.core import atomic
 from rejeu.core.errors import CheckpointError
 from rejeu.core.hardware import physical_memory
 from rejeu.core.records import Malformed, is_sparse, parse_json, shown, stored_size
+from rejeu.core.types import PyTree
 
 DTYPES = {"F32": "float32", "F64": "float64", "I64": "int64", "I32": "int32", "I16": "int16", "I8": "int8"}
 DTYPES |= {"U64": "uint64", "U32": "uint32", "U16": "uint16", "U8": "uint8", "BOOL": "bool", "F16": "float16"}
@@ -79,7 +80,7 @@ def check_table(path: Path) -> None:
         raise Malformed(f"its table has {size} bytes, expected at most {MAX_TABLE}")
 
 
-def contiguous(name: str, value: Any) -> np.ndarray:
+def contiguous(name: str, value: object) -> np.ndarray:
     """Returns an array as it is written: contiguous and little-endian.
 
     Raises:
@@ -137,7 +138,6 @@ CHECKSUMS = "checksums"
 RESERVED = ("schema", "kind", CHECKSUMS)
 
 Header = dict[str, Any]
-PyTree = Any
 
 
 def resolve(path: str | Path, suffix: str = SUFFIX) -> Path:
@@ -152,7 +152,7 @@ def resolve(path: str | Path, suffix: str = SUFFIX) -> Path:
     return path if path.suffix else path.with_name(path.name + suffix)
 
 
-def write(path: str | Path, file_type: str, arrays: Mapping[str, Any], header: Mapping[str, Any]) -> Path:
+def write(path: str | Path, file_type: str, arrays: Mapping[str, object], header: Mapping[str, object]) -> Path:
     """Writes a file and returns its path; an existing file is replaced only once the new one is on disk.
 
     Arrays are converted and written one at a time, so that no second copy of a replay buffer is made.

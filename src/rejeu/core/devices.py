@@ -19,7 +19,7 @@ INSTALL = 'pip install "jax[cuda13]"'
 """The command that brings JAX for NVIDIA GPUs; ``cuda12`` is for older drivers."""
 
 
-def named(device: Any, option: str = "device") -> str:
+def named(device: object, option: str = "device") -> str:
     """Returns the name of a device among ``NAMES``; ``"cuda"`` and PyTorch's devices are accepted.
 
     Raises:

@@ -225,7 +225,7 @@ def width(distribution: Any) -> int:
     return int(distribution[0].shape[-1])
 
 
-def is_squashed(distribution: Any) -> bool:
+def is_squashed(distribution: object) -> bool:
     """Returns whether a distribution has no entropy in closed form, because it or a part of it is a :class:`TanhNormal`."""
     if isinstance(distribution, Joint):
         return any(map(is_squashed, distribution.parts))

@@ -6,7 +6,7 @@ import os
 import tomllib
 from functools import cache
 from importlib import resources
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 from rejeu.core.validation import choice
 
@@ -31,7 +31,7 @@ def french() -> dict[str, str]:
     return tomllib.loads((resources.files("rejeu.core") / "language.toml").read_text(encoding="utf-8"))
 
 
-def said(text: str, *values: Any, language: Language | None = None) -> str:
+def said(text: str, *values: object, language: Language | None = None) -> str:
     """Returns a text in a language, by default the chosen one, with values in place of its braces.
 
     >>> said("step {}", 3, language="fr"), said("a text without a translation", language="fr")

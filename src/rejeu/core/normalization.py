@@ -60,7 +60,7 @@ class NormalizationConfig:
         coerce(self, "max_return", number, above=0, optional=True)
 
 
-def parse(value: Any) -> NormalizationConfig | None:
+def parse(value: object) -> NormalizationConfig | None:
     """Returns the settings that ``normalize`` stands for: None for False or None, the defaults for True.
 
     Raises:
@@ -127,7 +127,7 @@ class Statistics(NamedTuple):
 class State(eqx.Module):
     """The state of an algorithm, and the statistics by which its observations and rewards are normalized."""
 
-    learner: Any
+    learner: PyTree
     statistics: Statistics
 
 
@@ -253,7 +253,7 @@ def normalized(
     """
     normalizer = normalizer_of(leaves, config, gamma)
 
-    def update(state: State, batch: Any, clock: Clock) -> tuple[State, Metrics]:
+    def update(state: State, batch: PyTree, clock: Clock) -> tuple[State, Metrics]:
         if isinstance(batch, Rollout):
             batch, statistics = normalizer.rollout(state.statistics, batch)
         else:

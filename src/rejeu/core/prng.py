@@ -8,19 +8,20 @@ kernel. Keys of this module unroll it and give the same numbers as JAX's; all fu
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 from jax.extend.random import define_prng_impl
 
+from rejeu.core.types import Scalar
+
 ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
 PARITY = 0x1BD11BDA
 """The constants of the hash (table 2 and section 3.3 of the paper)."""
 
 
-def nth(key: Array, n: Any) -> Array:
+def nth(key: Array, n: Scalar) -> Array:
     """Returns the key that ``fold_in`` derives from ``key`` ``uint32[2]`` and ``n``, ``uint32[]`` or an int."""
     return jax.random.fold_in(jax.random.wrap_key_data(key, impl=IMPLEMENTATION), n)
 
@@ -66,7 +67,7 @@ def _split(key: Array, shape: tuple[int, ...]) -> Array:
     return _stored(jnp.stack(_hashes(key, shape), axis=-1))
 
 
-def _fold_in(key: Array, data: Any) -> Array:
+def _fold_in(key: Array, data: Scalar) -> Array:
     return _stored(jnp.stack(threefry(key, jnp.asarray(data, jnp.uint32))))
 
 

@@ -98,7 +98,7 @@ def read_json(path: Path, max_bytes: int) -> Any:
     return parse_json(read_bytes(path, max_bytes))
 
 
-def json_text(value: Any, indent: int = 1) -> str:
+def json_text(value: object, indent: int = 1) -> str:
     """Returns JSON values, also in dataclasses, as the text of a file.
 
     Raises:
@@ -116,7 +116,7 @@ def _as_dict(value: Any) -> dict[str, Any]:
     return {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
 
 
-def convert(value: Any, record_type: type[T]) -> T:
+def convert(value: object, record_type: type[T]) -> T:
     """Returns a JSON value, or one with arrays, as a record of type ``record_type``.
 
     Raises:
@@ -134,7 +134,7 @@ def convert(value: Any, record_type: type[T]) -> T:
         raise CheckpointError(f"{_received(value, path)}{problem[:1].lower()}{problem[1:]}") from None
 
 
-def is_deep(value: Any, max_depth: int) -> bool:
+def is_deep(value: object, max_depth: int) -> bool:
     """Returns whether a JSON value has more than ``max_depth`` levels."""
     level = [value]
     for _ in range(max_depth):
@@ -149,7 +149,7 @@ def is_deep(value: Any, max_depth: int) -> bool:
     return bool(level)
 
 
-def shown(value: Any, length: int = 100) -> str:
+def shown(value: object, length: int = 100) -> str:
     r"""Returns a value from a file as an error message may contain it: on one line, and shortened.
 
     >>> print(shown("héros\u202e\n"))
@@ -184,7 +184,7 @@ def _received(value: Any, path: str) -> str:
     return f"{name}={shown(repr(value), 40)}: "
 
 
-def encode(value: Any, arrays: dict[str, np.ndarray], name: str) -> Any:
+def encode(value: object, arrays: dict[str, np.ndarray], name: str) -> Any:
     """Returns ``value`` as JSON; its arrays are added to ``arrays`` under names that begin with ``name``.
 
     Raises:
@@ -211,7 +211,7 @@ def encode(value: Any, arrays: dict[str, np.ndarray], name: str) -> Any:
     raise TypeError(f"{name} is a {type(value).__name__}; expected numbers, strings, lists, tuples, dicts and arrays")
 
 
-def decode(value: Any, arrays: Mapping[str, np.ndarray]) -> Any:
+def decode(value: object, arrays: Mapping[str, np.ndarray]) -> Any:
     """Returns the value that :func:`encode` encoded.
 
     Raises:

@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from rejeu.core.types import Scalar
 from rejeu.core.validation import assign, coerce, number
 
 
@@ -41,7 +42,7 @@ class Linear:
         coerce(self, ("start", "end"), number)
         coerce(self, "fraction", number, above=0, most=1)
 
-    def __call__(self, progress: Any) -> Any:
+    def __call__(self, progress: Scalar) -> Any:
         done = _clip(progress / self.fraction)
         return self.start + (self.end - self.start) * done
 
@@ -65,7 +66,7 @@ class Exponential:
         coerce(self, ("start", "end"), number, above=0)
         coerce(self, "fraction", number, above=0, most=1)
 
-    def __call__(self, progress: Any) -> Any:
+    def __call__(self, progress: Scalar) -> Any:
         done = _clip(progress / self.fraction)
         return self.start * (self.end / self.start) ** done
 
@@ -86,7 +87,7 @@ class TableSchedule:
         if len(self.values) < 2 or not all(map(math.isfinite, self.values)):
             raise ValueError(f"a schedule needs two values or more, all finite; got {self.values!s:.80}")
 
-    def __call__(self, progress: Any) -> Any:
+    def __call__(self, progress: Scalar) -> Any:
         position = _clip(progress) * (len(self.values) - 1)
         if isinstance(position, int | float):
             below = min(int(position), len(self.values) - 2)
@@ -103,7 +104,7 @@ class Live:
     def __init__(self, value: float) -> None:
         self.value = value
 
-    def __call__(self, progress: Any) -> Any:
+    def __call__(self, progress: Scalar) -> Any:
         if isinstance(progress, int | float):
             return self.value
         shape = jax.ShapeDtypeStruct((), jnp.float32)
@@ -121,12 +122,12 @@ SCHEDULES: dict[str, type[Linear] | type[Exponential] | type[TableSchedule]] = {
 }
 
 
-def at(value: float | Schedule, progress: Any) -> Any:
+def at(value: float | Schedule, progress: Scalar) -> Any:
     """Returns the value of a number or of a schedule at ``progress``."""
     return value if isinstance(value, int | float) else value(progress)
 
 
-def parse(name: str, value: Any, least: float = -math.inf) -> float | Schedule:
+def parse(name: str, value: object, least: float = -math.inf) -> float | Schedule:
     """Returns a number or a schedule from what a user or a file gives.
 
     Accepted: a number, a schedule, ``"lin_3e-4"`` (RL Zoo's notation for a line to zero), the JSON form
@@ -144,7 +145,7 @@ def parse(name: str, value: Any, least: float = -math.inf) -> float | Schedule:
     return parsed
 
 
-def _schedule_of(name: str, value: Any) -> Schedule:
+def _schedule_of(name: str, value: object) -> Schedule:
     if isinstance(value, Linear | Exponential | TableSchedule):
         return value
     try:

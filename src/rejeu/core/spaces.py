@@ -6,11 +6,14 @@ import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from types import ModuleType
 from typing import Any, Literal
 
 import numpy as np
 from gymnasium import spaces
+from numpy.typing import DTypeLike
 
+from rejeu.core.types import Action, AnyArray, Observation, PyTree
 from rejeu.core.validation import choice
 
 POLICIES = ("MlpPolicy", "MultiInputPolicy", "CnnPolicy")
@@ -112,7 +115,7 @@ def structure(space: spaces.Space) -> Any:
     return jax.tree.structure(plain(space, space))
 
 
-def flat_keys(tree_structure: Any) -> list[str] | None:
+def flat_keys(tree_structure: PyTree) -> list[str] | None:
     """Returns the keys, in the order of :func:`leaves`, where observations are dicts of arrays and nothing deeper.
 
     None for any other structure. Reading such a dict by its keys is several times faster than flattening it as a tree.
@@ -124,7 +127,7 @@ def flat_keys(tree_structure: Any) -> list[str] | None:
     return list(skeleton) if is_flat else None
 
 
-def narrow(dtype: Any) -> str:
+def narrow(dtype: DTypeLike | None) -> str:
     """Returns the name of a dtype of 32 bits at most: 64-bit floats and integers become 32-bit."""
     return {"float64": "float32", "int64": "int32", "uint64": "uint32", "bool": "int8"}.get(
         np.dtype(dtype).name, np.dtype(dtype).name
@@ -163,7 +166,7 @@ def limits(leaf: Leaf) -> tuple[np.ndarray, np.ndarray]:
     return low, low + np.reshape(leaf.sizes, leaf.shape) - 1
 
 
-def keeps_values(array: np.ndarray, dtype: Any) -> bool:
+def keeps_values(array: np.ndarray, dtype: DTypeLike) -> bool:
     """Returns whether casting to ``dtype`` keeps the values, except for the precision of floats."""
     if array.dtype.kind not in "fiub":
         return False
@@ -173,7 +176,7 @@ def keeps_values(array: np.ndarray, dtype: Any) -> bool:
         return bool((array.astype(dtype) == array).all())
 
 
-def as_stored(value: Any, leaf: Leaf) -> np.ndarray:
+def as_stored(value: object, leaf: Leaf) -> np.ndarray:
     """Returns one or many values of a leaf as an array of its dtype; copies only if needed.
 
     Raises:
@@ -207,7 +210,7 @@ def is_finite(array: np.ndarray) -> bool:
     return bool(np.isfinite(array).all())
 
 
-def parts(space: spaces.Space, observation: Any) -> list[Any]:
+def parts(space: spaces.Space, observation: Observation) -> list[Any]:
     """Returns the parts of an observation, one for each of :func:`leaves`, in their order; of the space itself its leaves.
 
     Raises:
@@ -221,7 +224,7 @@ def parts(space: spaces.Space, observation: Any) -> list[Any]:
     return [observation]
 
 
-def plain(space: spaces.Space, observation: Any) -> Any:
+def plain(space: spaces.Space, observation: Observation) -> Any:
     """Returns an observation as plain dicts and tuples, nested like ``space``; its arrays are not copied.
 
     JAX sorts the keys of a dict, but keeps the order of an ``OrderedDict`` (which highway-env returns), and distinguishes
@@ -237,7 +240,7 @@ def plain(space: spaces.Space, observation: Any) -> Any:
     return observation
 
 
-def cast(space: spaces.Space, space_leaves: tuple[Leaf, ...], observation: Any) -> Any:
+def cast(space: spaces.Space, space_leaves: tuple[Leaf, ...], observation: Observation) -> Any:
     """Returns a batch of observations as plain dicts and tuples of arrays of the stored dtypes; copies only if needed.
 
     Raises:
@@ -396,7 +399,7 @@ def action_width(space: spaces.Space) -> int:
     return int(np.prod(space.shape or (), dtype=int))
 
 
-def nested_action(space: spaces.Dict | spaces.Tuple, action: Any, scale: Callable[[spaces.Space, Any], Any]) -> Any:
+def nested_action(space: spaces.Dict | spaces.Tuple, action: Action, scale: Callable[[spaces.Space, Any], Any]) -> Any:
     """Returns actions ``(batch, action_width)`` of a Dict or Tuple as one, each part by ``scale(part's space, numbers)``.
 
     The arrays are of NumPy or of JAX.
@@ -409,7 +412,7 @@ def nested_action(space: spaces.Dict | spaces.Tuple, action: Any, scale: Callabl
     return dict(zip(_keys(space), actions, strict=True)) if isinstance(space, spaces.Dict) else tuple(actions)
 
 
-def rows(action: Any) -> Any:
+def rows(action: Action) -> Any:
     """Returns a batch of actions as a sequence of single ones: an array as it is, of a Dict or Tuple a list."""
     if isinstance(action, dict):
         parts = zip(*map(rows, action.values()), strict=True)
@@ -417,7 +420,7 @@ def rows(action: Any) -> Any:
     return [*zip(*map(rows, action), strict=True)] if isinstance(action, tuple) else action
 
 
-def scale_action(space: spaces.Space, action: Any, xp: Any = np) -> Any:
+def scale_action(space: spaces.Space, action: Action, xp: ModuleType = np) -> Any:
     """Returns actions in the range of the environment from those of an algorithm.
 
     Box: from [-1, 1] to [low, high], ``(batch, action_dim)`` to ``(batch, *shape)``; actions are clipped, and components
@@ -433,7 +436,7 @@ def scale_action(space: spaces.Space, action: Any, xp: Any = np) -> Any:
     return action_scaler(space, xp)(action)
 
 
-def action_scaler(space: spaces.Space, xp: Any = np) -> Callable[[Any], Any]:
+def action_scaler(space: spaces.Space, xp: ModuleType = np) -> Callable[[Any], Any]:
     """Returns :func:`scale_action` for one space."""
     if isinstance(space, spaces.Dict | spaces.Tuple):
         return lambda action: nested_action(space, action, lambda member, numbers: scale_action(member, numbers, xp))
@@ -453,7 +456,9 @@ def action_scaler(space: spaces.Space, xp: Any = np) -> Callable[[Any], Any]:
     raise TypeError(f"cannot scale actions of {space}")
 
 
-def box_scaler(space: spaces.Box, shape: tuple[int, ...], dtype: Any, xp: Any) -> Callable[[Any], Any]:
+def box_scaler(
+    space: spaces.Box, shape: tuple[int, ...], dtype: DTypeLike | None, xp: ModuleType
+) -> Callable[[Any], Any]:
     """Returns :func:`scale_action` for a Box."""
     if space.dtype == np.float32 and (space.low == -1.0).all() and (space.high == 1.0).all():
         return lambda action: action.reshape(shape).clip(-1.0, 1.0)
@@ -516,7 +521,7 @@ def random_action(space: spaces.Space, n: int, rng: Any, mask: Any = None) -> An
     raise TypeError(f"the actions are {space}; agents choose Box, Discrete, MultiDiscrete, MultiBinary, Dict and Tuple")
 
 
-def nth_allowed(mask: Any, n: Any) -> Any:
+def nth_allowed(mask: AnyArray, n: AnyArray) -> Any:
     """Returns the actions that are the ``n``-th allowed ones, counted from 0; arrays of NumPy or of JAX.
 
     >>> nth_allowed(np.array([[False, True, True]]), np.array([1])).tolist()
@@ -621,7 +626,7 @@ def rebuild(description: Any, largest: int = MAX_NUMBERS) -> spaces.Space:
         raise ValueError(f"not the description of a space: {error}") from None
 
 
-def _bound(value: Any, dtype: np.dtype) -> np.ndarray:
+def _bound(value: object, dtype: np.dtype) -> np.ndarray:
     """Returns a bound of a Box; of integers the nearest one of the dtype."""
     bound = np.asarray(value, np.float64)
     if dtype.kind == "f":
@@ -633,7 +638,7 @@ def _bound(value: Any, dtype: np.dtype) -> np.ndarray:
     return np.array(nearest, dtype).reshape(bound.shape)
 
 
-def _bounds(bounds: np.ndarray, dtype: Any) -> Any:
+def _bounds(bounds: np.ndarray, dtype: DTypeLike | None) -> Any:
     """Returns one number if all bounds are equal, else a nested list; infinities as the strings ``inf`` and ``-inf``."""
     with np.errstate(over="ignore"):
         values = bounds.astype(dtype).astype(np.float64)
@@ -641,7 +646,7 @@ def _bounds(bounds: np.ndarray, dtype: Any) -> Any:
     return numbers.flat[0] if values.size and (values == values.flat[0]).all() else numbers.tolist()
 
 
-def as_batch(observation: Any, space: spaces.Space, leaves: Sequence[Leaf]) -> tuple[Any, bool]:
+def as_batch(observation: Observation, space: spaces.Space, leaves: Sequence[Leaf]) -> tuple[Any, bool]:
     """Returns observations as a batch of arrays of the right types, and whether it was a single observation.
 
     The arguments and errors are those of :func:`batch_arrays`.
@@ -650,7 +655,9 @@ def as_batch(observation: Any, space: spaces.Space, leaves: Sequence[Leaf]) -> t
     return structure(space).unflatten(arrays), single
 
 
-def batch_arrays(observation: Any, space: spaces.Space, leaves: Sequence[Leaf]) -> tuple[list[np.ndarray], bool]:
+def batch_arrays(
+    observation: Observation, space: spaces.Space, leaves: Sequence[Leaf]
+) -> tuple[list[np.ndarray], bool]:
     """Returns the parts of observations as batches of the right types, and whether it was a single observation.
 
     Args:
@@ -689,7 +696,7 @@ def batch_arrays(observation: Any, space: spaces.Space, leaves: Sequence[Leaf]) 
     return [array[None] if single else array for array in arrays], single
 
 
-def described(observation: Any) -> str:
+def described(observation: Observation) -> str:
     """Returns the structure of an invalid observation, in words.
 
     >>> described({"goal": [0.0], "place": None}), described((1, 2))

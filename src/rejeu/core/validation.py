@@ -15,6 +15,8 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import cache
 from typing import Any, TypeVar
 
+from rejeu.core.types import Settings
+
 C = TypeVar("C")
 MOST_OUTPUTS, MOST_WIDTH, MOST_LAYERS = 10_000, 2**20, 256
 MOST = {
@@ -61,7 +63,7 @@ def number(key: str, value: Any, least: float = -math.inf, above: float = -math.
     return float(value)
 
 
-def whole_seed(seed: Any) -> int:
+def whole_seed(seed: object) -> int:
     """Returns a seed as an ``int``.
 
     Raises:
@@ -78,7 +80,7 @@ def is_number(value: Any) -> bool:
     return bool(is_real and abs(value) <= sys.float_info.max)
 
 
-def flag(key: str, value: Any) -> bool:
+def flag(key: str, value: object) -> bool:
     """Returns ``value`` if it is True or False.
 
     Raises:
@@ -121,7 +123,7 @@ def assign(config: Any, **values: Any) -> None:
         object.__setattr__(config, key, value)
 
 
-def choice(key: str, value: Any, among: Collection[str]) -> Any:
+def choice(key: str, value: object, among: Collection[str]) -> Any:
     """Returns ``value`` if it is one of the texts ``among``.
 
     Raises:
@@ -132,7 +134,7 @@ def choice(key: str, value: Any, among: Collection[str]) -> Any:
     return value
 
 
-def nested(key: str, value: Any, config_class: type[C]) -> C:
+def nested(key: str, value: object, config_class: type[C]) -> C:
     """Returns a sub-configuration of class ``config_class`` from itself or from a mapping of its fields."""
     if isinstance(value, config_class):
         return value
@@ -143,7 +145,7 @@ def nested(key: str, value: Any, config_class: type[C]) -> C:
     return build(config_class, value, key)
 
 
-def build(cls: type[C], settings: Mapping[str, Any], setting: str = "") -> C:
+def build(cls: type[C], settings: Mapping[str, object], setting: str = "") -> C:
     """Returns ``cls(**settings)``; ``setting`` is the user's name for it, if not that of the class.
 
     Raises:
@@ -160,7 +162,7 @@ def check_names(keys: Iterable[str], names: Sequence[str], owner: str, shape: Se
             raise TypeError(unknown_name(key, names, owner, shape))
 
 
-def with_value(mapping: Mapping[str, Any], path: Sequence[str], value: Any, name: str) -> dict[str, Any]:
+def with_value(mapping: Mapping[str, object], path: Sequence[str], value: object, name: str) -> Settings:
     """Returns a copy of a mapping with one value set; a path of several keys reaches into nested mappings.
 
     Raises:
@@ -211,7 +213,7 @@ def field_names(config_class: type) -> list[str]:
     return [field.name for field in dataclasses.fields(config_class)]
 
 
-def field_defaults(config_class: type) -> dict[str, Any]:
+def field_defaults(config_class: type) -> Settings:
     """Returns the default of each field of a dataclass as an instance has it; ``inspect.Parameter.empty`` if it has none."""
     fields = dataclasses.fields(config_class)
     if any(field.default is field.default_factory is dataclasses.MISSING for field in fields):

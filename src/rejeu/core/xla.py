@@ -114,7 +114,7 @@ def run_once(function: Callable[..., Any]) -> Callable[..., Any]:
     """Returns ``function`` compiled for a single call, with the usual options if XLA does not know the quick ones."""
     quick = jax.jit(function, compiler_options=RUN_ONCE)
 
-    def call(*arguments: Any) -> Any:
+    def call(*arguments: object) -> Any:
         try:
             return quick(*arguments)
         except jax.errors.JaxRuntimeError as error:
@@ -150,7 +150,7 @@ def for_runs(function: Callable[..., Any], n: int) -> Callable[..., Any]:
     """Returns ``function``, which ``jax.vmap`` is going to compute for ``n`` runs at once."""
 
     @functools.wraps(function)
-    def call(*arguments: Any) -> Any:
+    def call(*arguments: object) -> Any:
         global _n_runs
         before, _n_runs = _n_runs, n
         try:
@@ -165,7 +165,7 @@ def _marked(function: F, marks: dict[str, str], limit: float, concatenates: int 
     """Returns ``function`` as a call with these attributes, if its inputs have at most ``limit`` elements."""
 
     @functools.wraps(function)
-    def call(*arguments: Any, **keywords: Any) -> Any:
+    def call(*arguments: object, **keywords: Any) -> Any:
         leaves, structure = jax.tree.flatten((arguments, keywords))
         where = [i for i, leaf in enumerate(leaves) if isinstance(leaf, jax.Array | np.ndarray)]
         is_split = concatenates * _n_runs > SPLIT and threads() > 1

@@ -32,6 +32,7 @@ from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.core import interrupt, spaces
 from rejeu.core.algorithm import Algorithm, Clock, Metrics, PyTree, averaged_fields, names
 from rejeu.core.errors import requires
+from rejeu.core.types import Action, Observation
 from rejeu.core.validation import number, whole
 from rejeu.demonstrations import dataset
 from rejeu.envs.masks import for_agent, split
@@ -39,6 +40,8 @@ from rejeu.envs.registry import make_env
 from rejeu.logs.formatting import counted
 from rejeu.networks.batch_renorm import in_training, is_normalized, with_statistics
 from rejeu.networks.projected import projected
+from rejeu.replay.hindsight import HerReplayBuffer
+from rejeu.replay.uniform import ReplayBuffer
 from rejeu.training import finite
 from rejeu.training.learner import Learner
 from rejeu.training.off_policy import STEPS_OFFLINE, learn_from
@@ -48,9 +51,9 @@ from rejeu.training.off_policy import STEPS_OFFLINE, learn_from
 class Episode:
     """One episode of ``T`` steps."""
 
-    observations: Any
+    observations: Observation
     """As the environment gives them, each array with a leading axis of ``T + 1``."""
-    actions: Any
+    actions: Action
     """In the range of the action space, ``(T, ...)``."""
     rewards: np.ndarray
     """``(T,)``."""
@@ -308,7 +311,7 @@ def clone(
     return float(value)
 
 
-def imitation_loss(algorithm: Algorithm, actor: PyTree, obs: PyTree, action: Any) -> Any:
+def imitation_loss(algorithm: Algorithm, actor: PyTree, obs: PyTree, action: Action) -> Any:
     """Returns the loss of an actor for demonstrated actions, ``(batch,)``; see :func:`clone`."""
     if algorithm.imitation is not None:
         return algorithm.imitation(actor, obs, action)
@@ -432,7 +435,7 @@ def keeping_policy(agent: Any) -> Learner:
             f"{agent.name} has no critics that could learn while its policy is kept; use SAC, TD3 or a relative of them"
         )
 
-    def update(state: PyTree, batch: Any, clock: Clock) -> tuple[PyTree, Metrics]:
+    def update(state: PyTree, batch: PyTree, clock: Clock) -> tuple[PyTree, Metrics]:
         new, metrics = algorithm.update(state, batch, clock)
         of_actor = ["actor" in name.removesuffix("actor_loss") for name in names(new)]  # also its target and moments
         is_kept = jax.tree.unflatten(jax.tree.structure(new), of_actor)
@@ -493,7 +496,7 @@ def arrays_of(agent: Any, episode: Episode) -> tuple[PyTree, np.ndarray]:
     return agent.with_masks(obs, None), spaces.unscale_action(agent.action_space, np.asarray(episode.actions))
 
 
-def batch_of(agent: Any, observations: Any, rows: slice) -> PyTree:
+def batch_of(agent: Any, observations: Observation, rows: slice) -> PyTree:
     """Returns some observations of an episode as a batch."""
     return spaces.as_batch(
         jax.tree.map(lambda leaf: np.asarray(leaf)[rows], observations), agent.observation_space, agent.obs_leaves
@@ -530,7 +533,7 @@ def with_targets(state: PyTree) -> PyTree:
     """Returns a state whose target networks are copies of the networks that they follow."""
     is_state = lambda node: isinstance(node, eqx.Module) and bool(averaged_fields(type(node)))  # noqa: E731
 
-    def copied(node: Any) -> Any:
+    def copied(node: PyTree) -> Any:
         if not is_state(node):
             return node
         fields = {name for name in averaged_fields(type(node)) if getattr(node, name) is not None}
@@ -558,7 +561,9 @@ class WithDemonstrations:
     Source: Ball et al. 2023 (arXiv 2302.02948), "symmetric sampling" with a share of one half.
     """
 
-    def __init__(self, buffer: Any, demonstrations: Any, share: float) -> None:
+    def __init__(
+        self, buffer: ReplayBuffer | HerReplayBuffer, demonstrations: ReplayBuffer | HerReplayBuffer, share: float
+    ) -> None:
         self.own, self.demonstrations, self.share = buffer, demonstrations, share
 
     def __getattr__(self, name: str) -> Any:

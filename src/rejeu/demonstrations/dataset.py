@@ -25,6 +25,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from rejeu.core import atomic, spaces
 from rejeu.core.records import WRONG, brief, shown, stored_size
+from rejeu.core.types import Action, Observation
 
 METADATA, MAIN = "metadata.json", "main_data.hdf5"
 EPISODE = re.compile(r"episode_(\d{1,9})")
@@ -144,7 +145,7 @@ def passed_over(path: Path, left_out: list[str]) -> Iterator[None]:
         left_out.append(f"{path.name}, which is damaged ({brief(error)})")
 
 
-def problem_of(observations: Any, actions: Any, rewards: np.ndarray, *ends: np.ndarray) -> str:
+def problem_of(observations: Observation, actions: Action, rewards: np.ndarray, *ends: np.ndarray) -> str:
     """Returns the part of an episode whose length does not fit its rewards, as text; empty if all fit."""
     n = len(rewards)
     parts = {"observations": (observations, n + 1), "actions": (actions, n)}
@@ -217,7 +218,7 @@ def picture(data: Any, shape: tuple[int, ...]) -> np.ndarray:
     return np.asarray(image).reshape(shape)
 
 
-def episode(i: int, steps: list[tuple[Any, ...]], seed: int | None, metadata: Mapping[str, Any]) -> bytes:
+def episode(i: int, steps: list[tuple[Any, ...]], seed: int | None, metadata: Mapping[str, object]) -> bytes:
     """Returns the file of an episode: ``(obs,)`` of the reset, then ``(obs, action, reward, terminated, truncated)``."""
     import h5py
 

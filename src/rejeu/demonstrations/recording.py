@@ -17,6 +17,7 @@ from gymnasium.envs.registration import EnvSpec
 from rejeu.core import atomic
 from rejeu.core.errors import requires
 from rejeu.core.failed_writes import FailedWrites
+from rejeu.core.types import Action, Observation
 from rejeu.demonstrations import dataset
 from rejeu.envs.validation import id_of
 from rejeu.logs.formatting import counted
@@ -86,14 +87,20 @@ class Recording:
             f"for MINARI_DATASETS_PATH={self.folder}, minari.load_dataset({self.dataset_id!r})"
         ) + (f"; {lost}" if (lost := self._writes.summary()) else "")
 
-    def begin(self, obs: Any, seed: int | None, frame: np.ndarray | None = None) -> None:
+    def begin(self, obs: Observation, seed: int | None, frame: np.ndarray | None = None) -> None:
         """Starts an episode, and ends a running one as truncated."""
         self._end()
         self._seed, self._steps = seed, [(copy.deepcopy(obs),)]
         self._frame = frame
 
     def step(
-        self, obs: Any, action: Any, reward: float, terminated: bool, truncated: bool, frame: np.ndarray | None = None
+        self,
+        obs: Observation,
+        action: Action,
+        reward: float,
+        terminated: bool,
+        truncated: bool,
+        frame: np.ndarray | None = None,
     ) -> None:
         """Adds a step."""
         if frame is not None:

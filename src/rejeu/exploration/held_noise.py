@@ -34,10 +34,10 @@ class Held(NamedTuple):
 def held_explorer(policy: Callable[[Any, PyTree], TanhNormal], action_dim: int, max_steps: int) -> Explorer:
     """Returns exploration by the policy with noise that is held for up to ``max_steps`` steps."""
 
-    def init(actor: Any, n_envs: int) -> Held:
+    def init(actor: PyTree, n_envs: int) -> Held:
         return Held(jnp.zeros((n_envs, action_dim), jnp.float32), jnp.zeros((n_envs,), jnp.int32))
 
-    def act(carry: Held, actor: Any, obs: PyTree, ended: Array, key: Array, clock: Clock) -> tuple[Array, Held]:
+    def act(carry: Held, actor: PyTree, obs: PyTree, ended: Array, key: Array, clock: Clock) -> tuple[Array, Held]:
         noise_key, spell_key = jax.random.split(key)
         due = ended | (carry.left <= 0)
         fresh = jax.random.normal(noise_key, carry.noise.shape, carry.noise.dtype)

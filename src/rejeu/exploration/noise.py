@@ -23,8 +23,10 @@ import jax.numpy as jnp
 import numpy as np
 from gymnasium import spaces
 from jax import Array
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, DTypeLike
 
+from rejeu.core.algorithm import PyTree
+from rejeu.core.types import Action, AnyArray
 from rejeu.core.validation import assign, coerce, number
 from rejeu.exploration.parameter_space import ParameterNoise
 
@@ -53,7 +55,7 @@ class NoiseProcess(Protocol):
     def init(self, n_envs: int) -> Any:
         """Returns the state of ``n_envs`` processes at the start of an episode: a pytree of arrays ``(n_envs, ...)``."""
 
-    def perturb(self, state: Any, action: Array, key: Array) -> tuple[Any, Array]:
+    def perturb(self, state: PyTree, action: Array, key: Array) -> tuple[Any, Array]:
         """Returns the state after one step, and ``action`` ``(n_envs, action_dim)`` with noise.
 
         ``key`` is a JAX random key. The result is clipped to [-1, 1]. JAX traces the function.
@@ -84,7 +86,7 @@ class ActionNoise(ABC):
         """Returns the state of ``n_envs`` processes at the start of an episode, ``float32 (n_envs, ...)``."""
 
     @abstractmethod
-    def advance(self, state: Any, action: Any, normal: Any) -> tuple[Any, Any]:
+    def advance(self, state: PyTree, action: Action, normal: AnyArray) -> tuple[PyTree, Any]:
         """Returns the state after one step, and ``action`` ``(n_envs, action_dim)`` with noise, not yet clipped.
 
         ``normal`` has standard normal numbers, one for each action dimension. NumPy or JAX arrays.
@@ -138,7 +140,7 @@ class NormalActionNoise(ActionNoise):
     """Probability that an action is replaced by a uniformly random one, as in hindsight experience replay's experiments
     (Plappert et al. 2018, arXiv 1802.09464: 0.3, with ``sigma=0.2``). An agent replaces them, a call by hand does not."""
 
-    def __post_init__(self, dtype: Any) -> None:
+    def __post_init__(self, dtype: DTypeLike) -> None:
         _check_dtype(self, dtype)
         _as_tuples(self, "mean", "sigma")
         coerce(self, "random", number, least=0, most=1)
@@ -147,7 +149,7 @@ class NormalActionNoise(ActionNoise):
         """Returns the state of the noise of ``n_envs`` environments: nothing."""
         return np.zeros((n_envs, 0), np.float32)
 
-    def advance(self, state: Any, action: Any, normal: Any) -> tuple[Any, Any]:
+    def advance(self, state: PyTree, action: Action, normal: AnyArray) -> tuple[PyTree, Any]:
         return state, action + (_row(self.mean) + _row(self.sigma) * normal)
 
     def perturb(self, state: Array, action: Array, key: Array) -> tuple[Array, Array]:
@@ -200,7 +202,7 @@ class OrnsteinUhlenbeckActionNoise(ActionNoise):
     """Strength of the repulsive boundary, at least 0; 0 or None for none. A larger value keeps actions further inside. A
     strength ``s`` for actions in ``[low, high]`` is ``4 s / (high - low)^2`` here: 1e-4 over [-2, 2] is 2.5e-5."""
 
-    def __post_init__(self, dtype: Any) -> None:
+    def __post_init__(self, dtype: DTypeLike) -> None:
         _check_dtype(self, dtype)
         for key in ("initial_noise", "repulsive"):
             if getattr(self, key) is None:
@@ -215,7 +217,7 @@ class OrnsteinUhlenbeckActionNoise(ActionNoise):
         """Returns the processes of ``n_envs`` environments at the start of an episode, ``(n_envs, action_dim)``."""
         return np.tile(_row(self.initial_noise), (n_envs, 1))
 
-    def advance(self, state: Any, action: Any, normal: Any) -> tuple[Any, Any]:
+    def advance(self, state: PyTree, action: Action, normal: Any) -> tuple[Any, Any]:
         kick = _row(self.sigma) * math.sqrt(self.dt) * normal
         state = state + self.theta * (_row(self.mean) - state) * self.dt + kick
         action = action + state
@@ -226,7 +228,7 @@ class OrnsteinUhlenbeckActionNoise(ActionNoise):
         return state, action
 
 
-def barrier(action: Any) -> Any:
+def barrier(action: Action) -> Any:
     """Returns the repulsive barrier ``B(u) = (pi u / 2)^6``, which is flat within [-1, 1] and steep beyond.
 
     >>> float(barrier(2 / math.pi))
@@ -235,7 +237,7 @@ def barrier(action: Any) -> Any:
     return (0.5 * math.pi * action) ** 6
 
 
-def barrier_slope(action: Any) -> Any:
+def barrier_slope(action: Action) -> Any:
     """Returns the barrier's derivative ``B'(u) = 3 pi (pi u / 2)^5``: the push for a ``repulsive`` of 1."""
     return 3.0 * math.pi * (0.5 * math.pi * action) ** 5
 
@@ -253,7 +255,7 @@ WRITTEN = re.compile(r"([a-z-]+)\s*\(([^()]*)\)")
 """Noise as a string, such as ``ou(0.2)``."""
 
 
-def parse(value: Any) -> Noise | str | None:
+def parse(value: object) -> Noise | str | None:
     """Returns noise settings from themselves, from None, from a number or a string, or from their JSON form.
 
     A number is the standard deviation of Gaussian noise; a string is ``"normal(0.1)"``, ``"ou(0.2)"``,
@@ -375,7 +377,7 @@ def _row(values: tuple[float, ...]) -> np.ndarray:
     return np.array([values], np.float32)
 
 
-def _check_dtype(noise: Any, dtype: Any) -> None:
+def _check_dtype(noise: object, dtype: DTypeLike) -> None:
     if not np.issubdtype(np.dtype(dtype), np.floating):
         raise ValueError(f"{type(noise).__name__}: dtype={dtype!r} must be a floating dtype")
 

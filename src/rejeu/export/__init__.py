@@ -31,11 +31,11 @@ class Format(NamedTuple):
     frames: bool = True
     """Whether single frames of stacks can be inputs."""
 
-    def files(self, source: Any) -> Any:
+    def files(self, source: object) -> Any:
         """Returns the contents of the files of a policy, and the run of the first; None if it cannot be run here."""
         return import_module(self.module).files(source)
 
-    def check(self, name: str, noise: bool, batch: Any, frame_stack: int | None) -> None:
+    def check(self, name: str, noise: bool, batch: object, frame_stack: int | None) -> None:
         """Raises ``ValueError`` if the format does not take these arguments."""
         if noise and not self.noise:
             raise ValueError(f"noise=True: {name} contains the deterministic policy; leave it out")

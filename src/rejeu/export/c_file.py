@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from rejeu.core.types import JsonObject
 from rejeu.export.check import Run
 from rejeu.export.contract import Exportable, Policy, Port
 from rejeu.export.loops import TEMPLATES, Language, Printer, indented, memory
@@ -47,7 +48,7 @@ def filled(template: str, **texts: Any) -> bytes:
     return Template((TEMPLATES / template).read_text(encoding="utf-8")).substitute(texts).encode()
 
 
-def write(policy: Policy, card: dict[str, Any], stem: str) -> tuple[bytes, bytes]:
+def write(policy: Policy, card: JsonObject, stem: str) -> tuple[bytes, bytes]:
     """Returns the C file of a policy and its header; ``stem`` is the name of the files without suffix."""
     printer, names = Printer(C), names_of(policy)
     stored_arrays = printer.run(policy.program, list(names.values()))

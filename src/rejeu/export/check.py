@@ -112,7 +112,7 @@ def computed(policy: Policy, in_double: bool) -> Callable[[dict[str, np.ndarray]
     return call
 
 
-def is_float32(param: Any) -> bool:
+def is_float32(param: object) -> bool:
     """Returns whether a parameter of a primitive is the dtype float32."""
     return isinstance(param, np.dtype | type) and param in (np.dtype("f4"), np.float32)
 

@@ -15,6 +15,7 @@ from jax import Array, ShapeDtypeStruct, export
 from rejeu.core import spaces
 from rejeu.core.algorithm import Algorithm, Clock, Masked, PyTree
 from rejeu.core.spaces import Leaf
+from rejeu.core.types import JsonObject
 from rejeu.exploration import explorer as exploration
 from rejeu.export.program import TracedProgram, trace
 
@@ -38,7 +39,7 @@ class Port(NamedTuple):
     drawn: str = ""
     """For noise: ``normal`` (standard) or ``uniform`` (in [0, 1)), independent numbers in each step."""
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> JsonObject:
         """Returns it as JSON values, without what is not given."""
         return {key: value for key, value in self._asdict().items() if value not in (None, "")}
 
@@ -123,7 +124,7 @@ class Exportable(NamedTuple):
     policy: Policy
     one: Policy
     """The same for one observation at a time."""
-    card: dict[str, Any]
+    card: JsonObject
     """About it."""
     observation_space: gym.Space
     action_space: gym.Space

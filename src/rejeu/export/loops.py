@@ -9,9 +9,10 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import DTypeLike
 
 from rejeu.export import PRIMITIVES
 from rejeu.export.program import Operation, TracedProgram, Value, unsupported
@@ -68,7 +69,7 @@ class Array(NamedTuple):
     """Of the memory that holds the array in C order; empty for a part of one, or other elements."""
 
 
-def memory(name: str, shape: Sequence[int], dtype: Any) -> Array:
+def memory(name: str, shape: Sequence[int], dtype: DTypeLike) -> Array:
     """Returns a whole array in C order."""
     strides = [math.prod(shape[axis + 1 :]) for axis in range(len(shape))]
 
@@ -163,7 +164,7 @@ class Printer:
             array = self.known[value] = self.stored(array)
         return array
 
-    def buffer(self, shape: Sequence[int], dtype: Any) -> Array:
+    def buffer(self, shape: Sequence[int], dtype: DTypeLike) -> Array:
         """Returns a new array."""
         name = f"v{len(self.buffers)}"
         self.buffers.append((name, str(np.dtype(dtype)), max(math.prod(shape), 1)))

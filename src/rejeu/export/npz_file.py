@@ -10,6 +10,7 @@ import numpy as np
 from jax.export import is_symbolic_dim
 
 from rejeu.core import spaces
+from rejeu.core.types import JsonObject
 from rejeu.export.check import Run, one_by_one
 from rejeu.export.contract import Exportable
 from rejeu.export.numpy_policy import FUNCTIONS, POLICY, parse
@@ -41,7 +42,7 @@ def name_of(operation: Operation) -> str:
     return "matmul" if operation.name == "dot_general" else operation.name
 
 
-def parameters(operation: Operation) -> dict[str, Any]:
+def parameters(operation: Operation) -> JsonObject:
     """Returns the parameters of an operation that are JSON values, with -1 for the free size of the batch."""
     rounding = operation.params.get("rounding_method", 1)
     if name_of(operation) not in FUNCTIONS or int(rounding) != 1:

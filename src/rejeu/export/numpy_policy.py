@@ -14,6 +14,7 @@ import numpy as np
 from rejeu.core import spaces
 from rejeu.core.errors import CheckpointError
 from rejeu.core.records import WRONG, brief, is_sparse, parse_json
+from rejeu.core.types import Observation
 from rejeu.export import PRIMITIVES
 
 POLICY = "policy"
@@ -170,7 +171,7 @@ class NumpyPolicy:
 
     def predict(
         self,
-        observation: Any,
+        observation: Observation,
         state: Any = None,
         episode_start: Any = None,
         deterministic: bool = True,

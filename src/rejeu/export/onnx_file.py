@@ -7,8 +7,10 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike, DTypeLike
 
 from rejeu.core.errors import requires
+from rejeu.core.types import JsonObject
 from rejeu.export import PRIMITIVES
 from rejeu.export.check import Run, one_by_one
 from rejeu.export.contract import Exportable, Policy
@@ -44,7 +46,7 @@ class Graph:
         self.nodes.append(helper.make_node(operator, inputs, [name], **attributes))
         return name
 
-    def constant(self, array: Any) -> str:
+    def constant(self, array: ArrayLike) -> str:
         """Adds a constant and returns its name; equal ones are stored once."""
         array = np.asarray(array)
         key = repr((array.dtype, array.shape)).encode() + array.tobytes()
@@ -77,7 +79,7 @@ class Graph:
         """Returns the name of an array in another shape; -1 for the size of the batch."""
         return self.node("Reshape", [name, self.constant(np.array(sizes, np.int64))])
 
-    def cast(self, name: str, dtype: Any) -> str:
+    def cast(self, name: str, dtype: DTypeLike) -> str:
         """Returns the name of an array in another dtype."""
         return self.node("Cast", [name], to=helper.np_dtype_to_tensor_dtype(np.dtype(dtype)))
 
@@ -167,7 +169,7 @@ def onnx_run(policy: Policy, content: bytes) -> Run | None:
     return one_by_one(policy, lambda inputs: dict(zip(names, session.run(names, inputs), strict=True)))
 
 
-def write(policy: Policy, card: dict[str, Any]) -> bytes:
+def write(policy: Policy, card: JsonObject) -> bytes:
     """Returns the model of a policy, with the card in its metadata."""
     graph, program = Graph(), policy.program
     size = "batch" if policy.batch is None else policy.batch

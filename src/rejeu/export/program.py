@@ -13,6 +13,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.extend import core
+from numpy.typing import DTypeLike
+
+from rejeu.core.types import AnyArray
 
 LARGEST_FOLD = 4096
 """Elements up to which a constant may be larger than the constants it is computed from, as by broadcasting."""
@@ -119,7 +122,7 @@ def is_rewritten(name: str, params: Any, inputs: Sequence[Value]) -> bool:
 class Value:
     """An array: its shape, in which the free size of the batch is symbolic, its dtype, and its numbers if constant."""
 
-    def __init__(self, shape: Sequence[Any], dtype: Any, data: np.ndarray | None = None) -> None:
+    def __init__(self, shape: Sequence[int], dtype: DTypeLike, data: np.ndarray | None = None) -> None:
         self.shape, self.dtype, self.data = tuple(shape), np.dtype(dtype), data
 
     @property
@@ -153,7 +156,7 @@ class TracedProgram(NamedTuple):
     operations: tuple[Operation, ...]
     outputs: tuple[Value, ...]
 
-    def __call__(self, *arrays: Any) -> list[Any]:
+    def __call__(self, *arrays: AnyArray) -> list[Any]:
         """Returns the outputs for inputs and draws, computed by JAX; it may be compiled."""
         values: dict[Value, Any] = dict(zip(self.arguments, arrays, strict=True))
         for operation in self.operations:
@@ -188,7 +191,7 @@ def unsupported(operation: Operation, target: str, detail: str = "") -> ValueErr
     )
 
 
-def trace(function: Callable[..., Any], *examples: Any, draws: bool = False) -> TracedProgram:
+def trace(function: Callable[..., Any], *examples: object, draws: bool = False) -> TracedProgram:
     """Returns a function of arrays as a program.
 
     Args:
@@ -226,7 +229,7 @@ class _Tracing:
         """Adds the operations of a jaxpr with these constants and arguments, and returns its outputs."""
         values: dict[Any, Value] = dict(zip([*jaxpr.constvars, *jaxpr.invars], arguments, strict=True))
 
-        def read(atom: Any) -> Value:
+        def read(atom: object) -> Value:
             return _constant(atom) if isinstance(atom, core.Literal) else values[atom]
 
         for equation in jaxpr.eqns:

@@ -6,12 +6,12 @@ import io
 import json
 import zipfile
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import numpy as np
 from jax import Array, ShapeDtypeStruct, export
 
+from rejeu.core.types import JsonObject
 from rejeu.export.check import Run, one_by_one
 from rejeu.export.contract import Exportable, Policy
 
@@ -19,7 +19,7 @@ MODULE, EXPORTED, CARD = "module.mlir.bc", "exported.jax", "card.json"
 """Names in the zip file: StableHLO as portable bytecode, the bytes for ``jax.export.deserialize``, the contract."""
 
 
-def write(policy: Policy, card: dict[str, Any]) -> bytes:
+def write(policy: Policy, card: JsonObject) -> bytes:
     """Returns the zip file of a policy. The module takes and returns arrays in the order of the card.
 
     Raises:

@@ -16,6 +16,7 @@ import numpy as np
 from jax import Array, ShapeDtypeStruct
 
 from rejeu.core import spaces
+from rejeu.core.types import JsonObject, PyTree
 from rejeu.envs import functional
 from rejeu.envs.functional import FunctionalEnv
 from rejeu.export.check import Run
@@ -42,7 +43,7 @@ JAVASCRIPT = Language("JavaScript", TYPES)
 KEY = ShapeDtypeStruct((2,), np.uint32)
 
 
-def environment(env_id: str | None, kwargs: Mapping[str, Any]) -> FunctionalEnv:
+def environment(env_id: str | None, kwargs: Mapping[str, object]) -> FunctionalEnv:
     """Returns the environment in JAX that a page contains.
 
     Raises:
@@ -61,7 +62,7 @@ def environment(env_id: str | None, kwargs: Mapping[str, Any]) -> FunctionalEnv:
         raise ValueError(f"a page cannot contain {env_id} with the arguments {', '.join(kwargs)}") from None
 
 
-def script(policy: Policy, env: FunctionalEnv, card: dict[str, Any]) -> str:
+def script(policy: Policy, env: FunctionalEnv, card: JsonObject) -> str:
     """Returns the policy and the environment as JavaScript.
 
     Raises:
@@ -74,7 +75,7 @@ def script(policy: Policy, env: FunctionalEnv, card: dict[str, Any]) -> str:
     state, obs = jax.eval_shape(env.reset, KEY)
     action_input = ShapeDtypeStruct(action.shape, spaces.narrow(action.dtype))
 
-    def step(state: Any, action: Array, key: Array) -> Any:
+    def step(state: PyTree, action: Array, key: Array) -> PyTree:
         return env.step(key, state, action)
 
     reset, stepped = trace(env.reset, KEY, draws=True), trace(step, state, action_input, KEY, draws=True)
@@ -122,7 +123,7 @@ def node_run(policy: Policy, script: str) -> Run | None:
     return run
 
 
-def node(script: str, message: Any) -> Any:
+def node(script: str, message: object) -> Any:
     """Returns what a script writes as JSON, which reads JSON, both by standard input and output."""
     with tempfile.TemporaryDirectory() as name:
         path = Path(name) / "main.js"

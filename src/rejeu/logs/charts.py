@@ -287,7 +287,7 @@ def time_chart(table: Table) -> Chart | None:
 
 def histogram(
     values: np.ndarray, columns: Mapping[str, np.ndarray], command: str = "", listed: int = LISTED
-) -> dict[str, Any] | None:
+) -> Chart | None:
     """Returns the histogram of returns, with the episodes behind each bar; None without any return.
 
     The bars cover all but the extreme half percent, which the first and the last bar contain too.

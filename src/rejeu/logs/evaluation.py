@@ -13,6 +13,7 @@ import numpy as np
 
 from rejeu.core import interrupt, xla
 from rejeu.core.spaces import scale_action
+from rejeu.core.types import JsonObject
 from rejeu.envs.base import VectorEnv
 from rejeu.logs import statistics
 from rejeu.logs.formatting import counted, html_table
@@ -81,7 +82,7 @@ class Evaluation:
         low, high = statistics.wilson(self.success_rate, np.sum(np.isfinite(self.successes)) or self.n)
         return float(low), float(high)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """Returns the statistics by name, as ``rejeu evaluate --json`` prints them."""
         return {
             "episodes": self.n,

@@ -9,11 +9,12 @@ from array import array
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from rejeu.core import atomic
+from rejeu.core.types import JsonObject
 from rejeu.core.validation import whole
 from rejeu.logs.evaluation import Evaluation
 from rejeu.logs.formatting import counted, html_table
@@ -157,7 +158,7 @@ class History:
 
         return plots.learning_curve(self, path, against, window)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """Returns the columns as arrays, ready for ``pandas.DataFrame``."""
         return {column: self[column] for column in COLUMNS}
 

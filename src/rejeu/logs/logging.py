@@ -134,7 +134,7 @@ class CsvFile:
     def write(self, step: int, metrics: Mapping[str, float]) -> None:
         self.add({"step": step, **metrics})
 
-    def add(self, row: Mapping[str, Any]) -> None:
+    def add(self, row: Mapping[str, object]) -> None:
         """Adds a row.
 
         Raises:
@@ -191,7 +191,7 @@ class JsonLines:
     def write(self, step: int, metrics: Mapping[str, float]) -> None:
         self.add({"step": step, **{name: x if math.isfinite(x) else None for name, x in metrics.items()}})
 
-    def add(self, row: Mapping[str, Any]) -> None:
+    def add(self, row: Mapping[str, object]) -> None:
         """Adds a row.
 
         Raises:
@@ -266,7 +266,7 @@ class TensorBoard:
         yield event.summary
         self._append(event)
 
-    def write_config(self, config: Mapping[str, Any]) -> None:
+    def write_config(self, config: Mapping[str, object]) -> None:
         """Writes the configuration as a table, in TensorBoard's tab "Text"."""
         cells = [(name, str(value).replace("|", "\\|")) for name, value in flat(config)]
         table = "\n".join(["| name | value |", "|---|---|", *(f"| {name} | {value} |" for name, value in cells)])
@@ -326,7 +326,7 @@ class Logger:
         self.name_to_count: dict[str, int] = {}
         """Number of values in each mean since the last row."""
 
-    def record(self, key: str, value: Any, exclude: str | tuple[str, ...] | None = None) -> None:
+    def record(self, key: str, value: object, exclude: str | tuple[str, ...] | None = None) -> None:
         """Records a metric for the next row, and replaces an earlier value.
 
         Args:
@@ -339,7 +339,7 @@ class Logger:
         """
         self.name_to_value[key] = _number(key, value)
 
-    def record_mean(self, key: str, value: Any, exclude: str | tuple[str, ...] | None = None) -> None:
+    def record_mean(self, key: str, value: object, exclude: str | tuple[str, ...] | None = None) -> None:
         """Records the mean of the values since the last row; None is ignored."""
         if value is None:
             return
@@ -453,7 +453,7 @@ def open_log(
     return MLflow(name, run_id) if log_name == "mlflow" else Trackio(name)
 
 
-def _number(key: str, value: Any) -> float:
+def _number(key: str, value: object) -> float:
     array = np.asarray(value)
     if array.dtype.kind not in "biuf" or array.size != 1:
         raise TypeError(f"record({key!r}) expected a number, got {type(value).__name__}")
@@ -493,7 +493,7 @@ class GuardedSink:
         """Writes the metrics of environment step ``step``."""
         self._put(partial(self.sink.write, step, dict(metrics)))
 
-    def write_config(self, config: Mapping[str, Any]) -> None:
+    def write_config(self, config: Mapping[str, object]) -> None:
         """Writes the configuration, if the sink takes one."""
         if isinstance(self.sink, Tracker):
             self._put(partial(self.sink.write_config, config))

@@ -7,7 +7,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from pathlib import Path
-from types import MappingProxyType
+from types import MappingProxyType, ModuleType
 from typing import Any, Protocol, runtime_checkable
 
 from rejeu.core.errors import requires
@@ -24,7 +24,7 @@ class Tracker(Protocol):
     def write(self, step: int, metrics: Mapping[str, float]) -> None:
         """Writes the metrics of environment step ``step``."""
 
-    def write_config(self, config: Mapping[str, Any]) -> None:
+    def write_config(self, config: Mapping[str, object]) -> None:
         """Writes the configuration of the run, before its first row."""
 
     def write_video(self, step: int, path: Path) -> None:
@@ -37,15 +37,15 @@ class Tracker(Protocol):
 class Logged(ABC):
     """A tracker whose package has runs with ``log`` and ``finish``; the run starts with the first write. Abstract."""
 
-    def __init__(self, package: Any, name: str | None, project: str) -> None:
+    def __init__(self, package: ModuleType, name: str | None, project: str) -> None:
         self._package, self.name, self.project = package, name, project
         self._run: Any = None
 
     @abstractmethod
-    def _start(self, config: Mapping[str, Any]) -> Any:
+    def _start(self, config: Mapping[str, object]) -> Any:
         """Returns a new run."""
 
-    def _started(self, config: Mapping[str, Any] = MappingProxyType({})) -> Any:
+    def _started(self, config: Mapping[str, object] = MappingProxyType({})) -> Any:
         if self._run is None:
             self._run = self._start(config)
         return self._run
@@ -88,11 +88,11 @@ class WandB(Logged):
     def __str__(self) -> str:
         return "Weights & Biases"
 
-    def write_config(self, config: Mapping[str, Any]) -> None:
+    def write_config(self, config: Mapping[str, object]) -> None:
         """Writes the configuration of the run."""
         self._started().config.update(dict(config), allow_val_change=True)
 
-    def _start(self, config: Mapping[str, Any]) -> Any:
+    def _start(self, config: Mapping[str, object]) -> Any:
         if self.folder is not None:
             Path(self.folder).mkdir(parents=True, exist_ok=True)
         is_offline = os.environ.get("WANDB_MODE") == "offline"  # where resume only warns
@@ -132,7 +132,7 @@ class MLflow:
         metric = self._mlflow.entities.Metric
         client.log_batch(self._id, metrics=[metric(name, value, now, step) for name, value in metrics.items()])
 
-    def write_config(self, config: Mapping[str, Any]) -> None:
+    def write_config(self, config: Mapping[str, object]) -> None:
         """Writes the configuration of the run; MLflow does not replace values that are there already."""
         client = self._started()
         logged = client.get_run(self._id).data.params
@@ -185,11 +185,11 @@ class Trackio(Logged):
     def __str__(self) -> str:
         return "Trackio"
 
-    def write_config(self, config: Mapping[str, Any]) -> None:
+    def write_config(self, config: Mapping[str, object]) -> None:
         """Writes the configuration of the run, if that has no row yet."""
         self._started(dict(flat(config)))
 
-    def _start(self, config: Mapping[str, Any]) -> Any:
+    def _start(self, config: Mapping[str, object]) -> Any:
         resume = "never" if self.name is None else "allow"
         return self._package.init(self.project, self.name, config=dict(config), resume=resume, embed=False)
 

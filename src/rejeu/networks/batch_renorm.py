@@ -141,8 +141,8 @@ class RenormalizedNetwork(eqx.Module):
     """Observation, and for a critic the action, to numbers: encoder, normalized hidden layers, one linear head."""
 
     encoder: Encoder
-    torso: Any
-    head: Any
+    torso: PyTree
+    head: PyTree
 
     def __init__(
         self,
@@ -181,7 +181,7 @@ class RenormalizedNetwork(eqx.Module):
 def with_statistics(network: Network, trained: Network) -> Network:
     """Returns ``network`` with the running statistics of ``trained``, a network of the same structure."""
 
-    def take(node: Any, trained_node: Any) -> Any:
+    def take(node: PyTree, trained_node: PyTree) -> Any:
         return eqx.tree_at(_statistics, node, _statistics(trained_node)) if isinstance(node, BatchRenorm) else node
 
     return jax.tree.map(take, network, trained, is_leaf=lambda node: isinstance(node, BatchRenorm))
@@ -206,7 +206,7 @@ def in_training(network: Network, use: Callable[[Network], Array]) -> tuple[Arra
     return use(jax.tree.unflatten(structure, recorders)), jax.tree.unflatten(structure, updated)
 
 
-def is_normalized(network: Any) -> bool:
+def is_normalized(network: PyTree) -> bool:
     """Returns whether a network has a :class:`BatchRenorm`."""
     is_norm = lambda node: isinstance(node, BatchRenorm)  # noqa: E731
     return any(map(is_norm, jax.tree.leaves(network, is_leaf=is_norm)))

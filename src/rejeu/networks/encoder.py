@@ -181,7 +181,7 @@ class OwnEncoder(eqx.Module):
     """An encoder of the user's own."""
 
     leaves: tuple[Leaf, ...] = eqx.field(static=True)
-    module: Any
+    module: PyTree
     n_features: int = eqx.field(static=True)
 
     def __init__(self, key: Array, leaves: tuple[Leaf, ...], make: Callable[[Array, tuple[Leaf, ...]], Any]) -> None:

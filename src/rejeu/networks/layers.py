@@ -136,7 +136,7 @@ class Dropout(eqx.Module):
         return jnp.where(is_kept, x / (1.0 - self.rate), 0.0)
 
 
-def with_dropout(networks: Any, key: Array | None) -> Any:
+def with_dropout(networks: PyTree, key: Array | None) -> Any:
     """Returns stacked networks whose dropout layers draw from ``key``, each layer its own numbers; unchanged for None."""
     if key is None:
         return networks
@@ -203,7 +203,7 @@ def register_encoder(name: str) -> Callable[[M], M]:
     return register
 
 
-def find_encoder(encoder: Any) -> Any:
+def find_encoder(encoder: PyTree) -> Any:
     """Returns the encoder of a name; anything but a name is returned unchanged.
 
     Raises:
@@ -238,7 +238,7 @@ class OwnModule(eqx.Module):
         return module(x) if self.takes_batch else jax.vmap(module)(x)
 
 
-def own_module(role: str, module: Any, example: PyTree) -> tuple[Any, int]:
+def own_module(role: str, module: PyTree, example: PyTree) -> tuple[Any, int]:
     """Returns a module of the user's own as one that takes a batch, and the number of its outputs.
 
     Args:
@@ -277,7 +277,7 @@ def own_module(role: str, module: Any, example: PyTree) -> tuple[Any, int]:
     return OwnModule(arrays, constants, takes_batch, n_outputs), n_outputs
 
 
-def outputs_of(module: Any, inputs: PyTree, leading: tuple[int, ...]) -> int | None:
+def outputs_of(module: PyTree, inputs: PyTree, leading: tuple[int, ...]) -> int | None:
     """Returns the length of the last axis that ``module`` gives for ``inputs``, None if it gives another shape."""
     try:
         shape = eqx.filter_eval_shape(module, inputs).shape

@@ -20,6 +20,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import Array
+from numpy.typing import ArrayLike
 
 from rejeu.core.algorithm import PyTree, Remembered, Sequences, renew, unmasked
 from rejeu.core.spaces import Leaf
@@ -126,7 +127,7 @@ class Cell(eqx.Module):
 class Recurrent(eqx.Module):
     """A network, or several stacked, that reads what a cell remembers of the observations of the episode so far."""
 
-    encoder: Any
+    encoder: PyTree
     cell: Cell
     reader: Any
     """Maps what is remembered, ``(batch, size)``; stacked networks share the memory."""
@@ -203,19 +204,19 @@ def with_memory(
     return Recurrent(encoder, cell, make((remembered,), dataclasses.replace(shape, encoder=None)), slot, shape.burn_in)
 
 
-def each(critics: Any, obs: PyTree, call: Callable[[Any, PyTree], Array]) -> Array:
+def each(critics: PyTree, obs: PyTree, call: Callable[[Any, PyTree], Array]) -> Array:
     """Returns ``call(critic, obs)`` of each of the stacked critics, ``(n_critics, ...)``, which may share a memory."""
     if isinstance(critics, Recurrent):
         critics, obs = critics.reader, critics.remembered(obs)
     return jax.vmap(lambda critic: call(critic, obs))(critics)
 
 
-def some(critics: Any, index: Any) -> Any:
+def some(critics: PyTree, index: ArrayLike) -> PyTree:
     """Returns those of stacked critics that ``index`` names: the numbers of several, or of one without the leading axis."""
     reader = jax.tree.map(lambda leaf: leaf[index], critics.reader if isinstance(critics, Recurrent) else critics)
     return dataclasses.replace(critics, reader=reader) if isinstance(critics, Recurrent) else reader
 
 
-def first(critics: Any) -> Any:
+def first(critics: PyTree) -> PyTree:
     """Returns the first of stacked critics."""
     return some(critics, 0)

@@ -147,7 +147,7 @@ def make_head(key: Array, n_inputs: int, n_outputs: int, shape: PolicyConfig) ->
     return head
 
 
-def name_of(function: Any) -> str:
+def name_of(function: object) -> str:
     """Returns the name of a function or class for messages."""
     return getattr(function, "__name__", repr(function))
 
@@ -155,9 +155,9 @@ def name_of(function: Any) -> str:
 class Network(eqx.Module):
     """Maps an observation to a vector, such as the parameters of an action or the values of all actions."""
 
-    encoder: Any
+    encoder: PyTree
     torso: Torso
-    head: Any
+    head: PyTree
 
     def __init__(
         self, key: Array, leaves: tuple[Leaf, ...], n_outputs: int, widths: Sequence[int], shape: PolicyConfig
@@ -175,9 +175,9 @@ class Network(eqx.Module):
 class QNetwork(eqx.Module):
     """Maps an observation and a continuous action to a value, or to several such as quantiles."""
 
-    encoder: Any
+    encoder: PyTree
     torso: Torso
-    head: Any
+    head: PyTree
 
     def __init__(
         self,
@@ -201,12 +201,12 @@ class QNetwork(eqx.Module):
         return self.head(self.torso(jnp.concatenate([features, action], axis=-1)))
 
 
-def action_values(critics: Any, obs: PyTree, action: Array) -> Array:
+def action_values(critics: PyTree, obs: PyTree, action: Array) -> Array:
     """Returns the value that each of the stacked critics gives, ``(n_critics, batch)``."""
     return each(critics, obs, lambda critic, obs: critic(obs, action)[:, 0])
 
 
-def values_by_critics(state: Any, obs: PyTree, action: Array) -> Array:
+def values_by_critics(state: PyTree, obs: PyTree, action: Array) -> Array:
     """Returns the same of the critics in the state of an algorithm; for ``Algorithm.action_values``."""
     return action_values(state.critics, obs, action)
 
@@ -231,11 +231,11 @@ def actor_and_critics(
     """
     leaves, shape = inputs
 
-    def actor(key: Array) -> Any:
+    def actor(key: Array) -> PyTree:
         build = lambda leaves, shape: Network(key, leaves, n_outputs, shape.actor_widths(), shape)  # noqa: E731
         return with_memory(key, leaves, shape, build)
 
-    def critics(key: Array) -> Any:
+    def critics(key: Array) -> PyTree:
         size, *more = sizes
 
         def build(leaves: tuple[Leaf, ...], shape: PolicyConfig) -> Any:

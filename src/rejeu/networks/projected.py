@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from rejeu.core.algorithm import PyTree
 from rejeu.networks.batch_renorm import NEVER, BatchRenorm, RenormalizedMLP
 from rejeu.networks.layers import ACTIVATIONS, RMSNorm, product
 
@@ -138,12 +139,12 @@ def projected(network: Network) -> Network:
     """
     is_part = lambda node: isinstance(node, UnitLinear | RMSNorm | BatchRenorm)  # noqa: E731
 
-    def scaled(node: Any) -> Any:
+    def scaled(node: PyTree) -> Any:
         if isinstance(node, UnitLinear):
             return eqx.tree_at(lambda layer: layer.weight, node, unit(node.weight, axis=-2))
         return jax.tree.map(with_gains, node, is_leaf=is_part) if isinstance(node, InvertedResidual) else node
 
-    def with_gains(node: Any) -> Any:
+    def with_gains(node: PyTree) -> Any:
         if isinstance(node, RMSNorm):
             return eqx.tree_at(lambda norm: norm.scale, node, unit(node.scale) * math.sqrt(node.scale.shape[-1]))
         if isinstance(node, BatchRenorm):

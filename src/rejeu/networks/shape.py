@@ -9,6 +9,7 @@ from typing import Any, Literal, NamedTuple
 from jax import Array
 
 from rejeu.core.spaces import Leaf
+from rejeu.core.types import Settings
 from rejeu.core.validation import MOST_LAYERS, MOST_WIDTH, assign, choice, coerce, flag, number, whole
 from rejeu.networks.layers import ACTIVATIONS, find_encoder
 
@@ -137,7 +138,7 @@ class PolicyConfig:
         return next(widths for widths in (arch, self.net_arch, simba) if widths is not None)
 
 
-def settled(shape: Mapping[str, Any], widths: Widths) -> dict[str, Any]:
+def settled(shape: Mapping[str, object], widths: Widths) -> Settings:
     """Returns the settings of widths that the settings ``shape`` leave to the default ``widths``.
 
     There are none where the hidden layers are of another kind: branches, SimBa or the user's own.
@@ -164,13 +165,13 @@ def split_net_arch(config: Any, fields: Mapping[str, str]) -> None:
     assign(config, net_arch=None, **widths)
 
 
-def activation_name(key: str, value: Any) -> str:
+def activation_name(key: str, value: object) -> str:
     """Returns the name of an activation function, from the name or from a function or class of that name."""
     name = value if isinstance(value, str) else getattr(value, "__name__", repr(value))
     return choice(key, name.lower(), ACTIVATIONS)
 
 
-def layer_widths(key: str, value: Any) -> tuple[int, ...]:
+def layer_widths(key: str, value: object) -> tuple[int, ...]:
     """Returns the widths of hidden layers."""
     if value is None:
         return ()

@@ -24,6 +24,7 @@ from jax import Array
 from rejeu.core import schedules
 from rejeu.core.algorithm import PyTree, Transition
 from rejeu.core.prng import below
+from rejeu.core.types import Scalar
 from rejeu.replay import device_priorities
 from rejeu.replay.device_priorities import DevicePriorities
 from rejeu.replay.hindsight import GoalStrategy, HindsightSteps, MixedStrategies
@@ -76,7 +77,7 @@ class DeviceReplay:
     rows: int
     """Rows of each environment, at least 3."""
     n_envs: int
-    obs_structure: Any
+    obs_structure: PyTree
     gamma: float
     batch_size: int
     n_steps: int = 1
@@ -154,7 +155,7 @@ class DeviceReplay:
         """Returns the absolute time of the oldest row that is kept, by environment, ``(n_envs,)``."""
         return jnp.maximum(ring.head - self.rows + 1, 0)
 
-    def draw_by_priority(self, ring: DeviceRing, key: Array, progress: Array | float) -> tuple[DeviceRows, Array]:
+    def draw_by_priority(self, ring: DeviceRing, key: Array, progress: Scalar) -> tuple[DeviceRows, Array]:
         """Returns the steps of a batch drawn by priority, and their importance weights, ``float32 (batch_size,)``."""
         assert ring.priorities is not None
         assert self.priorities is not None
@@ -207,7 +208,7 @@ class DeviceReplay:
         self,
         ring: DeviceRing,
         key: Array,
-        progress: Array | float = 1.0,
+        progress: Scalar = 1.0,
         reward: GoalFunction | None = None,
         terminated: GoalFunction | None = None,
     ) -> tuple[Transition, DeviceRows]:

@@ -30,11 +30,13 @@ from copy import deepcopy
 from dataclasses import dataclass
 from enum import Enum
 from functools import cache, cached_property, partial
+from types import ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from rejeu.core.algorithm import Transition
+from rejeu.core.algorithm import PyTree, Transition
+from rejeu.core.types import Observation
 from rejeu.core.validation import assign, coerce, flag, whole
 from rejeu.envs.goals import GoalFunctions
 from rejeu.replay.prioritized import Draw, Priorities
@@ -84,7 +86,7 @@ class HindsightSteps:
         return self.np.maximum(self.newest - self.rows + 1, 0)
 
     @cached_property
-    def first(self) -> Any:
+    def first(self) -> PyTree:
         """The first times of the same episodes with a goal that was reached by an action."""
         return self.begin(self.time) + 1
 
@@ -206,7 +208,7 @@ class MixedStrategies(NamedTuple):
     shares: tuple[tuple[str | GoalStrategy, int], ...]
     """Strategies and shares, such as ``(("future", 2), ("desired", 2))`` for half of the transitions each."""
 
-    def joined(self, xp: Any, choose: Callable[..., Any], *arrays: Any) -> Any:
+    def joined(self, xp: ModuleType, choose: Callable[..., Any], *arrays: Any) -> Any:
         """Returns ``choose(number, *rows, strategy)`` of all strategies, each with its rows of the arrays, in their order."""
         rows, order = rows_of_shares(tuple(share for _, share in self.shares), len(arrays[0]))
         parts = [choose(i, *(array[rows[i]] for array in arrays), self.shares[i][0]) for i in range(len(rows))]
@@ -251,7 +253,7 @@ class HindsightConfig:
         assign(self, goal_selection_strategy=strategy)
 
 
-def checked_strategy(strategy: Any) -> str | GoalStrategy | MixedStrategies:
+def checked_strategy(strategy: object) -> str | GoalStrategy | MixedStrategies:
     """Returns a goal strategy as settings have it: a name, a function without a name, or several names with shares.
 
     Raises:
@@ -339,7 +341,7 @@ class HerReplayBuffer(BaseReplayBuffer):
         self.last_infos: Callable[[], Any] = tuple
         """Returns the infos of the step that is added, one for each environment; set by the agent."""
 
-    def add(self, action: np.ndarray, reward: np.ndarray, terminated: np.ndarray, next_obs: Any) -> None:
+    def add(self, action: np.ndarray, reward: np.ndarray, terminated: np.ndarray, next_obs: Observation) -> None:
         """Records one step of each environment; see :meth:`Ring.add`."""
         if self.infos is not None:
             last = self.last_infos()

@@ -16,6 +16,7 @@ import numpy as np
 
 from rejeu.core import schedules
 from rejeu.core.schedules import Schedule
+from rejeu.core.types import Settings
 from rejeu.core.validation import coerce, number
 from rejeu.replay.ring import LAST, Ring, Rows
 
@@ -154,7 +155,7 @@ class Priorities:
         self.tree.fill(values)
         self.largest = largest
 
-    def state(self) -> dict[str, Any]:
+    def state(self) -> Settings:
         """Returns the state for :meth:`restore`."""
         n = self.ring.rows * self.ring.n_envs
         return {"values": self.tree[np.arange(n)], "largest": self.largest}

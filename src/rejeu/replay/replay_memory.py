@@ -10,6 +10,7 @@ import numpy as np
 
 from rejeu.core import spaces
 from rejeu.core.algorithm import Transition
+from rejeu.core.types import Action, Observation
 from rejeu.core.validation import number, whole
 from rejeu.replay.ring import check_memory
 
@@ -72,7 +73,7 @@ class ReplayMemory:
     def __repr__(self) -> str:
         return f"<ReplayMemory: {len(self):,} of {self.capacity:,} transitions>"
 
-    def push(self, obs: Any, action: Any, reward: float, next_obs: Any, terminated: bool) -> None:
+    def push(self, obs: Observation, action: Action, reward: float, next_obs: Observation, terminated: bool) -> None:
         """Adds one transition, and overwrites the oldest if the memory is full.
 
         Args:
@@ -130,7 +131,7 @@ class ReplayMemory:
     def _tree(self, stores: list[np.ndarray], index: np.ndarray) -> Any:
         return jax.tree.unflatten(spaces.structure(self.observation_space), [store[index] for store in stores])
 
-    def _parts(self, obs: Any, name: str) -> list[np.ndarray]:
+    def _parts(self, obs: Observation, name: str) -> list[np.ndarray]:
         """Returns the arrays of an observation.
 
         Raises:

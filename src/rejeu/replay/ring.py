@@ -15,9 +15,12 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from numpy.typing import DTypeLike
 
+from rejeu.core.algorithm import PyTree
 from rejeu.core.hardware import free_memory
 from rejeu.core.spaces import Leaf, flat_keys
+from rejeu.core.types import Observation
 
 STEP, TERMINATED, LAST = 0, 1, 2
 """Kinds of row: an ordinary step, a step into a terminal state of the MDP, a final observation without a step."""
@@ -46,9 +49,9 @@ class Ring:
         capacity: int,
         n_envs: int,
         obs_leaves: tuple[Leaf, ...],
-        obs_structure: Any,
+        obs_structure: PyTree,
         action_shape: tuple[int, ...],
-        action_dtype: Any,
+        action_dtype: DTypeLike,
         frame_stack: int | None = None,
         counters: Sequence[str] = (),
         memory_size: int = 0,
@@ -115,7 +118,7 @@ class Ring:
         stacks = [array for array, stacked in zip(self.obs, self.stacked, strict=True) if stacked]
         return self.records.nbytes + self.memory.nbytes + self.kind.nbytes + sum(array.nbytes for array in stacks)
 
-    def begin(self, obs: Any, envs: np.ndarray | None = None) -> None:
+    def begin(self, obs: Observation, envs: np.ndarray | None = None) -> None:
         """Starts an episode with ``obs`` ``(n_envs, ...)`` in the environments ``envs`` (indices; None: all).
 
         An episode that still runs there ends with its newest row, without a terminal state.
@@ -134,7 +137,7 @@ class Ring:
         action: np.ndarray,
         reward: np.ndarray,
         terminated: np.ndarray,
-        next_obs: Any,
+        next_obs: Observation,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Records one step of each environment, ``(n_envs, ...)``.
 
@@ -223,7 +226,7 @@ class Ring:
         back = np.minimum(np.arange(self.frame_stack)[::-1], available[..., None])
         return self.base[env][..., None] + (slot[..., None] - back) % self.rows
 
-    def tree(self, obs_leaves: Sequence[Any]) -> Any:
+    def tree(self, obs_leaves: Sequence[object]) -> PyTree:
         """Returns observation leaves in the structure of the environment's space."""
         return jax.tree.unflatten(self.obs_structure, obs_leaves)
 
@@ -247,7 +250,7 @@ class Ring:
             times = np.arange(max(int(self.start[env]), head - self.rows + 1), head + 1)
             self.until_end[self.base[env] + times % self.rows] = head - times
 
-    def _write_obs(self, index: np.ndarray, obs: Any, envs: np.ndarray | slice | int) -> None:
+    def _write_obs(self, index: np.ndarray, obs: Observation, envs: np.ndarray | slice | int) -> None:
         """Writes observations ``(n_envs, ...)`` at ``index``, and of stacks the newest frame."""
         leaves = jax.tree.leaves(obs) if self._keys is None else [obs[key] for key in self._keys]
         for store, leaf, stacked in zip(self.obs, leaves, self.stacked, strict=True):
@@ -336,7 +339,7 @@ def record_dtype(
     leaves: tuple[Leaf, ...],
     stacked: tuple[bool, ...],
     action_shape: tuple[int, ...],
-    action_dtype: Any,
+    action_dtype: DTypeLike,
     counters: tuple[str, ...],
 ) -> np.dtype:
     """Returns the dtype of a row without its kind and frames."""

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
 
 import jax
 import numpy as np
+from numpy.typing import DTypeLike
 
 from rejeu.core.algorithm import PyTree, Rollout
 from rejeu.core.spaces import Leaf
@@ -22,9 +22,9 @@ class RolloutBuffer:
         n_steps: int,
         n_envs: int,
         obs_leaves: tuple[Leaf, ...],
-        obs_structure: Any,
+        obs_structure: PyTree,
         action_shape: tuple[int, ...],
-        action_dtype: Any,
+        action_dtype: DTypeLike,
         gamma: float,
     ) -> None:
         """Allocates memory for ``n_steps`` steps of each environment.

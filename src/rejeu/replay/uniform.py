@@ -10,12 +10,14 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
+from types import ModuleType
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
-from rejeu.core.algorithm import Masked, Sequences, Transition, unmasked
+from rejeu.core.algorithm import Masked, PyTree, Sequences, Transition, unmasked
+from rejeu.core.types import Action, AnyArray, Observation
 from rejeu.replay import ring_io
 from rejeu.replay.prioritized import Draw, Priorities
 from rejeu.replay.ring import LAST, TERMINATED, Ring, Rows
@@ -73,14 +75,14 @@ class BaseReplayBuffer(ABC):
     def __repr__(self) -> str:
         return f"<{type(self).__name__}: {self.size():,} of {self.ring.rows * self.ring.n_envs:,} steps>"
 
-    def begin(self, obs: Any, envs: np.ndarray | None = None) -> None:
+    def begin(self, obs: Observation, envs: np.ndarray | None = None) -> None:
         """Starts episodes; see :meth:`Ring.begin`."""
         self.ring.begin(obs, envs)
         if self.priorities is not None:
             envs = self.ring.all_envs if envs is None else envs
             self.priorities.tree.set(self.ring.index(envs, self.ring.head[envs]), 0.0)
 
-    def add(self, action: np.ndarray, reward: np.ndarray, terminated: np.ndarray, next_obs: Any) -> None:
+    def add(self, action: np.ndarray, reward: np.ndarray, terminated: np.ndarray, next_obs: Observation) -> None:
         """Records one step of each environment; see :meth:`Ring.add`."""
         index, following = self.ring.add(action, reward, terminated, next_obs)
         if self.priorities is not None:
@@ -132,12 +134,12 @@ class BaseReplayBuffer(ABC):
     def transition(
         self,
         shape: tuple[int, ...],
-        obs: Any,
-        action: Any,
+        obs: Observation,
+        action: Action,
         result: Outcome,
-        next_obs: Any,
-        weight: Any = None,
-        next_action: Any = None,
+        next_obs: Observation,
+        weight: PyTree = None,
+        next_action: Action = None,
     ) -> Transition:
         """Returns transitions in ``shape``, from observations and actions ``(n, ...)`` and what they lead to."""
         rewards, steps, terminated = result
@@ -237,7 +239,7 @@ class StepWindow(NamedTuple):
     """Which of these entered a terminal state."""
 
 
-def look_ahead(xp: Any, ring: Any, index: Callable[..., Any], rows: Any, n: int) -> StepWindow:
+def look_ahead(xp: ModuleType, ring: Any, index: Callable[..., Any], rows: Any, n: int) -> StepWindow:
     """Returns the up to ``n`` steps from each of ``rows`` to its episode's end or to the newest step."""
     times = rows.time[:, None] + xp.arange(n)[None]
     position = index(rows.env[:, None], times)
@@ -262,7 +264,7 @@ class NewGoals(NamedTuple):
     terminated: Any
     """Whether they end the episode, a function as ``reward``; None if the steps keep their own flags."""
 
-    def ends(self, reached: Any, goal: Any, own_goal: Any, ended: Any) -> Any:
+    def ends(self, reached: AnyArray, goal: AnyArray, own_goal: AnyArray, ended: AnyArray) -> Any:
         """Returns which steps end an episode: those that reach ``goal``, and those that ended otherwise, as in a crash.
 
         ``ended`` says which of them ended with ``own_goal``.
@@ -284,7 +286,7 @@ class Outcome(NamedTuple):
 
 
 def outcome(
-    xp: Any, ring: Any, index: Callable[..., Any], rows: Any, n_steps: int, goals: NewGoals | None = None
+    xp: ModuleType, ring: Any, index: Callable[..., Any], rows: Any, n_steps: int, goals: NewGoals | None = None
 ) -> Outcome:
     """Returns what ``rows`` lead to in up to ``n_steps`` steps, with new goals if there are any."""
     if goals is not None:

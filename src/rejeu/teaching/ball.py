@@ -12,6 +12,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+from rejeu.core.types import Action, Info, JsonObject
 from rejeu.core.validation import number
 from rejeu.envs.canvas import Scene
 from rejeu.envs.functional.ball_drawing import HELD_REWARD, LOST_REWARD, MAX_PUSH, WALL, BallDrawing
@@ -97,9 +98,7 @@ class Ball(gym.Env[np.ndarray, np.ndarray]):
         self._push: list[float] = []
         self._drawing: BallDrawing | None = None
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[np.ndarray, Info]:
         """Starts an episode. Returns the position and an empty info."""
         super().reset(seed=seed)
         self.position = self.np_random.uniform(-MAX_PUSH, MAX_PUSH, self.dimension).tolist()
@@ -111,7 +110,7 @@ class Ball(gym.Env[np.ndarray, np.ndarray]):
         self._show()
         return self._observe(), {}
 
-    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+    def step(self, action: Action) -> tuple[np.ndarray, float, bool, bool, Info]:
         """Pushes the ball, see the class.
 
         Raises:
@@ -160,7 +159,7 @@ class Ball(gym.Env[np.ndarray, np.ndarray]):
         """Whether the environment must be reset before the next step."""
         return self.over
 
-    def get_state(self) -> dict[str, Any]:
+    def get_state(self) -> JsonObject:
         """Returns the state, including the random number generator, as JSON values, for :meth:`set_state`."""
         return {
             "position": list(self.position),

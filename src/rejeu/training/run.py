@@ -19,6 +19,7 @@ from jax import Array
 
 from rejeu.core.algorithm import Clock, PyTree
 from rejeu.core.records import Count, Duration, Positive, Seconds, convert
+from rejeu.core.types import JsonObject
 from rejeu.core.validation import number, whole
 from rejeu.core.xla import clock
 from rejeu.envs.base import Step, VectorEnv, seed_of_run
@@ -132,7 +133,7 @@ class Run:
         return self.buffer
 
     @replay.setter
-    def replay(self, buffer: Any) -> None:
+    def replay(self, buffer: object) -> None:
         self.buffer, self.fetch = buffer, None
 
     def copy_replay(self) -> None:
@@ -183,7 +184,12 @@ def record_step(run: Run, step: Step, stepped: np.ndarray | None = None) -> list
 
 
 def initial_run(
-    env: VectorEnv | None, buffer: Any, learner: Learner, learn_from: int, seed: int, state: PackedState | None = None
+    env: VectorEnv | None,
+    buffer: object,
+    learner: Learner,
+    learn_from: int,
+    seed: int,
+    state: PackedState | None = None,
 ) -> Run:
     """Returns a new run; ``seed`` determines all its random numbers.
 
@@ -220,7 +226,7 @@ def timed(part: str) -> Callable[[F], F]:
 
     def decorate(function: F) -> F:
         @wraps(function)
-        def call(run: Run, *arguments: Any) -> Any:
+        def call(run: Run, *arguments: object) -> Any:
             began = time.perf_counter()
             result = function(run, *arguments)
             add_time(run, part, began)
@@ -309,12 +315,12 @@ class TrainingCall:
         by_episodes = self.n_episodes is not None and run.episode - self.first_episode >= self.n_episodes
         return by_steps or by_episodes or (self.seconds is not None and self.elapsed >= self.seconds)
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> JsonObject:
         """Returns it as JSON values."""
         return {**{key: getattr(self, key) for key in SAVED}, "spent": self.elapsed}
 
     @classmethod
-    def from_json(cls, saved: Mapping[str, Any]) -> TrainingCall:
+    def from_json(cls, saved: Mapping[str, object]) -> TrainingCall:
         """Returns the call that :meth:`to_json` saved, resumed now.
 
         Raises:

@@ -107,16 +107,16 @@ Distribution = Normal | TanhNormal | Categorical | MultiCategorical | Bernoulli 
 class ActorCritic(eqx.Module):
     """Observation to a distribution over actions and to a value."""
 
-    encoder: Any
+    encoder: PyTree
     torso: Torso
-    head: Any
+    head: PyTree
     log_std: Array | None
     """``(action_dim,)``, with gSDE ``(width, action_dim)``; None where the head gives it or there is none."""
-    value_encoder: Any
+    value_encoder: PyTree
     """None where the policy's is shared."""
-    value_torso: Any
+    value_torso: PyTree
     """None where the policy's is shared."""
-    value_head: Any
+    value_head: PyTree
     action: ActionKind = eqx.field(static=True)
     shape: ActorCriticConfig = eqx.field(static=True)
 
@@ -248,11 +248,11 @@ def sde_explorer(n_steps: int, restarts: bool = True) -> Explorer:
     The carry is each environment's matrix ``(n_envs, width, action_dim)`` and its age in steps ``int32 (n_envs,)``.
     """
 
-    def init(actor: Any, n_envs: int) -> tuple[Array, Array]:
+    def init(actor: PyTree, n_envs: int) -> tuple[Array, Array]:
         return jnp.zeros((n_envs, *actor.log_std.shape), jnp.float32), jnp.zeros((n_envs,), jnp.int32)
 
     def act(
-        carry: tuple[Array, Array], actor: Any, obs: PyTree, ended: Array, key: Array, clock: Clock
+        carry: tuple[Array, Array], actor: PyTree, obs: PyTree, ended: Array, key: Array, clock: Clock
     ) -> tuple[Array, tuple[Array, Array]]:
         matrix, age = carry
         due = ended if n_steps == -1 else ended | (age % n_steps == 0)
@@ -282,7 +282,7 @@ def explorer_of(config: OnPolicyConfig, action_kind: ActionKind) -> Explorer | N
 
 
 def algorithm_of(
-    config: OnPolicyConfig, action_kind: ActionKind, init: Callable[[Array], Any], update: Callable[..., Any]
+    config: OnPolicyConfig, action_kind: ActionKind, init: Callable[[Array], PyTree], update: Callable[..., PyTree]
 ) -> Algorithm:
     """Returns the algorithm whose state has an :class:`ActorCritic` as ``network``, from how it begins and learns.
 
@@ -301,14 +301,14 @@ def algorithm_of(
     )
 
 
-def orthogonal(module: Any, key: Array, gain: float) -> Any:
+def orthogonal(module: PyTree, key: Array, gain: float) -> PyTree:
     """Returns ``module`` with the weights of every linear layer and convolution orthogonal times ``gain``, biases 0.
 
     Source: Saxe et al. 2014, "Exact solutions to the nonlinear dynamics of learning" (arXiv 1312.6120). None stays None.
     """
     drawn = 0
 
-    def draw(node: Any) -> Any:
+    def draw(node: PyTree) -> PyTree:
         nonlocal drawn
         if not isinstance(node, Linear | Convolution):
             return node
@@ -321,7 +321,7 @@ def orthogonal(module: Any, key: Array, gain: float) -> Any:
     return jax.tree.map(draw, module, is_leaf=lambda node: isinstance(node, Linear | Convolution))
 
 
-def is_value(network: Any) -> Any:
+def is_value(network: PyTree) -> PyTree:
     """Returns a tree like ``network``, an :class:`ActorCritic` or a module that holds one, of bools.
 
     They say of each array whether it belongs to the value alone.

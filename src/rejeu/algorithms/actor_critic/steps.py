@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -17,6 +17,7 @@ from rejeu.algorithms.actor_critic.network import ActorCritic, Distribution, is_
 from rejeu.core.algorithm import PyTree, Rollout, clip, descend
 from rejeu.core.distributions import is_squashed
 from rejeu.core.schedules import at
+from rejeu.core.types import Scalar
 
 D = TypeVar("D")
 MOST_SORTED = 2**14
@@ -28,7 +29,7 @@ N_ROUNDS = 8
 class RolloutState(eqx.Module):
     """Everything that an algorithm learns from minibatches of rollouts; every leaf is an array."""
 
-    network: Any
+    network: PyTree
     """Policy and value, an :class:`ActorCritic` or, with memory, a ``RecurrentActorCritic``; in PQN the Q-network."""
     optimizer: PyTree
     key: Array
@@ -38,12 +39,14 @@ class RolloutState(eqx.Module):
     n_rollouts: Array
     """Rollouts learned from, ``int32[]``."""
 
-    def after(self, network: Any, optimizer_state: PyTree, n_steps: Any) -> RolloutState:
+    def after(self, network: PyTree, optimizer_state: PyTree, n_steps: Scalar) -> RolloutState:
         """Returns the state after a rollout, from which ``n_steps`` gradient steps were taken."""
         return RolloutState(network, optimizer_state, self.key, self.n_updates + n_steps, self.n_rollouts + 1)
 
 
-def initial_state(key: Array, build: Callable[[Array], Any], optimizer: optax.GradientTransformation) -> RolloutState:
+def initial_state(
+    key: Array, build: Callable[[Array], PyTree], optimizer: optax.GradientTransformation
+) -> RolloutState:
     """Returns the state before the first rollout; ``build(key)`` returns the network."""
     network_key, update_key = jax.random.split(key)
     network = build(network_key)
@@ -99,13 +102,13 @@ def entropy_of(distribution: Distribution, log_prob: Array) -> Array:
 
 
 def clip_and_descend(
-    network: Any,
-    gradients: Any,
+    network: PyTree,
+    gradients: PyTree,
     optimizer_state: PyTree,
     optimizer: optax.GradientTransformation,
     config: OnPolicyConfig,
-    progress: Any,
-) -> tuple[Any, PyTree]:
+    progress: Scalar,
+) -> tuple[PyTree, PyTree]:
     """Returns network and optimizer state after one step against gradients whose norm is limited.
 
     A value with a learning rate of its own also has a norm of its own.
@@ -119,7 +122,7 @@ def clip_and_descend(
     return descend(network, eqx.combine(*parts), optimizer_state, optimizer, rates)
 
 
-def std_of(network: Any) -> dict[str, Array]:
+def std_of(network: PyTree) -> dict[str, Array]:
     """Returns the metric of the policy's standard deviation, if it has one of its own."""
     return {} if network.log_std is None else {"std": jnp.mean(jnp.exp(network.log_std))}
 
@@ -159,7 +162,7 @@ def minibatches(data: D, key: Array, n_epochs: int, batch_size: int) -> tuple[Ca
         n_epochs: passes over all steps.
         batch_size: steps of a minibatch; fewer if the rollout has fewer.
     """
-    steps: Any = data
+    steps: PyTree = data
     n = steps.valid.shape[0]
     size = min(batch_size, n)
     n_valid = jnp.sum(steps.valid, dtype=jnp.int32)

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -81,10 +81,10 @@ class State(eqx.Module):
     """Everything that DDPG learns; every leaf is an array."""
 
     actor: Network
-    critic: Any
+    critic: PyTree
     """A :class:`QNetwork`; for Discrete actions a :class:`Network` that gives the values of all actions."""
     target_actor: Network = eqx.field(metadata=AVERAGED)
-    target_critic: Any = eqx.field(metadata=AVERAGED)
+    target_critic: PyTree = eqx.field(metadata=AVERAGED)
     actor_optimizer: PyTree
     critic_optimizer: PyTree
     n_updates: Array
@@ -103,11 +103,11 @@ def make_with(
     config: Config,
     observation_space: spaces.Space,
     n_outputs: int,
-    critic_class: Any,
-    td_target: Callable[[Any, Any, Transition], Array],
-    critic_loss: Callable[[Any, Transition, Array], tuple[Array, Array]],
-    actor_loss: Callable[[Any, Any, PyTree], tuple[Array, Metrics]],
-) -> tuple[Any, Any, Any]:
+    critic_class: type[PyTree],
+    td_target: Callable[[PyTree, PyTree, Transition], Array],
+    critic_loss: Callable[[PyTree, Transition, Array], tuple[Array, Array]],
+    actor_loss: Callable[[PyTree, PyTree, PyTree], tuple[Array, Metrics]],
+) -> tuple[Callable[..., PyTree], Callable[..., PyTree], Callable[..., PyTree]]:
     """Returns ``init``, ``actor`` and ``update`` of DDPG with losses as those of this module.
 
     The actor has ``n_outputs``, which the critic, a ``critic_class``, takes or gives. With the actor's loss come metrics.

@@ -21,7 +21,7 @@ DroQ (Hiraoka et al. 2022, arXiv 2110.02034, algorithm 2).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, ClassVar
@@ -40,6 +40,7 @@ from rejeu.algorithms.soft import EntropyConfig, SoftCritic, soft_actor_critic
 from rejeu.core.algorithm import Algorithm, Clock, Explorer, PyTree, Transition, weighted_mean
 from rejeu.core.distributions import TanhNormal
 from rejeu.core.spaces import Leaf, action_dimension, check_box_action
+from rejeu.core.types import Settings
 from rejeu.core.validation import LARGEST_VALUE, coerce, flag, number, whole
 from rejeu.exploration.held_noise import held_explorer
 from rejeu.networks import (
@@ -53,6 +54,7 @@ from rejeu.networks import (
     some,
     with_dropout,
 )
+from rejeu.networks.shape import PolicyConfig
 
 LOG_STD_RANGE = (-20.0, 2.0)
 """Bounds of the policy's log standard deviation, in nats, as in the authors' code."""
@@ -115,7 +117,7 @@ class Config(EntropyConfig):
         """Returns keys for the dropout of critics that learn and that are learned from; None for both without dropout."""
         return jax.random.split(jax.random.fold_in(key, 1)) if self.policy_kwargs.dropout else (None, None)
 
-    def for_target(self, critics: Any, key: Array) -> Any:
+    def for_target(self, critics: PyTree, key: Array) -> PyTree:
         """Returns the target critics of an update: all of them or ``target_subset``, with dropout if they have it."""
         if self.target_subset is not None:
             index = jax.random.choice(jax.random.fold_in(key, 2), self.n_critics, (self.target_subset,), replace=False)
@@ -126,14 +128,16 @@ class Config(EntropyConfig):
 class SdeActor(eqx.Module):
     """Maps an observation to a mean action, and to noise that its last hidden layer scales (gSDE)."""
 
-    encoder: Any
-    torso: Any
-    head: Any
+    encoder: PyTree
+    torso: PyTree
+    head: PyTree
     log_std: Array
     """``(width, action_dim)``."""
     use_expln: bool = eqx.field(static=True, default=False)
 
-    def __init__(self, key: Array, inputs: tuple[tuple[Leaf, ...], Any], action_dim: int, config: Config) -> None:
+    def __init__(
+        self, key: Array, inputs: tuple[tuple[Leaf, ...], PolicyConfig], action_dim: int, config: Config
+    ) -> None:
         obs_leaves, shape = inputs
         encoder_key, torso_key, head_key = jax.random.split(key, 3)
         self.encoder = make_encoder(encoder_key, obs_leaves, shape)
@@ -164,12 +168,12 @@ def make_with(
     config: Config,
     observation_space: spaces.Space,
     action_space: spaces.Space,
-    td_target: Callable[[Any, Any, Array, Transition, Array], Array],
-    critics_loss: Callable[[Any, Transition, Array], tuple[Array, Any]],
-    values: Callable[[Any, PyTree, Array], Array],
-    judge: Callable[[Any, PyTree, Array], Array],
+    td_target: Callable[[PyTree, PyTree, Array, Transition, Array], Array],
+    critics_loss: Callable[[PyTree, Transition, Array], tuple[Array, PyTree]],
+    values: Callable[[PyTree, PyTree, Array], Array],
+    judge: Callable[[PyTree, PyTree, Array], Array],
     n_outputs: int = 1,
-    measure: Callable[[Any, Any], tuple[Array, Array]] = lambda errors, target: errors,
+    measure: Callable[[PyTree, PyTree], tuple[Array, Array]] = lambda errors, target: errors,
 ) -> Algorithm:
     """Returns SAC for Box actions with critics of ``n_outputs`` and functions of its own, as those of this module.
 
@@ -189,7 +193,7 @@ def make_with(
     return algorithm_of(parts, config, explore, exploit, {**queries, "explorer": explorer_of(config, action_dim)})
 
 
-def algorithm_of(parts: SoftCritic, config: Config, explore: Any, exploit: Any, others: Mapping[str, Any]) -> Algorithm:
+def algorithm_of(parts: SoftCritic, config: Config, explore: Any, exploit: Any, others: Settings) -> Algorithm:
     """Returns the algorithm of these parts and parts of :class:`Algorithm`, with REDQ, dropout and memory if they are set."""
     parts = parts if config.target_subset is None and not config.policy_kwargs.dropout else drawn(parts, config)
     bounds, target = (config.v_min, config.v_max), parts.target
@@ -203,21 +207,21 @@ def algorithm_of(parts: SoftCritic, config: Config, explore: Any, exploit: Any, 
 def drawn(parts: SoftCritic, config: Config) -> SoftCritic:
     """Returns the same with ``target_subset`` (REDQ) and with dropout in the critics in every pass (DroQ)."""
 
-    def target(actor: Any, target_critics: Any, alpha: Array, batch: Transition, key: Array) -> Any:
+    def target(actor: PyTree, target_critics: PyTree, alpha: Array, batch: Transition, key: Array) -> PyTree:
         return parts.target(actor, config.for_target(target_critics, key), alpha, batch, key)
 
-    def critics_loss(critics: Any, batch: Transition, target: Any, key: Array) -> tuple[Array, Any]:
+    def critics_loss(critics: PyTree, batch: Transition, target: PyTree, key: Array) -> tuple[Array, PyTree]:
         return parts.critics_loss(with_dropout(critics, config.dropout_keys(key)[0]), batch, target, key)
 
-    def actor_loss(actor: Any, critics: Any, alpha: Array, batch: Transition, key: Array) -> tuple[Array, Any]:
+    def actor_loss(actor: PyTree, critics: PyTree, alpha: Array, batch: Transition, key: Array) -> tuple[Array, PyTree]:
         return parts.actor_loss(actor, with_dropout(critics, config.dropout_keys(key)[1]), alpha, batch, key)
 
     return parts._replace(target=target, critics_loss=critics_loss, actor_loss=actor_loss)
 
 
 def networks(
-    config: Config, observation_space: spaces.Space, n_outputs: int, critic_class: Any, *sizes: int
-) -> tuple[Callable[[Array], Any], Callable[[Array], Any]]:
+    config: Config, observation_space: spaces.Space, n_outputs: int, critic_class: type[PyTree], *sizes: int
+) -> tuple[Callable[[Array], PyTree], Callable[[Array], PyTree]]:
     """Returns functions of a key that build an actor of ``n_outputs``, and ``config.n_critics`` critics.
 
     A critic is a ``critic_class``, with ``sizes`` where it takes numbers of actions and outputs. With gSDE the actor has half
@@ -304,11 +308,11 @@ def value(critics: QNetwork, obs: PyTree, action: Array, judged_by: Callable[...
 
 def actor_loss(
     actor: Network | SdeActor,
-    critics: Any,
+    critics: PyTree,
     alpha: Array,
     obs: PyTree,
     key: Array,
-    judge: Callable[[Any, PyTree, Array], Array] = value,
+    judge: Callable[[PyTree, PyTree, Array], Array] = value,
 ) -> tuple[Array, Array]:
     """Returns the soft policy loss and the log-probabilities of the actions drawn, ``(batch,)`` (equation 7).
 

@@ -42,7 +42,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.D
     check_discrete(config)
     n_actions = int(action_space.n)
 
-    def policy_loss(actor: Any, critics: Any, alpha: Array, batch: Transition, key: Array) -> tuple[Array, Array]:
+    def policy_loss(actor: PyTree, critics: PyTree, alpha: Array, batch: Transition, key: Array) -> tuple[Array, Array]:
         judged = config.judged_by(all_values(critics, batch.obs), axis=0)
         return actor_loss(actor, judged, alpha, batch.obs)
 

@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -82,7 +81,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         choice, box = policy(actor, obs, n)
         return joined(choice.mode(), box.mode())
 
-    def policy_loss(actor: Any, critics: Any, alpha: Array, batch: Transition, key: Array) -> tuple[Array, Array]:
+    def policy_loss(actor: PyTree, critics: PyTree, alpha: Array, batch: Transition, key: Array) -> tuple[Array, Array]:
         return actor_loss(actor, critics, alpha, batch.obs, key, n, config.judged_by)
 
     parts = SoftCritic(
@@ -95,7 +94,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     )
     algorithm = algorithm_of(parts, config, explore, exploit, {})
 
-    def update(state: Any, batch: Transition, clock: Clock) -> tuple[Any, Metrics]:
+    def update(state: PyTree, batch: Transition, clock: Clock) -> tuple[PyTree, Metrics]:
         """Returns the state after an update and the metrics, those of the two temperatures by names of their own."""
         state, metrics = algorithm.update(state, batch, clock)
         for name in ("ent_coef", "entropy"):
@@ -167,7 +166,7 @@ def actor_loss(
     key: Array,
     n: int,
     judged_by: Callable[..., Array] = jnp.min,
-) -> tuple[Array, Any]:
+) -> tuple[Array, PyTree]:
     """Returns the soft policy loss, and the log-probabilities of choice and Box components, ``(batch, 2)``."""
     value, log_probs = soft_value(actor, critics, alpha, obs, key, n, judged_by)
     return -jnp.mean(value), jnp.stack(log_probs, axis=-1)

@@ -5,7 +5,6 @@ checked.
 """
 
 from pathlib import Path
-from typing import Any
 
 from rejeu.core.errors import MissingExtra
 from rejeu.teaching.courses.checks import SESSION
@@ -25,7 +24,7 @@ __all__ = ["LANGUAGES", "Language", "Version", "by_hand", "minutes", "notebook",
 
 
 def by_hand(
-    env: str, episodes: int, seed: int | None = None, against: Any = None, record: str | Path | None = None
+    env: str, episodes: int, seed: int | None = None, against: object = None, record: str | Path | None = None
 ) -> list[float]:
     """Opens a window to play an environment by hand, and returns your scores; without a display it prints that and returns.
 

@@ -26,6 +26,7 @@ from rejeu.checkpoints.run_folder import RunFolder, find_model
 from rejeu.core import checkpoint, xla
 from rejeu.core.language import Language, said
 from rejeu.core.records import is_sparse, shown
+from rejeu.core.types import JsonObject, Observation
 from rejeu.envs.make import VectorEnv
 from rejeu.envs.registry import is_plain_id
 from rejeu.logs.evaluation import Evaluation, evaluate
@@ -46,7 +47,7 @@ class Unranked(ValueError):
         values: in that text.
     """
 
-    def __init__(self, text: str, *values: Any) -> None:
+    def __init__(self, text: str, *values: object) -> None:
         super().__init__(text)
         self.text, self.values = text, values
 
@@ -167,7 +168,7 @@ def usual_env_id(paths: Sequence[Path]) -> str:
     return ids.most_common(1)[0][0]
 
 
-def header(path: Path) -> dict[str, Any]:
+def header(path: Path) -> JsonObject:
     """Returns the header of a model file.
 
     Raises:
@@ -276,7 +277,7 @@ def evaluated(
         raise Unranked("its spaces are others: {0}", error, env_id) from None
     choose = policy(agent, deterministic=True)
 
-    def within_budget(obs: Any, started: np.ndarray) -> np.ndarray:
+    def within_budget(obs: Observation, started: np.ndarray) -> np.ndarray:
         if xla.clock() > end:
             raise Unranked("it needs more than {:g} seconds for {} episodes", seconds, episodes)
         return choose(obs, started)
@@ -297,7 +298,7 @@ def ranked(models: Iterable[Entrant]) -> tuple[Entrant, ...]:
     )
 
 
-def to_dict(board: Leaderboard) -> dict[str, Any]:
+def to_dict(board: Leaderboard) -> JsonObject:
     """Returns a leaderboard as JSON values."""
     rows = [
         {

@@ -17,6 +17,7 @@ import numpy as np
 
 from rejeu.agents import Agent
 from rejeu.core.interrupt import Interrupt
+from rejeu.core.types import Action, Observation
 from rejeu.core.validation import number, whole
 from rejeu.demonstrations.recording import Recording
 from rejeu.envs.masks import for_agent
@@ -36,12 +37,12 @@ REST_SECONDS = 1.5
 def play(
     env: str | Callable[..., gym.Env],
     *,
-    keys: Mapping[str, Any] | None = None,
+    keys: Mapping[str, Action] | None = None,
     seed: int | None = None,
     fps: float | None = None,
     episodes: int | None = None,
     record: str | Path | None = None,
-    against: Any = None,
+    against: object = None,
 ) -> Game:
     """Opens a window to play an environment by hand, and returns the game when the window is closed.
 
@@ -111,10 +112,10 @@ class Opened(NamedTuple):
 @contextmanager
 def opened(
     env: str | Callable[..., gym.Env],
-    agents: Mapping[str, Any],
+    agents: Mapping[str, object],
     by_hand: bool = True,
     *,
-    keys: Mapping[str, Any] | None = None,
+    keys: Mapping[str, Action] | None = None,
     seed: int | None = None,
     fps: float | None = None,
     episodes: int | None = None,
@@ -203,7 +204,7 @@ def _hand(keys: KeyMap) -> Act:
 def _policy(agent: Any) -> Act:
     state: Any = None
 
-    def act(obs: Any, held: Any, step: int) -> Any:
+    def act(obs: Observation, held: frozenset[str], step: int) -> Action:
         nonlocal state
         action, state = agent.predict(obs, None if step == 0 else state, deterministic=True)
         return action

@@ -14,6 +14,7 @@ from rejeu.agents import Agent, OffPolicyAgent
 from rejeu.callbacks.base import TrainingCallback
 from rejeu.core import interrupt, spaces
 from rejeu.core.language import said
+from rejeu.core.types import Action, Observation, PyTree
 from rejeu.core.validation import number
 from rejeu.demonstrations.recording import Recording
 from rejeu.envs.in_process import InProcess
@@ -42,14 +43,14 @@ class Expert:
         OSError: if there is no display.
     """
 
-    def __init__(self, env: gym.Env, keys: Mapping[str, Any] | None = None, fps: float | None = None) -> None:
+    def __init__(self, env: gym.Env, keys: Mapping[str, Action] | None = None, fps: float | None = None) -> None:
         self.env, self.keys = env, keys_for(id_of(env), env.action_space, keys)
         self.fps = natural_fps(env) if fps is None else number("fps", fps, above=0)
         self.player = Player("agent", env, lambda obs, held, step: None, over=False)
         self.game = Game([self.player], 0, self.keys.names, phase="running")
         self.window = Window(said("{}: hold a key to take over", f"rejeu {id_of(env)}"))
 
-    def __call__(self, obs: Any = None) -> Any:
+    def __call__(self, obs: Observation = None) -> Any:
         """Draws the environment, waits for its next step, and returns the action of the person; None where no key is held.
 
         After Ctrl-C, which ends the training or the clone, nobody is waited for.
@@ -106,7 +107,7 @@ class Assist(TrainingCallback):
     every_step: ClassVar[bool] = True
 
     def __init__(
-        self, folder: str | Path | None = None, keys: Mapping[str, Any] | None = None, fps: float | None = None
+        self, folder: str | Path | None = None, keys: Mapping[str, Action] | None = None, fps: float | None = None
     ) -> None:
         self.folder, self.keys, self.fps = folder, keys, fps
         self.seat: Expert
@@ -165,6 +166,6 @@ def check(agent: Agent) -> None:
     Window("").close()
 
 
-def single(batch: Any) -> Any:
+def single(batch: PyTree) -> PyTree:
     """Returns a copy of the only row of a batch of observations or actions."""
     return jax.tree.map(lambda leaf: np.array(leaf[0]), batch)

@@ -10,6 +10,7 @@ from typing import Any, Literal, NamedTuple
 import gymnasium as gym
 import numpy as np
 
+from rejeu.core.types import Action, Observation
 from rejeu.demonstrations.recording import Recording
 from rejeu.envs.base import success_of
 from rejeu.envs.rendering import rgb_frame
@@ -38,7 +39,7 @@ class Player:
     act: Act
     recording: Recording | None = None
     """Recording of the episodes, None if they are not recorded."""
-    obs: Any = None
+    obs: Observation = None
     frame: np.ndarray = field(default_factory=lambda: np.zeros((1, 1, 3), np.uint8))
     """The latest frame, ``uint8 (height, width, 3)``."""
     score: float = 0.0
@@ -69,7 +70,7 @@ class Player:
         if self.recording is not None:
             self.recording.begin(self.obs, seed, self.frame)
 
-    def step(self, action: Any) -> None:
+    def step(self, action: Action) -> None:
         """Steps the environment."""
         self.obs, reward, terminated, truncated, info = self.env.step(action)
         self.frame = rgb_frame(self.env)

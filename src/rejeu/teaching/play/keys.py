@@ -19,6 +19,8 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 
+from rejeu.core.types import Action
+
 ARROWS = {"left": "a", "right": "d", "up": "w", "down": "s"}
 """The key that an arrow key is equivalent to, unless it is bound."""
 OPPOSITES = (("a", "d"), ("s", "w"), ("left", "right"), ("down", "up"))
@@ -45,7 +47,7 @@ class Binding(NamedTuple):
 
     keys: frozenset[str]
     """One key, or several that are held together."""
-    action: Any
+    action: Action
     """An integer for Discrete actions, a flat tuple of numbers for Box actions."""
     label: str
     """Description for the window."""
@@ -69,7 +71,7 @@ class KeyMap:
         """All keys with an action, arrow keys included."""
         return frozenset().union(*(equivalent_keys(binding, self.bindings) for binding in self.bindings))
 
-    def action(self, held: Iterable[str], step: int) -> Any:
+    def action(self, held: Iterable[str], step: int) -> Action:
         """Returns the action at a step of the episode (from 0) in the space's shape and dtype, None to wait.
 
         >>> keys = bind(gym.spaces.Discrete(4), {"a": 1, "w": 2, "d": 3, "none": 0})
@@ -93,7 +95,7 @@ class KeyMap:
         return np.int64(actions[step % len(actions)]) if actions else None
 
 
-def bind(space: gym.Space, actions: Mapping[str, Any], labels: Iterable[tuple[Any, str]] = ()) -> KeyMap:
+def bind(space: gym.Space, actions: Mapping[str, Action], labels: Iterable[tuple[Any, str]] = ()) -> KeyMap:
     """Returns the key map of an action space.
 
     Args:
@@ -198,14 +200,14 @@ def _keys(name: str) -> frozenset[str]:
     return frozenset(keys)
 
 
-def _discrete(space: gym.spaces.Discrete, name: str, action: Any) -> int:
+def _discrete(space: gym.spaces.Discrete, name: str, action: Action) -> int:
     if isinstance(action, bool) or not isinstance(action, int | np.integer) or not space.contains(np.int64(action)):
         last = int(space.start + space.n - 1)
         raise ValueError(f"{name}={_text(action)} must be an integer from {int(space.start)} to {last}")
     return int(action)
 
 
-def _box(space: gym.spaces.Box, name: str, action: Any) -> tuple[float, ...]:
+def _box(space: gym.spaces.Box, name: str, action: Action) -> tuple[float, ...]:
     numbers = action if isinstance(action, list | tuple) else [action]
     low, high = space.low.reshape(-1).tolist(), space.high.reshape(-1).tolist()
     if any(isinstance(x, bool) or not isinstance(x, int | float) for x in numbers) or len(numbers) != len(low):
@@ -223,7 +225,7 @@ def _resting(space: gym.spaces.Box) -> tuple[float, ...]:
     )
 
 
-def _text(action: Any) -> str:
+def _text(action: Action) -> str:
     return "[" + ", ".join(map(_text, action)) + "]" if isinstance(action, list | tuple) else str(action)
 
 
@@ -273,7 +275,7 @@ def known_keys(env_id: str, space: gym.Space) -> dict[str, tuple[Any, str]] | No
     return None
 
 
-def fits(space: gym.Space, actions: Mapping[str, Any]) -> bool:
+def fits(space: gym.Space, actions: Mapping[str, Action]) -> bool:
     """Returns whether actions by keys are actions of a space."""
     try:
         bind(space, actions)
@@ -282,7 +284,7 @@ def fits(space: gym.Space, actions: Mapping[str, Any]) -> bool:
     return True
 
 
-def keys_for(env_id: str, space: gym.Space, custom: Mapping[str, Any] | None = None) -> KeyMap:
+def keys_for(env_id: str, space: gym.Space, custom: Mapping[str, Action] | None = None) -> KeyMap:
     """Returns the key map of an environment: its default keys, or those of its action space, updated by ``custom``.
 
     Raises:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from types import ModuleType
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -55,7 +56,7 @@ class Window:
     def __init__(self, title: str) -> None:
         with requires("playing", "pygame-ce", "play"):
             import pygame
-        self.pygame: Any = pygame
+        self.pygame: ModuleType = pygame
         self.title = title
         hardware.quiet_sdl()
         try:

@@ -20,6 +20,7 @@ from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.core import spaces
 from rejeu.core.algorithm import Clock, PyTree, Transition, unmasked
 from rejeu.core.prng import nth
+from rejeu.core.types import Scalar
 from rejeu.envs.functional.protocol import FunctionalEnv, GoalEnv, of_two_goals
 from rejeu.envs.masks import FunctionalMask
 from rejeu.replay import device_priorities
@@ -100,7 +101,7 @@ class OffPolicyProgram(Program):
             action, explorer = explored()
         return carry._replace(action=action, explorer=explorer)
 
-    def draw(self, env: FunctionalEnv, ring: DeviceRing, key: Array, progress: Array) -> tuple[Transition, DeviceRows]:
+    def draw(self, env: FunctionalEnv, ring: DeviceRing, key: Array, progress: Scalar) -> tuple[Transition, DeviceRows]:
         """Returns a batch and its rows; with hindsight, the rewards of new goals are those of ``env``."""
         if self.replay.strategy is None:
             return self.replay.draw(ring, key, progress)
@@ -190,7 +191,7 @@ def take_turn(program: OffPolicyProgram, env: FunctionalEnv, loop: Loop, limits:
     return loop._replace(carry=carry, experience=ring, learned=learned)
 
 
-def draws(key: Array, step: Array) -> Array:
+def draws(key: Array, step: Scalar) -> Array:
     """Returns the key of the random actions and batches of a turn that ends at the environment step ``step``."""
     return jax.random.fold_in(nth(key, jnp.uint32(DRAWS)), step)
 

@@ -140,7 +140,7 @@ class Loop(NamedTuple):
     """What the turns of a chunk pass on."""
 
     carry: Carry
-    experience: Any
+    experience: PyTree
     """The replay buffer, or the rollout."""
     learned: Learned
     log: EpisodeLog
@@ -180,7 +180,7 @@ class Program(ABC):
     """Makes the algorithm of a configuration, and its exploration, where hyperparameters differ between runs."""
 
     @abstractmethod
-    def batch(self, env: FunctionalEnv, carry: Carry, experience: Any, clock: Clock, number: Any) -> Any:
+    def batch(self, env: FunctionalEnv, carry: Carry, experience: PyTree, clock: Clock, number: Array | int) -> PyTree:
         """Returns the batch of the ``number``-th gradient step of a turn that ends at ``clock``."""
 
     @abstractmethod
@@ -204,7 +204,7 @@ class Program(ABC):
         """Returns the experience of a run, on the device."""
 
     @abstractmethod
-    def download(self, run: Run, experience: Any, counts: Any) -> None:
+    def download(self, run: Run, experience: PyTree, counts: PyTree) -> None:
         """Copies experience on the device into the buffer of a run."""
 
     @abstractmethod
@@ -212,7 +212,7 @@ class Program(ABC):
         """Copies what only this kind of learning counts into a run."""
 
     def chunk(
-        self, env: FunctionalEnv, carry: Carry, experience: Any, limits: Limits
+        self, env: FunctionalEnv, carry: Carry, experience: PyTree, limits: Limits
     ) -> tuple[Carry, Any, ChunkReport]:
         """Returns carry, experience and report after a number of turns."""
         program = self.with_hyperparameters(carry.hyper)
@@ -246,10 +246,10 @@ class Program(ABC):
         algorithm, explorer = self.remake(config)
         return dataclasses.replace(self, algorithm=algorithm, explorer=explorer, config=config)
 
-    def nothing_learned(self, env: FunctionalEnv, state: PyTree, carry: Carry, experience: Any) -> Learned:
+    def nothing_learned(self, env: FunctionalEnv, state: PyTree, carry: Carry, experience: PyTree) -> Learned:
         """Returns what is learned before the first update: metrics are 0. The update is only traced."""
 
-        def update(state: PyTree, carry: Carry, experience: Any) -> tuple[PyTree, Metrics]:
+        def update(state: PyTree, carry: Carry, experience: PyTree) -> tuple[PyTree, Metrics]:
             clock = Clock(jnp.uint32(0), jnp.uint32(0), jnp.float32(0))
             return self.algorithm.update(state, self.batch(env, carry, experience, clock, 0), clock)
 
@@ -375,7 +375,7 @@ class KeyGenerator:
     def __init__(self, key: Array) -> None:
         self.key = key
 
-    def integers(self, high: Any, size: Any = None, dtype: Any = np.int32) -> Array:
+    def integers(self, high: Any, size: Any = None, dtype: type[np.generic] = np.int32) -> Array:
         """Returns whole numbers from 0 to ``high - 1``."""
         high = jnp.asarray(high, dtype)
         bits = jax.random.bits(self.key, high.shape if size is None else (size,) if isinstance(size, int) else size)

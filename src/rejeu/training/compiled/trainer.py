@@ -155,13 +155,13 @@ class DeviceTrainer:
             run.state, run.carry = jax.tree.map(jnp.array, (run.state, run.carry))  # views of arrays of all runs
 
 
-def with_env(function: Callable[..., Any], program: Any, static: Any, arrays: Any, *arguments: Any) -> Any:
+def with_env(function: Callable[..., Any], program: Any, static: PyTree, arrays: PyTree, *arguments: PyTree) -> PyTree:
     """Returns the result of ``function(program, env, *arguments)``, given the two parts of the environment."""
     return function(program, joined(static, arrays), *arguments)
 
 
 def take_chunk(
-    program: Program, env: FunctionalEnv, carry: Any, limits: Limits, experience: Any
+    program: Program, env: FunctionalEnv, carry: PyTree, limits: Limits, experience: PyTree
 ) -> tuple[Any, Any, ChunkReport]:
     """Returns carry, experience and report after a chunk, of several runs if there is an axis of them."""
     take = lambda carry, limits, experience: program.chunk(env, carry, experience, limits)  # noqa: E731
@@ -178,18 +178,18 @@ def first_action(program: Program, env: FunctionalEnv, carry: Carry, progress: A
     return program.choose(env, carry, program.packing.unpack(carry.state), clock).action  # type: ignore[attr-defined]
 
 
-def axes_of(tree: Any) -> Any:
+def axes_of(tree: PyTree) -> Any:
     """Returns for each field of a carry or of experience 0, or None if all runs share it."""
     return type(tree)(**{name: None if name in SHARED else 0 for name in tree._fields})
 
 
-def of_run(tree: Any, i: int) -> Any:
+def of_run(tree: PyTree, i: int) -> Any:
     """Returns the experience of one of several runs."""
     parts = {name: jax.tree.map(lambda leaf: leaf[i], getattr(tree, name)) for name in {*tree._fields} - {*SHARED}}
     return tree._replace(**parts)
 
 
-def with_shared(tree: Any, of_one: Any) -> Any:
+def with_shared(tree: PyTree, of_one: PyTree) -> PyTree:
     """Returns a carry or experience of several runs, with the fields that all share from that of one."""
     return tree._replace(**{name: getattr(of_one, name) for name in tree._fields if name in SHARED})
 

@@ -47,6 +47,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rejeu.core.language import SETTING, Language, chosen
 
@@ -134,7 +135,7 @@ def exercise(check: Callable[..., None]) -> Callable[..., Verdict]:
     name, course = check.__name__, check.__module__.rpartition(".")[2]
 
     @wraps(check)
-    def checked(*args: Any, **kwargs: Any) -> Verdict:
+    def checked(*args: object, **kwargs: Any) -> Verdict:
         try:
             check(*args, **kwargs)
         except Wrong as error:
@@ -205,7 +206,7 @@ def require(*names: str, **answers: Any) -> None:
         raise NotReady(SESSION.say("missing", names=", ".join(missing)))
 
 
-def call(student: Any, *args: Any, may_return_none: bool = False, copies: bool = True) -> Any:
+def call(student: Any, *args: object, may_return_none: bool = False, copies: bool = True) -> Any:
     """Calls the student's function or class and returns the result.
 
     Args:
@@ -232,7 +233,7 @@ def call(student: Any, *args: Any, may_return_none: bool = False, copies: bool =
     return result
 
 
-def compiles(student: Any, *args: Any) -> None:
+def compiles(student: Any, *args: object) -> None:
     """Checks that JAX can compile the student's function, as training does.
 
     Raises:
@@ -245,7 +246,7 @@ def compiles(student: Any, *args: Any) -> None:
         raise Wrong("not_compiled_line" if line else "not_compiled", line=line) from None
 
 
-def numbers(result: Any, shape: tuple[int, ...]) -> np.ndarray:
+def numbers(result: object, shape: tuple[int, ...]) -> np.ndarray:
     """Returns a result as an array of floats of a shape, ``()`` for a number.
 
     Raises:
@@ -266,7 +267,7 @@ def numbers(result: Any, shape: tuple[int, ...]) -> np.ndarray:
     return array
 
 
-def diagnose(result: np.ndarray, right: Any, /, **wrong: Any) -> None:
+def diagnose(result: np.ndarray, right: ArrayLike, /, **wrong: Any) -> None:
     """Raises :class:`Wrong` unless a result is right, with the message of the first mistake whose result it is.
 
     Args:
@@ -293,13 +294,13 @@ def mistakes(**occurred: Any) -> None:
             raise Wrong(key)
 
 
-def close(a: Any, b: Any) -> bool:
+def close(a: object, b: object) -> bool:
     """Returns whether two arrays have the same shape and, up to single precision, the same numbers."""
     a, b = np.asarray(a, float), np.asarray(b, float)
     return a.shape == b.shape and bool(np.allclose(a, b, rtol=1e-4, atol=1e-5))
 
 
-def short(value: Any) -> str:
+def short(value: object) -> str:
     """Returns a value as text on one line of at most 160 characters."""
     text = "`...`" if value is ... else " ".join(str(value).split())
     return text if len(text) <= 160 else text[:157] + "..."
@@ -326,5 +327,5 @@ def _same(a: Any, b: Any) -> bool:
     return True
 
 
-def _rounded(values: Any) -> str:
+def _rounded(values: object) -> str:
     return " ".join(np.array2string(np.asarray(values, float), precision=3, threshold=12, separator=", ").split())

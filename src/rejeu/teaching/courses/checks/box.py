@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from rejeu.core.types import Action, PyTree
 from rejeu.teaching.courses.checks import call, close, diagnose, exercise, mistakes, numbers, tabulated
 
 
-def _value(state: Any, action: Any) -> Any:
+def _value(state: Any, action: Action) -> Any:
     return state[:, :1] + 2.0 * action
 
 
@@ -18,7 +19,7 @@ def _action(state: Any) -> Any:
     return 0.5 * state[:, 1:]
 
 
-def _layers() -> dict[str, Any]:
+def _layers() -> dict[str, PyTree]:
     """Returns a small critic. Both branches have as many outputs, so that their order shows."""
     rng, shapes = np.random.default_rng(0), {"state": (2, 4), "action": (1, 4), "common": (8, 5)}
     layers: dict[str, Any] = {

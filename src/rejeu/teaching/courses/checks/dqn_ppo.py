@@ -9,10 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from rejeu.core.algorithm import Transition
+from rejeu.core.types import Action, AnyArray, Info, Observation
 from rejeu.teaching.courses.checks import Wrong, call, close, compiles, diagnose, exercise, mistakes, numbers, tabulated
 
 
-def _linear(weight: Any, obs: Any) -> Any:
+def _linear(weight: AnyArray, obs: Observation) -> Any:
     return obs @ weight
 
 
@@ -48,7 +49,7 @@ def replay_memory(student: Any) -> None:
         raise Wrong("other_transitions", seen=sorted(stored))
 
 
-def _check_length(memory: Any, expected: int) -> None:
+def _check_length(memory: object, expected: int) -> None:
     length = call(len, memory, copies=False)
     if length != expected:
         raise Wrong("length", length=length, expected=expected)
@@ -103,11 +104,11 @@ class _Corridor:
         self.goes_on_after: set[str] = set()
         self.actions: list[Any] = []
 
-    def reset(self, seed: int | None = None, options: Any = None) -> tuple[np.ndarray, dict[str, Any]]:
+    def reset(self, seed: int | None = None, options: object = None) -> tuple[np.ndarray, Info]:
         self.episode, self.time = self.episode + 1, 0
         return self._observe(), {}
 
-    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+    def step(self, action: Action) -> tuple[np.ndarray, float, bool, bool, Info]:
         ends = ("terminated", "truncated")
         if self.time >= 3:
             self.goes_on_after.add(ends[self.episode % 2])
@@ -124,10 +125,10 @@ class _Corridor:
 class _Notes(list):
     """A memory that keeps everything in order."""
 
-    def push(self, *transition: Any) -> None:
+    def push(self, *transition: object) -> None:
         self.append(transition)
 
-    def sample(self, batch_size: int, rng: Any) -> tuple[int, int]:
+    def sample(self, batch_size: int, rng: object) -> tuple[int, int]:
         return len(self), batch_size
 
 

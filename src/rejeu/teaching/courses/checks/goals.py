@@ -13,6 +13,7 @@ import gymnasium as gym
 import numpy as np
 
 from rejeu.agents import SAC
+from rejeu.core.types import Action
 from rejeu.teaching.courses.checks import Wrong, call, close, diagnose, exercise, mistakes, numbers, tabulated
 
 N = 4_000
@@ -24,7 +25,7 @@ class GoalStep(NamedTuple):
 
     obs: dict[str, np.ndarray]
     """``observation``, ``achieved_goal`` and ``desired_goal`` before the step."""
-    action: Any
+    action: Action
     reward: float
     next_obs: dict[str, np.ndarray]
     """Those after the step."""
@@ -193,7 +194,7 @@ def saving(save_all: Any, load_all: Any, agent: Any = None, env: Any = "Pendulum
 
 
 @exercise
-def steps_needed(estimate: Any) -> None:
+def steps_needed(estimate: object) -> None:
     """Checks the mean number of episodes until a random agent of 12 bits stands on its goal in the end, about 4,096."""
     number = float(numbers(estimate, ()))
     diagnose(
