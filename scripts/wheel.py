@@ -1,9 +1,9 @@
-"""Builds the wheel and tests it in a new virtual environment, without extras.
+"""Builds the source distribution and the wheel, and tests the wheel in a new virtual environment, without extras.
 
     python scripts/wheel.py [FOLDER]
 
-The wheel is saved in ``FOLDER``, or deleted if none is given. The exit status is 0 if the wheel contains only the
-package, installs, imports, runs its commands, and trains.
+Both are saved in ``FOLDER``, or deleted if none is given. The wheel is built from the source distribution. The exit
+status is 0 if it contains only the package, installs, imports, runs its commands, and trains. Needs the package ``build``.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ def run(*command: str | Path, cwd: Path = ROOT) -> str:
 
 
 def build(folder: Path) -> Path:
-    """Builds the wheel in ``folder`` and returns its path."""
-    run(sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", folder, ROOT)
+    """Builds the source distribution, and from it the wheel, in ``folder``; returns the path of the wheel."""
+    run(sys.executable, "-m", "build", "-o", folder, ROOT)
     (wheel,) = folder.glob("rejeu-*.whl")
     return wheel
 
