@@ -266,6 +266,18 @@ class Watch(RunOptions):
 
 
 @dataclass(frozen=True)
+class New:
+    """Writes a project to a new folder: an environment with its test, a plan of runs, pyproject.toml and a README.
+
+    Everything in it runs at once, and is to be replaced by your own. Example: rejeu new my-robot
+    """
+
+    folder: Annotated[Path, Shown("FOLDER", is_positional=True)]
+    """New folder, whose name is that of the project."""
+    json: Json = False
+
+
+@dataclass(frozen=True)
 class Check(EnvironmentOptions):
     """Checks an environment for a few seconds and prints what is wrong with it; exit status 1 after errors.
 
@@ -463,7 +475,7 @@ class Pull:
 
 
 TASKS: dict[str, tuple[Callable[..., Any], ...]] = {
-    "train": (List, Check, Train, Resume, Branch, Clone, Tune, Sweep),
+    "train": (List, New, Check, Train, Resume, Branch, Clone, Tune, Sweep),
     "look": (Studio, Evaluate, Watch, Record, Report, Runs, Status, Compare),
     "share": (Export, Import, Push, Pull),
     "teach": (Play, Course, Class),
