@@ -94,7 +94,7 @@ def find_agent(name: str, is_typed: bool = True) -> type[Agent]:
     raise ValueError(f"no algorithm is called {name!r}; {hint}; --import MODULE imports one that registers others")
 
 
-def agent_of_file(name: Any, path: str | Path) -> type[Agent]:
+def agent_of_file(name: object, path: str | Path) -> type[Agent]:
     """Returns the agent that a file names. Imports nothing: an agent that is not registered is an error.
 
     Raises:

@@ -16,6 +16,7 @@ from rejeu.checkpoints import model_files, resume
 from rejeu.checkpoints.run_files import CheckpointFolder, folder_of
 from rejeu.checkpoints.run_folder import find_model
 from rejeu.core import algorithm as core, checkpoint, devices, spaces
+from rejeu.core.types import AnyArray, Observation, PyTree
 from rejeu.core.validation import number, whole
 from rejeu.envs.base import seed_of_run
 from rejeu.envs.masks import split
@@ -103,12 +104,12 @@ class Agent(BaseAgent):
 
     def predict(
         self,
-        observation: Any,
-        state: Any = None,
-        episode_start: Any = None,
+        observation: Observation,
+        state: PyTree = None,
+        episode_start: AnyArray = None,
         deterministic: bool = False,
-        action_masks: Any = None,
-    ) -> tuple[np.ndarray, Any]:
+        action_masks: AnyArray = None,
+    ) -> tuple[np.ndarray, PyTree]:
         """Returns actions in the environment's own range, and the next state of a recurrent policy (else ``state``).
 
         Args:

@@ -21,12 +21,14 @@ import jax
 import numpy as np
 
 from rejeu.algorithms import config as configs, contract
+from rejeu.algorithms.config import AlgorithmConfig
 from rejeu.algorithms.rnd import with_rnd
 from rejeu.callbacks.base import Stateful
 from rejeu.core import devices, hardware, spaces, validation, xla
 from rejeu.core.algorithm import Algorithm, Masked, names
 from rejeu.core.failed_writes import FailedWrites
 from rejeu.core.normalization import normalized
+from rejeu.core.types import AnyArray, Observation, Settings
 from rejeu.core.validation import number, whole, whole_seed
 from rejeu.envs.make import Backend, VectorEnv, make_vector
 from rejeu.envs.masks import make_masked, mask_leaf, n_choices
@@ -176,7 +178,7 @@ class BaseAgent(ABC):
     """Shapes of a recurrent policy's state for one episode; computed when they are first needed."""
 
     @staticmethod
-    def converted(settings: Mapping[str, Any]) -> dict[str, Any]:
+    def converted(settings: Mapping[str, object]) -> Settings:
         """Converts keyword arguments of the constructor and of ``load`` from another form, such as Stable-Baselines3's."""
         return dict(settings)
 
@@ -262,7 +264,7 @@ class BaseAgent(ABC):
             hint = f"; did you mean {near[0]}?" if near else ""
             raise AttributeError(f"{type(self).__name__} has no attribute {name!r}{hint}")
 
-    def __setattr__(self, name: str, value: Any) -> None:
+    def __setattr__(self, name: str, value: object) -> None:
         """Sets an attribute; one that agents do not have by :meth:`assign`."""
         has_it = name not in READ_ONCE and (name in self.__dict__ or hasattr(type(self), name))
         if has_it or "run" not in self.__dict__:
@@ -270,7 +272,7 @@ class BaseAgent(ABC):
         else:
             BaseAgent.assign(self, name, value)
 
-    def assign(self, name: str, value: Any) -> None:
+    def assign(self, name: str, value: object) -> None:
         """Sets a hyperparameter, which counts from the next update on, or an attribute of a class of your own.
 
         Raises:
@@ -286,7 +288,7 @@ class BaseAgent(ABC):
         else:
             object.__setattr__(self, name, value)
 
-    def change(self, new: Any) -> None:
+    def change(self, new: AlgorithmConfig) -> None:
         """Replaces the hyperparameters; the new ones count from the next update on, also within ``learn``, and are compiled.
 
         Args:
@@ -473,7 +475,7 @@ class BaseAgent(ABC):
         """Whether its policy takes masks of the allowed actions."""
         return self.config.action_masks
 
-    def with_masks(self, obs: Any, masks: Any) -> Any:
+    def with_masks(self, obs: Observation, masks: AnyArray) -> Any:
         """Returns a batch of observations together with action masks, if the agent takes any; None allows all actions.
 
         Raises:
@@ -534,7 +536,7 @@ class Documentation:
     def __init__(self, text: str | None) -> None:
         self.text = inspect.cleandoc(text or "")
 
-    def __get__(self, instance: Any, owner: type) -> str:
+    def __get__(self, instance: object, owner: type) -> str:
         config = owner.algorithm.Config  # type: ignore[attr-defined]
         docs = validation.field_docs(config)
         lines = [f"    {key}: {text}" for key, text in AGENT_ARGUMENTS.items()]
@@ -554,7 +556,7 @@ class Signature:
         self.common = common
         """Of an agent's constructor, whose last parameter stands for the hyperparameters."""
 
-    def __get__(self, instance: Any, owner: type) -> inspect.Signature:
+    def __get__(self, instance: object, owner: type) -> inspect.Signature:
         config = owner.algorithm.Config  # type: ignore[attr-defined]
         hyperparameters = [
             inspect.Parameter(key, inspect.Parameter.KEYWORD_ONLY, default=default)

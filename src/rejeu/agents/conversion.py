@@ -111,7 +111,7 @@ def under(prefix: str, network: Network) -> Network:
     return {f"{prefix}.{name}": make for name, make in network.items()}
 
 
-def linear(name: str, order: Any = ALL) -> Network:
+def linear(name: str, order: np.ndarray | slice = ALL) -> Network:
     """Returns a linear layer whose inputs are in another order."""
     return {"weight": lambda view: view.get(f"{name}.weight").T[order], "bias": lambda view: view.get(f"{name}.bias")}
 
@@ -140,7 +140,7 @@ def searched(policy: OriginalPolicy) -> Network:
     return plain(policy, "features_extractor", hidden, head)
 
 
-def mlp(names: Sequence[str], order: Any) -> Network:
+def mlp(names: Sequence[str], order: np.ndarray | slice) -> Network:
     """Returns hidden layers."""
     layers: Network = {}
     for i, name in enumerate(names):
@@ -358,7 +358,7 @@ def parts_of(algorithm: str, policy: OriginalPolicy, n_quantiles: int) -> list[P
 
 
 def converted(
-    parts: Sequence[Part], policy: OriginalPolicy, optimizers: Mapping[str, Any]
+    parts: Sequence[Part], policy: OriginalPolicy, optimizers: Mapping[str, object]
 ) -> tuple[dict[str, np.ndarray], list[str]]:
     """Returns the arrays of the state by name, and the files of the optimizers that were left out.
 

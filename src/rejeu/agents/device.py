@@ -31,7 +31,7 @@ COPIES = 3
 """How often networks and optimizers are in memory during an update: before it, after it, and the gradients."""
 
 
-def stops_of(agent: BaseAgent, call: TrainingCall, callbacks: Sequence[Any]) -> Stops | None:
+def stops_of(agent: BaseAgent, call: TrainingCall, callbacks: Sequence[object]) -> Stops | None:
     """Returns where the program returns to the host in a ``learn``, None if the agent trains with the loop of the host.
 
     Raises:
@@ -120,13 +120,13 @@ def total(leaves: Sequence[Any]) -> int:
     return sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in leaves)
 
 
-def stops_at(call: TrainingCall, callbacks: Sequence[Any]) -> Stops:
+def stops_at(call: TrainingCall, callbacks: Sequence[object]) -> Stops:
     """Returns where limits and callbacks need the program to return to the host."""
     every = tuple(sorted({c.every for c in callbacks if isinstance(c, Periodic) and c.every is not None}))
     return Stops(every, at_episodes=call.n_episodes is not None)
 
 
-def reason_against(agent: BaseAgent, callbacks: Sequence[Any]) -> str | None:
+def reason_against(agent: BaseAgent, callbacks: Sequence[object]) -> str | None:
     """Returns why an agent cannot train on the device, None if it can."""
     run, config = agent.run, agent.config
     if functional_vector(run.env) is None:
@@ -138,7 +138,7 @@ def reason_against(agent: BaseAgent, callbacks: Sequence[Any]) -> str | None:
     return None if config.n_episodes is None else "rollouts of n_episodes whole episodes exist on the host only"
 
 
-def reason_against_callbacks(callbacks: Sequence[Any]) -> str | None:
+def reason_against_callbacks(callbacks: Sequence[object]) -> str | None:
     """Returns which callback must be called after every step, None if there is none."""
     names = [type(c).__name__ for c in callbacks if isinstance(c, TrainingCallback) and c.every_step]
     return f"the callback {names[0]} must be called after every step" if names else None

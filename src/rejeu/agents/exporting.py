@@ -17,6 +17,7 @@ import numpy as np
 from rejeu.agents.base import BaseAgent
 from rejeu.core import atomic, spaces, xla
 from rejeu.core.algorithm import Masked
+from rejeu.core.types import JsonObject, Observation
 from rejeu.envs.make import VectorEnv
 from rejeu.envs.masks import mask_leaf
 from rejeu.envs.registry import maker, register
@@ -50,7 +51,7 @@ class Exported(NamedTuple):
     def __str__(self) -> str:
         return f"{self.path}: {self.bytes / 1000:,.1f} kB; {self.note or self.check}"
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """Returns it as JSON values."""
         return {**self._asdict(), "check": None if self.check is None else self.check._asdict()}
 
@@ -137,7 +138,7 @@ def numpy_policy(agent: BaseAgent, source: str) -> NumpyPolicy:
     return NumpyPolicy(*npz_file.content_of(exportable), spaces.MAX_NUMBERS)
 
 
-def card_of(agent: BaseAgent, policy: Policy, target: str, source: str, duration: float | None) -> dict[str, Any]:
+def card_of(agent: BaseAgent, policy: Policy, target: str, source: str, duration: float | None) -> JsonObject:
     """Returns the contract of a policy in JSON values."""
     finite.settle(agent)
     weights = hashlib.sha256()
@@ -237,7 +238,9 @@ def seconds_per_step(env: Any) -> float | None:
     return None if seconds is None else float(seconds)
 
 
-def _restacked(agent: BaseAgent, stack: FrameStack, obs: Any, before: list[np.ndarray] | None, starts: bool) -> Any:
+def _restacked(
+    agent: BaseAgent, stack: FrameStack, obs: Observation, before: list[np.ndarray] | None, starts: bool
+) -> Any:
     """Returns an observation whose newest frames are those of a sample, and the others those before."""
     masked = obs if isinstance(obs, Masked) else None
     leaves, structure = jax.tree.flatten(obs if masked is None else masked.obs)

@@ -32,7 +32,10 @@ from rejeu.training.run import Progress
 if TYPE_CHECKING:
     from rejeu.demonstrations import Demonstrations
 
-BUFFERS: dict[str, Any] = {"ReplayBuffer": ReplayBuffer, "HerReplayBuffer": HerReplayBuffer}
+BUFFERS: dict[str, type[ReplayBuffer] | type[HerReplayBuffer]] = {
+    "ReplayBuffer": ReplayBuffer,
+    "HerReplayBuffer": HerReplayBuffer,
+}
 """Replay buffers by the name of their class."""
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import Any
 
 import jax
 import numpy as np
@@ -12,6 +11,7 @@ from rejeu.agents import policy
 from rejeu.agents.agent import Agent
 from rejeu.algorithms.rollout_config import RolloutConfig
 from rejeu.core import devices, spaces
+from rejeu.core.types import AnyArray, Observation, PyTree
 from rejeu.envs.make import VectorEnv
 from rejeu.envs.masks import split
 from rejeu.exploration.noise import Noise
@@ -30,7 +30,7 @@ class OnPolicyAgent(Agent):
 
     config: RolloutConfig
 
-    def value(self, observation: Any, state: Any = None, episode_start: Any = None) -> np.ndarray:
+    def value(self, observation: Observation, state: PyTree = None, episode_start: AnyArray = None) -> np.ndarray:
         """Returns the critic's values of observations, that is, the expected discounted return, as ``float32``.
 
         With ``normalize``, observations are scaled as in training; if rewards are scaled, so are the values.

@@ -12,6 +12,7 @@ import numpy as np
 
 from rejeu.agents.base import BaseAgent
 from rejeu.core import devices, spaces
+from rejeu.core.types import Action, Observation, PyTree
 from rejeu.core.validation import choice
 from rejeu.envs.envpool import envpool_knows
 from rejeu.envs.make import VectorEnv
@@ -28,7 +29,9 @@ CRITICS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 """How :func:`q_values` reduces the values of several critics, ``(n_critics, ...)``."""
 
 
-def act(agent: BaseAgent, obs: Any, deterministic: bool, memory: Any, ended: np.ndarray) -> tuple[np.ndarray, Any]:
+def act(
+    agent: BaseAgent, obs: Observation, deterministic: bool, memory: PyTree, ended: np.ndarray
+) -> tuple[np.ndarray, PyTree]:
     """Returns actions in the algorithm's range, and the next state of a recurrent policy, else None.
 
     Args:
@@ -57,7 +60,7 @@ def act(agent: BaseAgent, obs: Any, deterministic: bool, memory: Any, ended: np.
 
 
 def q_values(
-    agent: BaseAgent, observation: Any, action: Any = None, critics: Literal["min", "mean", "all"] = "min"
+    agent: BaseAgent, observation: Observation, action: Action = None, critics: Literal["min", "mean", "all"] = "min"
 ) -> np.ndarray:
     """Returns the critics' values of actions, that is, the expected discounted return, as ``float32``.
 
@@ -111,7 +114,7 @@ def q_values(
     return CRITICS[critics](values)
 
 
-def _actions(space: gym.Space, action: Any, single: bool, n: int) -> np.ndarray:
+def _actions(space: gym.Space, action: Action, single: bool, n: int) -> np.ndarray:
     """Returns a batch of Box or Discrete actions in the algorithm's range.
 
     Raises:
@@ -129,7 +132,7 @@ def _actions(space: gym.Space, action: Any, single: bool, n: int) -> np.ndarray:
     return spaces.unscale_action(space, array)
 
 
-def memory_of(agent: BaseAgent, memory: Any, n: int) -> Any:
+def memory_of(agent: BaseAgent, memory: PyTree, n: int) -> Any:
     """Returns the state of the agent's policy for ``n`` episodes: what was given, else that at their start.
 
     Raises:
@@ -227,7 +230,7 @@ def policy(agent: BaseAgent, deterministic: bool) -> Callable[[Any, np.ndarray],
     """Returns the policy as a function for :func:`rejeu.logs.evaluation.evaluate`, which keeps a recurrent state."""
     memory: Any = None
 
-    def choose(obs: Any, ended: np.ndarray) -> np.ndarray:
+    def choose(obs: Observation, ended: np.ndarray) -> np.ndarray:
         nonlocal memory
         action, memory = act(agent, obs, deterministic, memory, ended)
         return action

@@ -11,9 +11,10 @@ import jax
 
 from rejeu.core import algorithm as core, normalization
 from rejeu.core.spaces import Leaf
+from rejeu.core.types import PyTree
 
 
-def describe(state: Any, leaves: tuple[Leaf, ...]) -> str:
+def describe(state: PyTree, leaves: tuple[Leaf, ...]) -> str:
     """Returns a table of all networks of an algorithm's state, and the parts of the observation.
 
     A layer has the name that its arrays have in a model file. The arrays of several critics have a leading axis.
@@ -37,7 +38,7 @@ def describe(state: Any, leaves: tuple[Leaf, ...]) -> str:
     return "\n".join([*table, "", *parts])
 
 
-def layers(network: Any) -> list[tuple[str, str, str]]:
+def layers(network: PyTree) -> list[tuple[str, str, str]]:
     """Returns a row for each layer: its name, the shapes of its arrays, and its number of parameters."""
     by_layer: dict[str, list[tuple[str, Any]]] = {}
     for path, leaf in zip(core.names(network), jax.tree.leaves(network), strict=True):
@@ -49,6 +50,6 @@ def layers(network: Any) -> list[tuple[str, str, str]]:
     ]
 
 
-def n_parameters(network: Any) -> int:
+def n_parameters(network: PyTree) -> int:
     """Returns the number of parameters of a network, over all members of an ensemble."""
     return sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(network) if hasattr(leaf, "shape"))

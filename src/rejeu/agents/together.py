@@ -135,7 +135,7 @@ def numbers_of(seeds: int | Iterable[int]) -> list[int]:
     return numbers
 
 
-def is_list_of_numbers(value: Any) -> bool:
+def is_list_of_numbers(value: object) -> bool:
     """Returns whether the value of a setting is a list of numbers, one for each run.
 
     >>> is_list_of_numbers([1e-3, 1e-4]), is_list_of_numbers((4, "step")), is_list_of_numbers([True])

@@ -6,7 +6,6 @@ import math
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -19,6 +18,7 @@ from rejeu.callbacks.base import Callback, called, in_order, listed, listening, 
 from rejeu.callbacks.progress_bar import ProgressBar
 from rejeu.core import schedules, xla
 from rejeu.core.interrupt import Interrupt
+from rejeu.core.types import JsonObject
 from rejeu.envs import snapshot
 from rejeu.exploration.noise import warn_without_noise
 from rejeu.logs.logging import Console, GuardedSink, Sink, guarded, next_folder, open_log
@@ -67,7 +67,7 @@ def tracker_id(agent: BaseAgent) -> str:
     return agent.run_id + (f"-{agent.reset_step}" if agent.reset_step else "")
 
 
-def run_config(agent: BaseAgent, call: TrainingCall) -> dict[str, Any]:
+def run_config(agent: BaseAgent, call: TrainingCall) -> JsonObject:
     """Returns the configuration of a run for trackers: environment, algorithm, limits, hyperparameters."""
     return {
         "algorithm": agent.name,

@@ -37,6 +37,7 @@ from rejeu.checkpoints.pickled import (
 from rejeu.core import algorithm as core, checkpoint, normalization, spaces
 from rejeu.core.errors import CheckpointError
 from rejeu.core.records import Malformed, brief, shown, stored_size
+from rejeu.core.types import JsonObject, PyTree, Settings
 from rejeu.core.validation import build
 
 MOST_DATA = 16 * 2**20
@@ -112,7 +113,7 @@ class Model(NamedTuple):
             return error
 
     @property
-    def group(self) -> dict[str, Any]:
+    def group(self) -> Settings:
         """The settings of the policy's optimizer."""
         for name in ("policy.optimizer", "actor.optimizer"):
             if isinstance(optimizer := self.tensors.get(name), dict) and optimizer.get("param_groups"):
@@ -274,17 +275,17 @@ def observation_space_of(old: gym.Space, new: gym.Space | None) -> gym.Space:
     return new
 
 
-def number_of(value: Any) -> Any:
+def number_of(value: object) -> Any:
     """Returns the number that a schedule of Stable-Baselines3 always gives; other values as they are."""
     for key in ("value_schedule", "val"):
         value = value.state.get(key) if isinstance(value, PickledCall) and isinstance(value.state, dict) else value
     return array_of(value).item() if isinstance(value, PickledCall) and value.name.endswith(".scalar") else value
 
 
-def settings_of(config_class: Any, model: Model, notes: list[str], changed: Collection[str] = ()) -> dict[str, Any]:
+def settings_of(config_class: Any, model: Model, notes: list[str], changed: Collection[str] = ()) -> Settings:
     """Returns the hyperparameters of a file that rejeu has too, but for those ``changed``; what is left out is noted."""
     names = {field.name for field in dataclasses.fields(config_class)}
-    settings: dict[str, Any] = {}
+    settings: Settings = {}
     names -= {"max_grad_norm"} if number_of(model.readable("max_grad_norm")) == 0 else set()  # of TRPO, without effect
     stored = {name: f"{name}_schedule" if name == "delta_std" else name for name in names - {*IGNORED}}
     for name in sorted(name for name, key in stored.items() if key in model.fields and name not in changed):
@@ -322,7 +323,7 @@ def settings_of(config_class: Any, model: Model, notes: list[str], changed: Coll
     return settings
 
 
-def hindsight(setting: Callable[[str], Any]) -> dict[str, Any]:
+def hindsight(setting: Callable[[str], Any]) -> Settings:
     """Returns the hyperparameters of hindsight replay, from a function that returns a setting by its name."""
     kwargs = {key: value for key in ("n_sampled_goal", OLD_HER) if (value := setting(key)) is not None}
     if isinstance(strategy := kwargs.get(OLD_HER), PickledCall):
@@ -330,7 +331,7 @@ def hindsight(setting: Callable[[str], Any]) -> dict[str, Any]:
     return {"replay_buffer_class": "HerReplayBuffer", "replay_buffer_kwargs": kwargs}
 
 
-def policy_settings(model: Model, policy: OriginalPolicy, algorithm: str) -> dict[str, Any]:
+def policy_settings(model: Model, policy: OriginalPolicy, algorithm: str) -> Settings:
     """Returns ``policy_kwargs``, and hyperparameters that are among those of the policy there.
 
     The widths of layers are those of the weights.
@@ -349,7 +350,7 @@ def policy_settings(model: Model, policy: OriginalPolicy, algorithm: str) -> dic
     for key, expected in {"use_expln": False, "full_std": True, "clip_mean": 2.0}.items():
         if kwargs.get(key, expected) != expected:
             raise Malformed(f"policy_kwargs has {key}={shown(kwargs[key], 40)}, which is not read")
-    shape: dict[str, Any] = {"normalize_images": kwargs.get("normalize_images", True)}
+    shape: Settings = {"normalize_images": kwargs.get("normalize_images", True)}
     if (activation := kwargs.get("activation_fn")) is not None:
         shape["activation_fn"] = activation.name.lower() if isinstance(activation, Name) else "of another kind"
         if shape["activation_fn"] == "gelu":
@@ -358,7 +359,7 @@ def policy_settings(model: Model, policy: OriginalPolicy, algorithm: str) -> dic
     if len(dims) > 1:
         raise Malformed(f"its images have {sorted(dims)} features, expected one number")
     shape |= {"cnn_features": dims.pop()} if dims else {}
-    changes: dict[str, Any] = {"policy_kwargs": shape}
+    changes: Settings = {"policy_kwargs": shape}
     if algorithm in ON_POLICY:
         shared = policy.widths("mlp_extractor.shared_net")
         nets = {"pi": "policy_net", "vf": "value_net"}
@@ -392,7 +393,7 @@ def policy_settings(model: Model, policy: OriginalPolicy, algorithm: str) -> dic
     return changes | ({"n_quantiles": n_outputs} if algorithm == "TQC" else {})
 
 
-def moments(field: str, value: Any) -> dict[str, np.ndarray]:
+def moments(field: str, value: object) -> dict[str, np.ndarray]:
     """Returns the arrays of a running mean and variance."""
     if not isinstance(value, PickledCall) or not isinstance(value.state, dict):
         raise Malformed(f"it has no running statistics for {field}")
@@ -419,7 +420,7 @@ def unresolved(value: Any) -> int:
 
 def statistics_of(
     state: Mapping[str, Any], leaves: tuple[spaces.Leaf, ...], notes: list[str]
-) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+) -> tuple[JsonObject, dict[str, np.ndarray]]:
     """Returns the setting ``normalize`` and the statistics of a ``VecNormalize`` as those of an agent.
 
     Raises:
@@ -530,7 +531,7 @@ def load_zip(
 
 
 def normalization_for(
-    path: Path, vecnormalize: str | Path | Literal[False] | None, changes: Mapping[str, Any]
+    path: Path, vecnormalize: str | Path | Literal[False] | None, changes: Mapping[str, object]
 ) -> tuple[Path | None, list[str]]:
     """Returns the file of the statistics that a policy was trained behind, if any, and notes about what lies beside it."""
     notes: list[str] = []
@@ -545,7 +546,7 @@ def normalization_for(
     return Path(vecnormalize) if vecnormalize else None, notes + zoo.notes_beside(path, vecnormalize or None, changes)
 
 
-def arguments_of(model: Model) -> dict[str, Any]:
+def arguments_of(model: Model) -> Settings:
     """Returns the arguments of an agent that are no hyperparameters."""
     seed, window = model.value("seed"), model.readable("_stats_window_size")
     arguments = {"seed": seed if isinstance(seed, int) and 0 <= seed < 2**32 else None}
@@ -587,7 +588,7 @@ def restore(
 def counts_of(algorithm: str, model: Model) -> dict[str, np.ndarray]:
     """Returns the counters and the temperature among the arrays of a state."""
     variables = model.tensors.get("pytorch_variables", model.tensors.get("tensors"))
-    counts: dict[str, Any] = {}
+    counts: JsonObject = {}
     if isinstance(variables, dict) and isinstance(log_alpha := variables.get("log_ent_coef"), np.ndarray):
         counts["log_alpha"] = log_alpha.reshape(())
         optimizer = model.tensors.get("ent_coef_optimizer")
@@ -601,7 +602,7 @@ def counts_of(algorithm: str, model: Model) -> dict[str, np.ndarray]:
     return counts
 
 
-def checked(shapes: Any, arrays: Mapping[str, np.ndarray], fields: list[str]) -> dict[str, np.ndarray]:
+def checked(shapes: PyTree, arrays: Mapping[str, np.ndarray], fields: list[str]) -> dict[str, np.ndarray]:
     """Returns arrays in the dtypes of the state, after their shapes have been compared with those of our networks.
 
     Raises:

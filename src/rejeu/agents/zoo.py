@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 from rejeu.checkpoints.pickled import check_size
 from rejeu.core.records import WRONG, Malformed, brief, read_bytes, shown
+from rejeu.core.types import JsonObject, Settings
 
 BEST = "best_model"
 STATISTICS = ("vecnormalize.pkl", "vec_normalize.pkl")
@@ -71,7 +72,7 @@ def notes_beside(path: Path, used: Any, changes: Any = ()) -> list[str]:
     unread |= {file.name for file in path.parent.glob(f"{path.stem}*.pkl") if file != used}
     if unread:
         notes.append(f"not read: {shown(', '.join(sorted(unread)), 200)}")
-    args: dict[str, Any] = {}
+    args: Settings = {}
     for name in ("args.yml", "config.yml", "env_kwargs.yml"):
         yaml_file = next((folder / name for folder in folders(path) if (folder / name).is_file()), None)
         try:
@@ -110,7 +111,7 @@ def notes_beside(path: Path, used: Any, changes: Any = ()) -> list[str]:
     return notes
 
 
-def read_yaml(path: Path) -> dict[str, Any]:
+def read_yaml(path: Path) -> JsonObject:
     """Returns the content of a YAML file of RL Zoo; of Python's objects ``OrderedDict`` and ``tuple`` are read, as data.
 
     Raises:
@@ -125,7 +126,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
     class Reader(yaml.SafeLoader):
         """Creates numbers, texts, lists and dicts only. Merged dicts, which may double with each line, are refused."""
 
-        def flatten_mapping(self, node: Any) -> None:
+        def flatten_mapping(self, node: object) -> None:
             """Leaves the keys as they are."""
 
     def items(reader: Any, node: Any) -> list[Any]:

@@ -15,6 +15,7 @@ from rejeu.algorithms import config as configs
 from rejeu.core import checkpoint, devices, spaces, xla
 from rejeu.core.errors import CheckpointError, MissingObjectError
 from rejeu.core.records import WRONG, Positive, Seed, brief, convert
+from rejeu.core.types import JsonObject, Settings
 from rejeu.envs.registry import are_plain, is_plain_id
 
 if TYPE_CHECKING:
@@ -48,7 +49,7 @@ class GeneratorState(msgspec.Struct):
 class AgentHeader(msgspec.Struct, kw_only=True):
     """The header of a model file, which :func:`header` returns; unknown fields are ignored."""
 
-    config: dict[str, Any]
+    config: Settings
     policy: str
     observation_space: Any
     action_space: Any
@@ -70,7 +71,7 @@ class Saved(NamedTuple):
     action_space: gym.Space
 
 
-def interpret(header: Mapping[str, Any], room: int, config_class: Any, changes: Mapping[str, Any]) -> Saved:
+def interpret(header: Mapping[str, object], room: int, config_class: Any, changes: Mapping[str, object]) -> Saved:
     """Returns a header with its values checked and converted.
 
     Args:
@@ -99,7 +100,7 @@ def interpret(header: Mapping[str, Any], room: int, config_class: Any, changes: 
     return Saved(saved, config, observation_space, action_space)
 
 
-def check_space(description: Any, ours: gym.Space, name: str) -> None:
+def check_space(description: object, ours: gym.Space, name: str) -> None:
     """Raises ``ValueError`` unless a space of a file is the agent's, apart from the bounds of observations.
 
     Args:
@@ -117,7 +118,7 @@ def check_space(description: Any, ours: gym.Space, name: str) -> None:
 A = TypeVar("A", bound=BaseAgent)
 
 
-def header(agent: BaseAgent) -> dict[str, Any]:
+def header(agent: BaseAgent) -> JsonObject:
     """Returns the header of an agent's model file: everything except arrays, as JSON values."""
     run = agent.run
     return {
@@ -143,7 +144,7 @@ def header(agent: BaseAgent) -> dict[str, Any]:
     }
 
 
-def made_from(agent: BaseAgent) -> dict[str, Any] | None:
+def made_from(agent: BaseAgent) -> JsonObject | None:
     """Returns id and keyword arguments of an agent's environments for a header; None if a file may not hold them."""
     source = agent.origin
     if source is None or not is_plain_id(source[0]) or not are_plain(dict(source[1])):
@@ -151,7 +152,7 @@ def made_from(agent: BaseAgent) -> dict[str, Any] | None:
     return {"env_id": source[0], "env_kwargs": dict(source[1])}
 
 
-def trained_on(header: Mapping[str, Any]) -> tuple[str, dict[str, Any]] | None:
+def trained_on(header: Mapping[str, object]) -> tuple[str, Settings] | None:
     """Returns the value of :func:`made_from` in a header; None if it is missing or not what a file may hold."""
     source = header.get("made_from")
     if not isinstance(source, dict) or not is_plain_id(source.get("env_id")) or not are_plain(source.get("env_kwargs")):
@@ -163,7 +164,7 @@ def load(
     cls: type[A],
     file: checkpoint.Contents,
     make_env: Callable[[A], VectorEnv | None],
-    changes: dict[str, Any],
+    changes: Settings,
     threads: int | None = None,
     prefix: str = "",
 ) -> A:

@@ -26,6 +26,7 @@ import numpy as np
 
 from rejeu.core.errors import CheckpointError
 from rejeu.core.records import MAX_DEPTH, WRONG, Malformed, brief, read_bytes, shown
+from rejeu.core.types import JsonObject
 
 PACKAGES = {"collections", "copyreg", "gym", "gymnasium", "numpy", "sb3_contrib", "stable_baselines3", "torch"}
 """Packages whose names a pickle may mention."""
@@ -71,7 +72,7 @@ class Name(NamedTuple):
 class PickledCall:
     """An object that a pickle would create by a call: the name, the arguments, and the attributes that it would set."""
 
-    def __init__(self, name: Any, arguments: tuple[Any, ...]) -> None:
+    def __init__(self, name: object, arguments: tuple[Any, ...]) -> None:
         self.name, self.arguments = str(name) if isinstance(name, Name) else "", arguments
         self.state: Any = None
 
@@ -161,7 +162,7 @@ def parse(
     raise Malformed("it is cut short")
 
 
-def check_size(value: Any, limit: int, arrays: int = 0) -> None:
+def check_size(value: object, limit: int, arrays: int = 0) -> None:
     """Raises ``Malformed`` if a value is larger than ``limit``, see :data:`MOST_WRITTEN`, or its arrays than ``arrays``.
 
     Neither may it have more than :data:`MAX_DEPTH` levels: Python's hash of a tuple ends the process at some ten thousand.
@@ -193,7 +194,7 @@ def popped(stack: list[Any], n: int) -> list[Any]:
     return values
 
 
-def add(target: Any, items: list[Any], pairs: bool) -> None:
+def add(target: object, items: list[Any], pairs: bool) -> None:
     """Adds items to a list, or alternating keys and values to a dict; of other objects they are of no interest."""
     if isinstance(target, dict) and pairs:
         for key, value in zip(items[::2], items[1::2], strict=True):
@@ -207,12 +208,12 @@ def add(target: Any, items: list[Any], pairs: bool) -> None:
         target.state.extend(items)
 
 
-def named(value: Any) -> str:
+def named(value: object) -> str:
     """Returns a name from a file for a message; of anything else the type, since nested values may be endless to print."""
     return shown(value, 60) if isinstance(value, str | Name) else type(value).__name__
 
 
-def array_of(value: Any) -> np.ndarray:
+def array_of(value: object) -> np.ndarray:
     """Returns the array that a record of NumPy's describes, or a scalar of a pickle as an array.
 
     Raises:
@@ -238,7 +239,7 @@ def array_of(value: Any) -> np.ndarray:
     return array.reshape(shape, order="F" if order == "F" else "C")
 
 
-def dtype_of(value: Any) -> np.dtype:
+def dtype_of(value: object) -> np.dtype:
     """Returns the dtype of numbers that a record of NumPy's, or the name of a class of scalars, describes."""
     if isinstance(value, Name) and value.module == "numpy":
         dtype = np.dtype(value.name)
@@ -304,7 +305,7 @@ def structure(data: bytes, content: Callable[[str], bytes], room: int) -> Any:
     """
     storages: dict[str, np.ndarray] = {}
 
-    def storage(reference: Any) -> np.ndarray:
+    def storage(reference: object) -> np.ndarray:
         key, dtype, n = kind_of(reference)
         if key not in storages:
             storages[key] = np.frombuffer(content(key), dtype.newbyteorder("<"))
@@ -315,7 +316,7 @@ def structure(data: bytes, content: Callable[[str], bytes], room: int) -> Any:
     return parse(data, tensor, storage, 4 * room)
 
 
-def kind_of(reference: Any) -> tuple[str, np.dtype, int]:
+def kind_of(reference: object) -> tuple[str, np.dtype, int]:
     """Returns name, dtype and number of values of the storage to which a structure refers."""
     if not isinstance(reference, tuple) or len(reference) > 6:
         raise Malformed("it has a tensor whose storage is not described by a tuple of five or six")
@@ -328,7 +329,7 @@ def kind_of(reference: Any) -> tuple[str, np.dtype, int]:
     return key, np.dtype(code), n
 
 
-def tensor(function: Any, arguments: tuple[Any, ...]) -> Any:
+def tensor(function: object, arguments: tuple[Any, ...]) -> Any:
     """Returns the array that a function of PyTorch would make; the only other calls in such files are of no arguments."""
     if function == ("torch._utils", "_rebuild_parameter"):
         return arguments[0]
@@ -401,7 +402,7 @@ def explained(path: Path) -> Iterator[None]:
         raise CheckpointError(f"{path} cannot be read as a file of Stable-Baselines3: {brief(error)}") from None
 
 
-def read_normalization(path: Path) -> dict[str, Any]:
+def read_normalization(path: Path) -> JsonObject:
     """Returns the attributes of a ``VecNormalize`` file.
 
     Raises:

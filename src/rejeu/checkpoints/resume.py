@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from numpy.typing import DTypeLike
 
 from rejeu.agents.base import BaseAgent, Best, Resumed, fill_windows
 from rejeu.checkpoints import model_files
@@ -22,6 +23,7 @@ from rejeu.core import checkpoint, devices, records, spaces, xla
 from rejeu.core.algorithm import PyTree
 from rejeu.core.errors import CheckpointError, DivergedError
 from rejeu.core.records import MAX_ENVS, WRONG, brief, convert
+from rejeu.core.types import JsonObject, Settings
 from rejeu.core.validation import number, whole_seed
 from rejeu.envs.base import seed_of_run
 from rejeu.envs.make import BACKENDS, Backend, VectorEnv
@@ -34,7 +36,7 @@ from rejeu.training.run import Run, TrainingCall
 A = TypeVar("A", bound=BaseAgent)
 
 
-def resume(cls: type[A], folder: Path, env: Any, changes: dict[str, Any]) -> A:
+def resume(cls: type[A], folder: Path, env: Any, changes: Settings) -> A:
     """Returns the agent of the newest complete checkpoint, or of the one that is named; see :meth:`Agent.resume`."""
     paths = [folder] if folder.is_file() else checkpoint_files(folder)
     if not paths:
@@ -71,7 +73,7 @@ def is_whole(path: Path) -> bool:
     return True
 
 
-def _resume(cls: type[A], path: Path, env: Any, changes: dict[str, Any]) -> A:
+def _resume(cls: type[A], path: Path, env: Any, changes: Settings) -> A:
     with checkpoint.opened(path, "run") as file, ExitStack() as stack:
         agent = _resume_within(stack, file, cls, env, changes)
         stack.pop_all()
@@ -81,7 +83,7 @@ def _resume(cls: type[A], path: Path, env: Any, changes: dict[str, Any]) -> A:
     return agent
 
 
-def _resume_within(stack: ExitStack, file: checkpoint.Contents, cls: type[A], env: Any, changes: dict[str, Any]) -> A:
+def _resume_within(stack: ExitStack, file: checkpoint.Contents, cls: type[A], env: Any, changes: Settings) -> A:
     """Returns the agent; ``stack`` closes the environments made for it if the checkpoint is refused."""
     path = file.path
     try:
@@ -293,7 +295,7 @@ def put_envs_back(run: Run, saved: SavedRun, n_episodes: int | None) -> str:
 
 
 def restore_buffer(
-    run: Run, saved: dict[str, Any], rows: Sequence[dict[str, np.ndarray]], carry: PyTree, begun: bool
+    run: Run, saved: JsonObject, rows: Sequence[dict[str, np.ndarray]], carry: PyTree, begun: bool
 ) -> None:
     """Restores the experience of a run.
 
@@ -344,7 +346,7 @@ def like(expected: PyTree, arrays: list[np.ndarray], name: str) -> PyTree:
     )
 
 
-def exactly(array: Any, shape: tuple[int, ...], dtype: Any, name: str) -> np.ndarray:
+def exactly(array: object, shape: tuple[int, ...], dtype: DTypeLike, name: str) -> np.ndarray:
     """Returns a copy of an array of a file.
 
     Raises:

@@ -36,6 +36,7 @@ from rejeu.core import atomic, checkpoint, records, xla
 from rejeu.core.algorithm import PyTree
 from rejeu.core.errors import CheckpointError, RunInUseError
 from rejeu.core.records import Count, Positive, Seconds
+from rejeu.core.types import JsonObject
 from rejeu.replay import ring_io
 from rejeu.replay.ring import Ring
 from rejeu.replay.rollout import RolloutBuffer
@@ -214,7 +215,7 @@ UPDATES = 4
 """Number of the arithmetic of updates and batches; a change that rounds anything differently raises it."""
 
 
-def versions() -> dict[str, Any]:
+def versions() -> JsonObject:
     """Returns the versions that results depend on in their last bits."""
     return {"updates": UPDATES, "jax": jax.__version__, "optax": optax.__version__}
 
@@ -258,7 +259,7 @@ class SavedRun(msgspec.Struct, kw_only=True):
     episode_return: np.ndarray
     episode_length: np.ndarray
     running_return: np.ndarray
-    rng: dict[str, Any]
+    rng: JsonObject
     carry: list[np.ndarray]
     obs: list[np.ndarray] | None
     action: np.ndarray | None
@@ -270,17 +271,17 @@ class SavedRun(msgspec.Struct, kw_only=True):
     n_skipped: Count
     td_errors: list[np.ndarray]
     seconds: dict[str, Seconds]
-    buffer: dict[str, Any]
+    buffer: JsonObject
     history: np.ndarray
     best: SavedBest | None
     logger: tuple[dict[str, Any], dict[str, Count]]
     n_predictions: Count
-    call: dict[str, Any] | None
+    call: JsonObject | None
     callbacks: list[tuple[str, Any]]
     vec_normalize: Any
 
 
-def content(agent: BaseAgent, reason: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+def content(agent: BaseAgent, reason: str) -> tuple[JsonObject, dict[str, np.ndarray]]:
     """Returns header and arrays of a run, without the rows of its replay buffer."""
     run = agent.run
     states = None if reason or run.obs is None else run.env.snapshot()
@@ -331,7 +332,7 @@ def content(agent: BaseAgent, reason: str) -> tuple[dict[str, Any], dict[str, np
     return header, arrays
 
 
-def buffer_content(run: Run) -> dict[str, Any]:
+def buffer_content(run: Run) -> JsonObject:
     """Returns the state of a buffer, without the rows of a ring."""
     buffer = run.replay
     if isinstance(buffer, RolloutBuffer):

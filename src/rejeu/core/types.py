@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, TypeAlias, Union
 
 import numpy as np
@@ -22,6 +23,10 @@ Action: TypeAlias = Any
 Info: TypeAlias = dict[str, Any]
 """The info dictionary of Gymnasium's ``reset`` and ``step``, or their options."""
 Settings: TypeAlias = dict[str, Any]
-"""Values of a configuration, or arguments of a function, by name."""
+"""Values of a configuration by name."""
+Arguments: TypeAlias = Mapping[str, Any]
+"""Keyword arguments of a call."""
+Variables: TypeAlias = dict[str, Any]
+"""Local or global variables of a function by name."""
 JsonObject: TypeAlias = dict[str, Any]
 """A dict of values that JSON can express."""

@@ -10,12 +10,13 @@ from __future__ import annotations
 import zlib
 from collections.abc import Iterator
 from itertools import islice
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import gymnasium as gym
 import numpy as np
 
 from rejeu.core.spaces import action_scaler, check_env_actions, random_action
+from rejeu.core.types import JsonObject
 from rejeu.core.validation import whole
 
 STEP, STEP_SOME, RESET, RESET_SOME = range(4)
@@ -101,11 +102,11 @@ class ActionLog:
             self._blocks.append(_compressed(self._open))
             self._open = bytearray()
 
-    def to_plain(self) -> dict[str, Any]:
+    def to_plain(self) -> JsonObject:
         """Returns the log as plain data (see :mod:`rejeu.core.records`)."""
         return {"n_operations": self.n_operations, "blocks": [*self._blocks, _compressed(self._open)]}
 
-    def operations(self, saved: dict[str, Any]) -> Iterator[LoggedOperation]:
+    def operations(self, saved: JsonObject) -> Iterator[LoggedOperation]:
         """Yields the operations of a log that :meth:`to_plain` returned, oldest first.
 
         Raises:
@@ -134,7 +135,7 @@ class ActionLog:
                 yield LoggedOperation(indices, action)
 
 
-def replay(log: ActionLog, saved: dict[str, Any], title: str) -> Iterator[LoggedOperation]:
+def replay(log: ActionLog, saved: JsonObject, title: str) -> Iterator[LoggedOperation]:
     """Yields the operations of a saved log. On a terminal, a progress bar is shown for long logs.
 
     Raises:
@@ -157,7 +158,7 @@ def _compressed(data: bytearray) -> np.ndarray:
     return np.frombuffer(zlib.compress(bytes(data), 1), np.uint8)
 
 
-def _expanded(block: Any, longest: int) -> bytes:
+def _expanded(block: object, longest: int) -> bytes:
     """Returns the decompressed bytes of a block, at most ``longest``."""
     if not isinstance(block, np.ndarray) or block.dtype != np.uint8 or block.ndim != 1:
         raise ValueError("a block of the record of actions is no array of bytes")

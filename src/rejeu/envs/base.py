@@ -16,6 +16,7 @@ import jax
 import numpy as np
 
 from rejeu.core.errors import BadEnvironmentError
+from rejeu.core.types import Info, Observation, PyTree
 from rejeu.envs.goals import GoalFunctions
 
 Seed = int | Sequence[int] | None
@@ -26,7 +27,7 @@ OF_ENVIRONMENTS = 0x454E
 """Added to the seed of a run, so that the seeds of its environments differ from all others."""
 
 
-def checked_seed(seed: Any, n_envs: int) -> Seed:
+def checked_seed(seed: object, n_envs: int) -> Seed:
     """Validates a seed for ``n_envs`` environments and returns it, a sequence as a tuple of ints.
 
     Raises:
@@ -71,7 +72,7 @@ SUCCESS_KEYS = ("is_success", "success")
 class Step(NamedTuple):
     """The result of one step of all environments."""
 
-    obs: Any
+    obs: Observation
     """True successors, a pytree of arrays ``(n_envs, ...)``; valid until the next call."""
     reward: np.ndarray
     """``float32 (n_envs,)``."""
@@ -124,7 +125,7 @@ class VectorEnv(ABC):
     """One seed for each environment, which a run uses instead of its own seed; None if there are none."""
 
     @abstractmethod
-    def reset(self, seed: Seed = None) -> Any:
+    def reset(self, seed: Seed = None) -> Observation:
         """Resets every environment and returns the observations ``(n_envs, ...)``.
 
         Args:
@@ -173,7 +174,7 @@ class VectorEnv(ABC):
         """Steps those that are ``active``, which are neither none nor all."""
 
     @abstractmethod
-    def reset_done(self, done: np.ndarray) -> Any:
+    def reset_done(self, done: np.ndarray) -> Observation:
         """Starts new episodes where ``done``, ``bool (n_envs,)``; returns the observations of all environments."""
 
     @abstractmethod
@@ -193,7 +194,7 @@ class VectorEnv(ABC):
     def goals(self) -> GoalFunctions | None:
         """Returns the goal functions, or None for environments without goals."""
 
-    def infos(self, begun: bool = False) -> list[dict[str, Any]]:
+    def infos(self, begun: bool = False) -> list[Info]:
         """Returns the info of each environment: that of its last step, or with ``begun`` of its last reset."""
         return each_info(self.info, self.n_envs, begun)
 
@@ -227,7 +228,7 @@ class VectorEnv(ABC):
         """
         return None
 
-    def restore(self, saved: Any, obs: Any) -> list[int]:
+    def restore(self, saved: object, obs: Observation) -> list[int]:
         """Restores what :meth:`snapshot` returned, into environments of the same kind.
 
         Args:
@@ -292,7 +293,7 @@ def success_by(reported: float, episode_return: float, threshold: float | None) 
     return reported if threshold is None or not math.isnan(reported) else float(episode_return >= threshold)
 
 
-def success_of(info: dict[str, Any]) -> float:
+def success_of(info: Info) -> float:
     """Returns whether ``is_success`` or ``success`` in an info is true, or all its numbers are at least 1: 1.0 or 0.0.
 
     NaN without either, and where it is no number: then nothing is known.
@@ -306,7 +307,7 @@ def success_of(info: dict[str, Any]) -> float:
     return float((value >= 1).all()) if value.dtype.kind in "biuf" and not np.isnan(value).any() else math.nan
 
 
-def step_whole(step_all: Callable[[np.ndarray], Step], before: Any, action: np.ndarray, active: np.ndarray) -> Step:
+def step_whole(step_all: Callable[[np.ndarray], Step], before: PyTree, action: np.ndarray, active: np.ndarray) -> Step:
     """Steps environments that can only be stepped together, and returns the step of the ``active`` ones.
 
     The others get an action of one that is active, and keep their observations ``before``, ``(n_envs, ...)``.
@@ -321,7 +322,7 @@ def step_whole(step_all: Callable[[np.ndarray], Step], before: Any, action: np.n
     )
 
 
-def with_rows(batch: Any, rows: np.ndarray, values: Any) -> Any:
+def with_rows(batch: PyTree, rows: np.ndarray, values: PyTree) -> PyTree:
     """Returns a copy of a batch of arrays whose ``rows``, indices or a mask, are ``values``."""
     batch = jax.tree.map(np.copy, batch)
     for array, array_values in zip(jax.tree.leaves(batch), jax.tree.leaves(values), strict=True):

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from types import ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from rejeu.core.errors import requires
+from rejeu.core.types import Action
 
 
 class Scene(NamedTuple):
@@ -15,7 +17,7 @@ class Scene(NamedTuple):
 
     states: list[Any]
     """The states of the episode up to now, as NumPy arrays."""
-    action: Any
+    action: Action
     """The last action; None after a reset."""
     over: bool
     """Whether the episode has ended."""
@@ -54,7 +56,7 @@ class Canvas(Drawing):
         """
         with requires(f"drawing {title}", "pygame-ce", "play"):
             import pygame
-        self.pygame: Any = pygame
+        self.pygame: ModuleType = pygame
         self.size, self.fps, self.fine = size, fps, fine
         self.surface = pygame.Surface((size[0] * fine, size[1] * fine))
         self.window: Any = None

@@ -27,6 +27,7 @@ from rejeu.core.spaces import (
     plain,
     random_action,
 )
+from rejeu.core.types import Info, Observation
 from rejeu.envs import masks, validation
 from rejeu.envs.base import SEEDS_END, success_of
 from rejeu.envs.functional.gym_env import GymnasiumEnv
@@ -75,11 +76,11 @@ class Finding(NamedTuple):
 class SeenStep(NamedTuple):
     """One step, with copies of the returned values."""
 
-    obs: Any
+    obs: Observation
     reward: float
     terminated: bool
     truncated: bool
-    info: dict[str, Any]
+    info: Info
     judged: dict[str, list[Any]]
     """Results of each function of goals for the :func:`_pairs`, right after the step."""
 
@@ -233,7 +234,7 @@ def _play(env: gym.Env, problems: dict[str, Finding], effort: Effort) -> list[Se
     return steps
 
 
-def _reset(env: gym.Env, problems: dict[str, Finding]) -> tuple[Any, dict[str, Any]] | None:
+def _reset(env: gym.Env, problems: dict[str, Finding]) -> tuple[Observation, Info] | None:
     """Resets the environment and checks its observation, which is returned with the info; None if it is unusable."""
     space = env.observation_space
     result = env.reset()
@@ -247,7 +248,7 @@ def _reset(env: gym.Env, problems: dict[str, Finding]) -> tuple[Any, dict[str, A
     return obs, result[1] if has_info else {}
 
 
-def _check_step(result: Any, space: gym.Space, problems: dict[str, Finding]) -> bool:
+def _check_step(result: object, space: gym.Space, problems: dict[str, Finding]) -> bool:
     """Checks the values of a step, and returns whether training could go on after it."""
     faults = dict(validation.step_faults(result, space, strict=True))
     for name, text in faults.items():
@@ -273,7 +274,7 @@ def _check_step(result: Any, space: gym.Space, problems: dict[str, Finding]) -> 
     return validation.step_fault(result, space) is None
 
 
-def _check_observation(obs: Any, space: gym.Space, problems: dict[str, Finding], method: str) -> None:
+def _check_observation(obs: Observation, space: gym.Space, problems: dict[str, Finding], method: str) -> None:
     fault = validation.observation_fault(space, obs, strict=True)
     if fault is not None:
         problems.setdefault("observation", Finding("error", f"{method} returned {fault}"))
@@ -402,7 +403,7 @@ def _goal_faults(
         yield from _against_batches(name, function, rows)
 
 
-def _against_step(name: str, result: Any, row: SeenStep) -> Iterator[tuple[Level, str]]:
+def _against_step(name: str, result: object, row: SeenStep) -> Iterator[tuple[Level, str]]:
     """Yields the difference between a step and the function for one goal."""
     if name == "compute_terminated" and result and not row.terminated:  # it may end otherwise, as in a crash
         yield (
@@ -448,7 +449,7 @@ def _against_batches(name: str, function: Callable[..., Any], rows: Sequence[See
         )
 
 
-def _result_fault(name: str, result: Any) -> str | None:
+def _result_fault(name: str, result: object) -> str | None:
     """Returns the fault of the result for one pair of goals, None without one."""
     if isinstance(result, Exception):
         return f"nothing, but {_describe_result(result)}"
@@ -461,7 +462,7 @@ def _goals(row: SeenStep) -> tuple[Any, Any]:
     return achieved, desired
 
 
-def _attempt(function: Callable[..., Any], *arguments: Any) -> Any:
+def _attempt(function: Callable[..., Any], *arguments: object) -> Any:
     """Returns the result of a function, or the exception that it raised."""
     try:
         return function(*copy.deepcopy(arguments))
@@ -469,7 +470,7 @@ def _attempt(function: Callable[..., Any], *arguments: Any) -> Any:
         return error
 
 
-def _agree(a: Any, b: Any) -> bool:
+def _agree(a: object, b: object) -> bool:
     try:
         first, second = np.asarray(a, np.float64), np.asarray(b, np.float64)
     except (TypeError, ValueError):  # of errors, and of what is no number
@@ -477,7 +478,7 @@ def _agree(a: Any, b: Any) -> bool:
     return bool(np.allclose(first, second, rtol=1e-4, atol=1e-5, equal_nan=True))
 
 
-def _describe_result(result: Any) -> str:
+def _describe_result(result: object) -> str:
     return f"raised {type(result).__name__}: {result}" if isinstance(result, Exception) else f"{result}"
 
 

@@ -9,9 +9,11 @@ from typing import Any
 import gymnasium as gym
 import jax
 import numpy as np
+from numpy.typing import DTypeLike
 
 from rejeu.core.errors import DivergedError
 from rejeu.core.spaces import cast, leaves
+from rejeu.core.types import JsonObject, Observation
 from rejeu.core.validation import whole
 from rejeu.envs import goals as goals_module
 from rejeu.envs.action_log import MOST_IMAGE_STEPS, MOST_STEPS, ActionLog, replay
@@ -74,7 +76,7 @@ class EnvPool(VectorEnv):
         """Logs the actions from now on. A pool that has been used is created again at the next reset."""
         self._log.is_on = True
 
-    def reset(self, seed: Seed = None) -> Any:
+    def reset(self, seed: Seed = None) -> Observation:
         if seed is None and self.must_reset:
             seed = next_seed(self._seed)
         if seed is not None:
@@ -94,7 +96,7 @@ class EnvPool(VectorEnv):
         obs, reward, terminated, truncated, info = self._pool.step(action, ids)  # rows in order of ids
         self._obs = with_rows(self._obs, ids, cast(self.observation_space, self._leaves, obs))
 
-        def spread(values: np.ndarray, dtype: Any) -> np.ndarray:
+        def spread(values: np.ndarray, dtype: DTypeLike) -> np.ndarray:
             whole = np.zeros(self.n_envs, dtype)
             whole[ids] = values
             return whole
@@ -102,20 +104,20 @@ class EnvPool(VectorEnv):
         successes = {key: spread(info[key], info[key].dtype) for key in SUCCESS_KEYS if key in info}
         return Step(self._obs, spread(reward, np.float32), spread(terminated, bool), spread(truncated, bool), successes)
 
-    def reset_done(self, done: np.ndarray) -> Any:
+    def reset_done(self, done: np.ndarray) -> Observation:
         ended = np.flatnonzero(done).astype(np.int32)
         self._log.reset(ended)
         fresh = cast(self.observation_space, self._leaves, self._pool.reset(ended)[0])
         self._obs = with_rows(self._obs, ended, fresh)
         return self._obs
 
-    def snapshot(self) -> dict[str, Any] | None:
+    def snapshot(self) -> JsonObject | None:
         if not self._log.is_complete:
             return None
         seed = self._seed if isinstance(self._seed, int) else list(self._seed)
         return {"seed": seed, **self._log.to_plain()}
 
-    def restore(self, saved: Any, obs: Any) -> list[int]:
+    def restore(self, saved: object, obs: Observation) -> list[int]:
         if not isinstance(saved, dict) or {*saved} != {"seed", "n_operations", "blocks"}:
             raise ValueError("the record of actions is not one of EnvPool")
         self._pool.close()
@@ -156,7 +158,7 @@ def next_seed(seed: int | Sequence[int]) -> int | Sequence[int]:
     return tuple(int(np.random.SeedSequence([env_seed, 1]).generate_state(1)[0]) % SEEDS_END for env_seed in seed)
 
 
-def _saved_seed(seed: Any, n_envs: int) -> int | Sequence[int]:
+def _saved_seed(seed: object, n_envs: int) -> int | Sequence[int]:
     """Returns the seed of a pool from a file.
 
     Raises:

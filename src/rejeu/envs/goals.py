@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import DTypeLike
 
 from rejeu.core.errors import BadEnvironmentError
 from rejeu.envs.validation import describe_value
@@ -28,7 +29,7 @@ class GoalFunctions(NamedTuple):
     """Returns which steps are terminal, with the same arguments. If it is None, relabeled steps keep their flags."""
 
 
-def parking_reward(achieved: np.ndarray, desired: np.ndarray, infos: Any = None) -> np.ndarray:
+def parking_reward(achieved: np.ndarray, desired: np.ndarray, infos: object = None) -> np.ndarray:
     """Returns ``-sqrt(weights . |achieved - desired|)``, the reward of ``parking-v0`` without its collision penalty.
 
     Shapes ``(..., 6)`` to ``(...)``. It is equal to highway-env's ``compute_reward`` with the default configuration,
@@ -74,7 +75,7 @@ def goal_fault(name: str, error: Exception, goal: np.ndarray) -> BadEnvironmentE
     )
 
 
-def over_batches(function: Callable[..., Any], dtype: Any) -> Callable[..., np.ndarray]:
+def over_batches(function: Callable[..., Any], dtype: DTypeLike) -> Callable[..., np.ndarray]:
     """Returns ``function(achieved, desired, info)`` as a function of batches of goals, and of their infos if they are given.
 
     The first call with at least two rows compares the results for the whole batch with those for each of the first eight

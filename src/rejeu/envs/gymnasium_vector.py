@@ -15,6 +15,7 @@ from gymnasium.vector.async_vector_env import AsyncState
 
 from rejeu.core.errors import BadEnvironmentError, WorkerError
 from rejeu.core.spaces import leaves, plain
+from rejeu.core.types import Info, Observation
 from rejeu.envs import base, goals as goals_module, validation
 from rejeu.envs.base import Seed, Step, VectorEnv, describe_spec, each_info, each_seed, step_whole
 from rejeu.envs.goals import GoalFunctions
@@ -62,7 +63,7 @@ class GymnasiumVector(VectorEnv):
         self.n_steps = 0
         """Number of steps of the vector."""
 
-    def reset(self, seed: Seed = None) -> Any:
+    def reset(self, seed: Seed = None) -> Observation:
         seed = self._seed if seed is None else seed
         self._seed = None
         # Other classes of vector environments may not accept a list.
@@ -114,7 +115,7 @@ class GymnasiumVector(VectorEnv):
         self._obs = step.obs
         return step
 
-    def reset_done(self, done: np.ndarray) -> Any:
+    def reset_done(self, done: np.ndarray) -> Observation:
         done = np.asarray(done, bool)
         if not self._same_step:
             self._obs = self._reset(options={"reset_mask": done})
@@ -153,7 +154,7 @@ class GymnasiumVector(VectorEnv):
         except BadEnvironmentError as error:
             raise self._bad(None, f"reset returned {error}") from error.__cause__
 
-    def _called(self, function: Callable[..., Any], *positional: Any, **arguments: Any) -> Any:
+    def _called(self, function: Callable[..., Any], *positional: object, **arguments: Any) -> Any:
         """Calls a method of the vector. An error in the vector itself is attributed to one of its environments.
 
         The values that single environments return cannot be checked before the vector uses them. Exceptions that an
@@ -175,7 +176,7 @@ class GymnasiumVector(VectorEnv):
     def _bad(self, env: int | None, fault: str) -> BadEnvironmentError:
         return BadEnvironmentError(validation.with_location(self.env_id, env, self.n_steps, fault))
 
-    def infos(self, begun: bool = False) -> list[dict[str, Any]]:
+    def infos(self, begun: bool = False) -> list[Info]:
         return each_info(self._reset_info if begun else self.info, self.n_envs, begun)
 
     def call(self, name: str) -> list[Any]:

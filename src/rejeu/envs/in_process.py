@@ -11,6 +11,7 @@ import numpy as np
 
 from rejeu.core.errors import BadEnvironmentError
 from rejeu.core.spaces import leaves, rows, structure
+from rejeu.core.types import Info, Observation
 from rejeu.envs import goals as goals_module, snapshot, validation
 from rejeu.envs.base import Seed, Step, VectorEnv, describe_spec, each_seed, success_of
 from rejeu.envs.goals import GoalFunctions
@@ -62,14 +63,14 @@ class InProcess(VectorEnv):
         wrapped.seeds, wrapped.owner = self.seeds, self.owner
         return wrapped
 
-    def reset(self, seed: Seed = None) -> Any:
+    def reset(self, seed: Seed = None) -> Observation:
         seed = self._seed if seed is None else seed
         self._seed = None
         for i, own_seed in enumerate(each_seed(seed, self.n_envs)):
             self._reset(i, own_seed)
         return self._obs
 
-    def reset_done(self, done: np.ndarray) -> Any:
+    def reset_done(self, done: np.ndarray) -> Observation:
         for i in np.flatnonzero(done).tolist():
             self._reset(i)
         return self._obs
@@ -95,7 +96,7 @@ class InProcess(VectorEnv):
         reward = np.zeros(self.n_envs, np.float32)
         terminated = np.zeros(self.n_envs, bool)
         truncated = np.zeros(self.n_envs, bool)
-        info: list[dict[str, Any]] = [{}] * self.n_envs
+        info: list[Info] = [{}] * self.n_envs
         self.n_steps += 1
         action = rows(action)
         for i in range(self.n_envs) if indices is None else indices:
@@ -125,7 +126,7 @@ class InProcess(VectorEnv):
         states = [snapshot.state_of(env) for env in self.envs]
         return None if any(state is None for state in states) else states
 
-    def restore(self, saved: Any, obs: Any) -> list[int]:
+    def restore(self, saved: Any, obs: Observation) -> list[int]:
         snapshot.check_count(saved, self.n_envs)
         for env, state in zip(self.envs, saved, strict=True):
             snapshot.restore(env, state)

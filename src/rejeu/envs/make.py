@@ -13,6 +13,7 @@ from typing import Any, Literal, NamedTuple
 import gymnasium as gym
 
 from rejeu.core import validation
+from rejeu.core.types import Arguments, Settings
 from rejeu.envs import functional
 from rejeu.envs.base import Seed, Step as Step, VectorEnv as VectorEnv, checked_seed
 from rejeu.envs.envpool import EnvPool as EnvPool, check_envpool_knows, envpool_knows
@@ -67,7 +68,7 @@ def make_vector(
     *,
     worker_timeout: float | None = TIMEOUT,
     restart_workers: int = 0,
-    ray: Mapping[str, Any] | None = None,
+    ray: Mapping[str, object] | None = None,
     **env_kwargs: Any,
 ) -> VectorEnv:
     """Returns a vector environment of ``n_envs`` environments.
@@ -122,7 +123,7 @@ make_vec = make_vector
 
 
 def _made(
-    env: Any, n_envs: int, backend: Backend, seed: Seed, workers: WorkerOptions, env_kwargs: dict[str, Any]
+    env: Any, n_envs: int, backend: Backend, seed: Seed, workers: WorkerOptions, env_kwargs: Settings
 ) -> VectorEnv:
     """Returns the vector environment of :func:`make_vector`, for arguments that were checked."""
     if isinstance(env, VectorEnv):
@@ -156,7 +157,7 @@ def _made(
 
 
 def _of_id(
-    env: str, n_envs: int, backend: Backend, seed: Seed, workers: WorkerOptions, env_kwargs: dict[str, Any]
+    env: str, n_envs: int, backend: Backend, seed: Seed, workers: WorkerOptions, env_kwargs: Settings
 ) -> VectorEnv:
     if backend == "auto":
         backend = auto_backend(env, n_envs, env_kwargs)
@@ -171,7 +172,7 @@ def _of_id(
     return make_vector(maker(env, **env_kwargs), n_envs, backend, seed, **workers._asdict())
 
 
-def auto_backend(env_id: str, n_envs: int, env_kwargs: Mapping[str, Any] = MappingProxyType({})) -> Backend:
+def auto_backend(env_id: str, n_envs: int, env_kwargs: Arguments = MappingProxyType({})) -> Backend:
     """Returns the backend that ``"auto"`` stands for. It does not depend on the speed of the machine.
 
     ``"jax"`` if it is an environment in JAX; ``"envpool"`` if EnvPool is installed and has the environment, no arguments are

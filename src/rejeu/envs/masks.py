@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any
+from typing import Any, SupportsFloat
 
 import equinox as eqx
 import gymnasium as gym
@@ -21,6 +21,7 @@ from jax import Array
 from rejeu.core.algorithm import Masked
 from rejeu.core.errors import BadEnvironmentError
 from rejeu.core.spaces import Leaf
+from rejeu.core.types import Action, AnyArray, Info, Observation, PyTree
 from rejeu.envs import functional, snapshot
 from rejeu.envs.base import Seed, Step, VectorEnv
 from rejeu.envs.envpool import EnvPool
@@ -66,16 +67,16 @@ class MaskInObservation(gym.Wrapper[Any, Any, Any, Any]):
         self._n = n_choices(env.action_space, id_of(env))
         self.observation_space = spaces.Dict({OBSERVATION: env.observation_space, MASK: spaces.MultiBinary(self._n)})
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Observation, Info]:
         obs, info = self.env.reset(seed=seed, options=options)
         return {OBSERVATION: obs, MASK: self._mask(info, False)}, info
 
-    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+    def step(self, action: Action) -> tuple[Observation, SupportsFloat, bool, bool, Info]:
         obs, reward, terminated, truncated, info = self.env.step(action)
         mask = self._mask(info, terminated or truncated)
         return {OBSERVATION: obs, MASK: mask}, reward, terminated, truncated, info
 
-    def _mask(self, info: dict[str, Any], over: bool) -> np.ndarray:
+    def _mask(self, info: Info, over: bool) -> np.ndarray:
         if not isinstance(info, dict):  # reported by the vector, with the number of the environment
             return np.zeros(self._n, np.int8)
         method = None if MASK in info else attribute(self.env, METHOD)
@@ -85,7 +86,7 @@ class MaskInObservation(gym.Wrapper[Any, Any, Any, Any]):
         return flat_mask(mask, self.action_space, id_of(self.env), over)
 
 
-def flat_mask(mask: Any, space: spaces.Space, env_id: str, over: bool) -> np.ndarray:
+def flat_mask(mask: AnyArray, space: spaces.Space, env_id: str, over: bool) -> np.ndarray:
     """Returns the mask that an environment gave, an array or a list of arrays, as ``int8 (n_choices,)``.
 
     Raises:
@@ -103,7 +104,7 @@ def flat_mask(mask: Any, space: spaces.Space, env_id: str, over: bool) -> np.nda
     return mask
 
 
-def sampled(env: gym.Env, info: Any) -> Any:
+def sampled(env: gym.Env, info: object) -> Any:
     """Returns a random action, among those that the environment allows if ``info`` or ``action_masks()`` says so.
 
     Raises:
@@ -166,7 +167,7 @@ class MaskedVector(VectorEnv):
     def reset_done(self, done: np.ndarray) -> Masked:
         return self._masked(self.inner.reset_done(done), np.flatnonzero(done))
 
-    def _masked(self, obs: Any, indices: np.ndarray, over: np.ndarray | None = None) -> Masked:
+    def _masked(self, obs: Observation, indices: np.ndarray, over: np.ndarray | None = None) -> Masked:
         """Returns observations with their masks, of which those of ``indices`` are new; ``over`` is None after a reset."""
         if self._mask is None:
             return masked(obs)
@@ -199,7 +200,7 @@ class MaskedVector(VectorEnv):
     def snapshot(self) -> Any:
         return self.inner.snapshot()
 
-    def restore(self, saved: Any, obs: Masked) -> list[int]:
+    def restore(self, saved: object, obs: Masked) -> list[int]:
         if self._mask is None:
             return self.inner.restore(saved, {OBSERVATION: obs.obs, MASK: obs.mask.astype(np.int8)})
         self._mask[:] = obs.mask
@@ -212,7 +213,7 @@ class MaskedVector(VectorEnv):
         self.inner.close()
 
 
-def masked(obs: dict[str, Any]) -> Masked:
+def masked(obs: dict[str, Observation]) -> Masked:
     """Returns observations of :class:`MaskInObservation` with their masks, ``bool (n_envs, n)``."""
     return Masked(obs[OBSERVATION], obs[MASK].astype(bool))
 
@@ -228,7 +229,7 @@ def for_agent(agent: Any, env: gym.Env) -> gym.Env:
     return MaskInObservation(env) if getattr(agent, "takes_masks", False) else env
 
 
-def split(observation: Any, masks: Any) -> tuple[Any, Any]:
+def split(observation: Observation, masks: AnyArray) -> tuple[Any, Any]:
     """Returns an observation and its mask, from both in one as environments with masks show them, or from the two apart."""
     if isinstance(observation, Masked):
         return observation.obs, observation.mask if masks is None else masks
@@ -314,18 +315,18 @@ class FunctionalMask(FunctionalEnv):
     def action_space(self) -> spaces.Space:
         return self.env.action_space
 
-    def reset(self, key: Array) -> tuple[Any, Any]:
+    def reset(self, key: Array) -> tuple[PyTree, PyTree]:
         state, obs = self.env.reset(key)
         return state, self._observe(state, obs)
 
-    def step(self, key: Array, state: Any, action: Array) -> tuple[Any, Any, Array, Array, Array]:
+    def step(self, key: Array, state: PyTree, action: Array) -> tuple[PyTree, PyTree, Array, Array, Array]:
         state, obs, *result = self.env.step(key, state, action)
         return state, self._observe(state, obs), *result
 
-    def success(self, state: Any) -> Array | None:
+    def success(self, state: PyTree) -> Array | None:
         return self.env.success(state)
 
-    def _observe(self, state: Any, obs: Any) -> dict[str, Any]:
+    def _observe(self, state: PyTree, obs: Observation) -> dict[str, Observation]:
         mask = self.env.action_mask(state)
         if mask is None or mask.shape != (self.n_choices,):
             shape = "None" if mask is None else f"the shape {mask.shape}"

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from highway_env.envs.common.observation import KinematicsGoalObservation
 from highway_env.envs.parking_env import ParkingEnv
 from highway_env.road.lane import StraightLane
+
+from rejeu.core.types import Settings
 
 SLOTS, WIDTH = 18, 3.0
 """Slots of each of the two rows, and their width in meters; 14 of 4 m in parking-v0. A car is 2 m wide and 5 m long."""
@@ -29,7 +29,7 @@ class ParkingHard(ParkingEnv):
     Observations, actions, rewards, walls and the end of episodes are those of parking-v0, whose ``config`` it takes as well.
     """
 
-    def __init__(self, config: dict[str, Any] | None = None, render_mode: str | None = None) -> None:
+    def __init__(self, config: Settings | None = None, render_mode: str | None = None) -> None:
         super().__init__({"vehicles_count": 24, **(config or {})}, render_mode)
 
     def define_spaces(self) -> None:

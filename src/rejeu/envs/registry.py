@@ -19,6 +19,7 @@ import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
 
 from rejeu.core.errors import MissingExtra, requires
+from rejeu.core.types import Settings
 
 PLAIN_ID = re.compile(r"(?=.{1,200}$)([\w-]+/)?[\w.-]*(?<!\.py)(?<!\.)", re.IGNORECASE)
 """Pattern of ids that are looked up: a name, after a namespace or none. An id with a colon makes Gymnasium import a module."""
@@ -180,7 +181,7 @@ def maker(env_id: str, **kwargs: Any) -> Callable[[], gym.Env]:
 @dataclass(frozen=True)
 class _Maker:
     env_id: str
-    kwargs: dict[str, Any]
+    kwargs: Settings
     spec: EnvSpec | None
 
     def __call__(self) -> gym.Env:

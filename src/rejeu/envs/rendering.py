@@ -7,7 +7,7 @@ import os
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import MappingProxyType
 from typing import Any
@@ -17,6 +17,7 @@ import numpy as np
 
 from rejeu.core import hardware
 from rejeu.core.spaces import keeps_values
+from rejeu.core.types import Arguments
 from rejeu.envs.validation import describe_value
 
 DEFAULT_FPS = 30.0
@@ -26,7 +27,7 @@ RENDERING = threading.RLock()
 
 
 def make_rendering_env(
-    make: Callable[..., gym.Env], env_id: str, plain_kwargs: Mapping[str, Any] = MappingProxyType({})
+    make: Callable[..., gym.Env], env_id: str, plain_kwargs: Arguments = MappingProxyType({})
 ) -> gym.Env:
     """Returns ``make(render_mode="rgb_array")``, an environment that renders to arrays.
 

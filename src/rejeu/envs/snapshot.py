@@ -30,6 +30,7 @@ from msgspec import Meta
 
 from rejeu.core.errors import DivergedError
 from rejeu.core.records import brief, encode
+from rejeu.core.types import JsonObject
 
 ABSENT = "absent"
 """Value of an attribute that does not exist yet, such as ``last_u`` before the first step."""
@@ -117,7 +118,7 @@ def _state(layer: Any) -> Any:
     return _mujoco_state(layer) if is_mujoco(layer) else None
 
 
-def _answer(get: Callable[[], Any]) -> dict[str, Any] | None:
+def _answer(get: Callable[[], Any]) -> JsonObject | None:
     """Returns the state of an environment by its method; None, with a warning, if that is no dict of plain data.
 
     Some environments have a method of that name for other purposes.
@@ -148,7 +149,7 @@ def restore(env: gym.Env, layers: list[Any]) -> None:
         env_layers[-1].np_random.bit_generator.state = layers[-1]["rng"]
 
 
-def _restore(layer: Any, state: dict[str, Any]) -> None:
+def _restore(layer: Any, state: JsonObject) -> None:
     """Restores the state of a layer without its random numbers."""
     if answers_for_itself(layer) or saves_itself(layer):
         put = layer.set_state if answers_for_itself(layer) else layer.set_wrapper_state
@@ -170,7 +171,7 @@ def _restore(layer: Any, state: dict[str, Any]) -> None:
         raise ValueError(f"{type(layer).__name__} does not support snapshots")
 
 
-def check_count(states: Any, n_envs: int) -> None:
+def check_count(states: object, n_envs: int) -> None:
     """Raises ``ValueError`` unless ``states`` is a list with one entry per environment."""
     if not isinstance(states, list) or len(states) != n_envs:
         raise ValueError(f"the states are not those of {n_envs} environments")
@@ -191,7 +192,7 @@ def is_over(env: gym.Env) -> bool:
     return "state" in REMEMBERED.get(type(layer), {}) and getattr(layer, "state", None) is None
 
 
-def check_types(layer: gym.Env, state: Mapping[str, Any], types: Mapping[str, Any]) -> None:
+def check_types(layer: gym.Env, state: Mapping[str, object], types: Mapping[str, object]) -> None:
     """Checks attributes of an environment or wrapper that were read from a file.
 
     Raises:
@@ -224,7 +225,7 @@ def is_mujoco(layer: gym.Env) -> bool:
     return type(layer).__module__.startswith(MUJOCO)
 
 
-def _mujoco_state(env: Any) -> dict[str, Any]:
+def _mujoco_state(env: Any) -> JsonObject:
     import mujoco
 
     spec = mujoco.mjtState.mjSTATE_INTEGRATION
@@ -233,7 +234,7 @@ def _mujoco_state(env: Any) -> dict[str, Any]:
     return {"integration": state}
 
 
-def _put_mujoco(env: Any, state: dict[str, Any]) -> None:
+def _put_mujoco(env: Any, state: JsonObject) -> None:
     import mujoco
 
     spec = mujoco.mjtState.mjSTATE_INTEGRATION

@@ -19,9 +19,11 @@ from typing import Any, Literal
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from numpy.typing import DTypeLike
 
 from rejeu.core.errors import BadEnvironmentError
 from rejeu.core.spaces import Leaf, as_stored, cast, keeps_values, leaves, limits, parts
+from rejeu.core.types import Action, Info, Observation, PyTree, Settings
 
 FLAGS = frozenset((bool, np.bool_))
 """Types of ``terminated`` and ``truncated``."""
@@ -39,7 +41,7 @@ TERMINATED_AND_TRUNCATED = (
 )
 
 
-def to_array(value: Any, leaf: Leaf) -> np.ndarray:
+def to_array(value: object, leaf: Leaf) -> np.ndarray:
     """Returns one value of a leaf as an array of its shape and dtype.
 
     Raises:
@@ -51,7 +53,7 @@ def to_array(value: Any, leaf: Leaf) -> np.ndarray:
     return as_stored(array, leaf)
 
 
-def convert_step(result: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+def convert_step(result: Any) -> tuple[Observation, float, bool, bool, Info]:
     """Returns the five values that ``step`` returned, with reward and flags as Python scalars.
 
     Raises any exception if they are invalid; :func:`step_fault` then describes what is wrong.
@@ -108,13 +110,13 @@ def make_writer(space: spaces.Space, stores: Sequence[np.ndarray]) -> Callable[[
     ]
     store, leaf, size, dtype, array = slots[0]
 
-    def put_array(i: int, obs: Any) -> None:
+    def put_array(i: int, obs: Observation) -> None:
         # As many numbers as are expected can only be broadcast from shapes with leading ones, which is harmless.
         if type(obs) is not array or obs.size != size or obs.dtype is not dtype:
             obs = to_array(obs, leaf)
         store[i] = obs
 
-    def put_parts(i: int, obs: Any) -> None:
+    def put_parts(i: int, obs: Observation) -> None:
         for (store, leaf, size, dtype, array), value in zip(slots, parts(space, obs), strict=True):
             if type(value) is not array or value.size != size or value.dtype is not dtype:
                 value = to_array(value, leaf)
@@ -128,7 +130,7 @@ def is_free(leaf: Leaf, space: spaces.Space) -> bool:
     return isinstance(space, spaces.Box) and (leaf.dtype[0] == "f" or np.can_cast(space.dtype, leaf.dtype))
 
 
-def called_reset(env: gym.Env, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+def called_reset(env: gym.Env, seed: int | None = None, options: Info | None = None) -> Any:
     """Returns the result of ``reset``, given ``seed`` and ``options`` only if they are not None.
 
     Raises:
@@ -143,7 +145,7 @@ def called_reset(env: gym.Env, seed: int | None = None, options: dict[str, Any] 
         raise
 
 
-def seed_fault(env: gym.Env, seed: int | None, options: dict[str, Any] | None, error: Exception) -> str | None:
+def seed_fault(env: gym.Env, seed: int | None, options: Info | None, error: Exception) -> str | None:
     """Describes why ``reset`` raised an error because of its seed; None if the seed is not the reason."""
     if seed is None:
         return None
@@ -158,7 +160,7 @@ def seed_fault(env: gym.Env, seed: int | None, options: dict[str, Any] | None, e
     )
 
 
-def _resets(env: gym.Env, arguments: dict[str, Any]) -> bool:
+def _resets(env: gym.Env, arguments: Settings) -> bool:
     """Returns whether an environment can be reset without a seed."""
     try:
         env.reset(**arguments)
@@ -167,9 +169,7 @@ def _resets(env: gym.Env, arguments: dict[str, Any]) -> bool:
     return True
 
 
-def reset_env(
-    env: gym.Env, seed: int | None = None, options: dict[str, Any] | None = None
-) -> tuple[Any, dict[str, Any]]:
+def reset_env(env: gym.Env, seed: int | None = None, options: Info | None = None) -> tuple[Observation, Info]:
     """Resets an environment and returns the observation and the info; see :func:`called_reset`.
 
     Raises:
@@ -181,7 +181,7 @@ def reset_env(
     return result
 
 
-def step_env(env: gym.Env, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+def step_env(env: gym.Env, action: Action) -> tuple[Observation, float, bool, bool, Info]:
     """Steps an environment and returns the result, with numbers as Python scalars.
 
     Raises:
@@ -193,7 +193,7 @@ def step_env(env: gym.Env, action: Any) -> tuple[Any, float, bool, bool, dict[st
     return convert_step(result)
 
 
-def copy_observation(space: spaces.Space, obs: Any) -> Any:
+def copy_observation(space: spaces.Space, obs: Observation) -> Any:
     """Returns a copy of a valid observation, in which every leaf can be cast to the declared dtype."""
     if isinstance(space, spaces.Dict):
         return {key: copy_observation(subspace, obs[key]) for key, subspace in space.spaces.items()}
@@ -205,7 +205,7 @@ def copy_observation(space: spaces.Space, obs: Any) -> Any:
     return copy.deepcopy(obs) if np.isscalar(obs) else np.asarray(obs).astype(dtype)
 
 
-def to_batch(space: spaces.Space, space_leaves: tuple[Leaf, ...], n_envs: int, obs: Any) -> Any:
+def to_batch(space: spaces.Space, space_leaves: tuple[Leaf, ...], n_envs: int, obs: Observation) -> Any:
     """Returns the observations of a vector environment, converted by :func:`rejeu.core.spaces.cast`.
 
     Raises:
@@ -226,7 +226,7 @@ def to_batch(space: spaces.Space, space_leaves: tuple[Leaf, ...], n_envs: int, o
     return arrays
 
 
-def to_vector(name: str, values: Any, n_envs: int, dtype: Any) -> np.ndarray:
+def to_vector(name: str, values: object, n_envs: int, dtype: DTypeLike) -> np.ndarray:
     """Returns the rewards or flags that a vector environment returned, ``dtype (n_envs,)``.
 
     Raises:
@@ -289,7 +289,7 @@ def arguments_fault(env: gym.Env) -> str | None:
     return None
 
 
-def reset_fault(result: Any, space: spaces.Space) -> str | None:
+def reset_fault(result: object, space: spaces.Space) -> str | None:
     """Describes what is wrong with what ``reset`` returned."""
     if not isinstance(result, tuple) or len(result) != 2 or not isinstance(result[1], dict):
         only = observation_fault(space, result) is None
@@ -299,12 +299,12 @@ def reset_fault(result: Any, space: spaces.Space) -> str | None:
     return None if fault is None else f"reset returned {fault}"
 
 
-def step_fault(result: Any, space: spaces.Space) -> str | None:
+def step_fault(result: object, space: spaces.Space) -> str | None:
     """Describes what is wrong with what ``step`` returned."""
     return next((fault for _, fault in step_faults(result, space)), None)
 
 
-def step_faults(result: Any, space: spaces.Space, strict: bool = False) -> Iterator[tuple[str, str]]:
+def step_faults(result: object, space: spaces.Space, strict: bool = False) -> Iterator[tuple[str, str]]:
     """Yields everything that is wrong with what ``step`` returned, after the name of the value that it is in.
 
     ``step`` stands for the observation and for the whole. For ``strict`` see :func:`reward_fault` and :func:`flag_fault`.
@@ -348,14 +348,14 @@ def reward_fault(reward: Any, strict: bool = False) -> str | None:
     return None
 
 
-def info_fault(info: Any) -> str | None:
+def info_fault(info: object) -> str | None:
     """Describes what is wrong with an info."""
     if isinstance(info, dict):
         return None
     return f"the info {describe_value(info)}, expected a dict; return {{}} if there is nothing to say"
 
 
-def flag_fault(name: str, flag: Any, strict: bool = False) -> str | None:
+def flag_fault(name: str, flag: object, strict: bool = False) -> str | None:
     """Describes what is wrong with ``terminated`` or ``truncated``; if ``strict``, zeros and ones are wrong too."""
     try:
         to_bool(flag)
@@ -368,7 +368,7 @@ def flag_fault(name: str, flag: Any, strict: bool = False) -> str | None:
     return f"{name}={flag!r:.80} of type {type(flag).__name__}{hint}, expected a bool; {TERMINATED_AND_TRUNCATED}"
 
 
-def observation_fault(space: spaces.Space, obs: Any, path: str = "", strict: bool = False) -> str | None:
+def observation_fault(space: spaces.Space, obs: Observation, path: str = "", strict: bool = False) -> str | None:
     """Describes what is wrong with the structure, shape or dtype of one observation.
 
     Args:
@@ -401,7 +401,7 @@ def observation_fault(space: spaces.Space, obs: Any, path: str = "", strict: boo
     return next((fault for fault in faults if fault is not None), None)
 
 
-def _array_fault(space: spaces.Space, obs: Any, name: str, strict: bool) -> str | None:
+def _array_fault(space: spaces.Space, obs: Observation, name: str, strict: bool) -> str | None:
     """Describes what is wrong with one array of an observation."""
     (leaf,) = leaves(space)
     try:
@@ -435,7 +435,7 @@ def _array_fault(space: spaces.Space, obs: Any, name: str, strict: bool) -> str 
     return None
 
 
-def nonfinite_fault(space: spaces.Space, obs: Any) -> str | None:
+def nonfinite_fault(space: spaces.Space, obs: Observation) -> str | None:
     """Describes which number of one observation of the right structure is not finite."""
     for leaf, value in zip(leaves(space), parts(space, obs), strict=True):
         array = np.asarray(value)
@@ -446,7 +446,7 @@ def nonfinite_fault(space: spaces.Space, obs: Any) -> str | None:
     return None
 
 
-def bounds_fault(space: spaces.Space, obs: Any) -> tuple[Literal["error", "warning"], str] | None:
+def bounds_fault(space: spaces.Space, obs: Observation) -> tuple[Literal["error", "warning"], str] | None:
     """Describes which number of one observation of the right structure lies outside of the declared bounds.
 
     A warning for a Box, whose bounds networks never see; an error for choices and bits, which would have no place in one.
@@ -468,7 +468,7 @@ def bounds_fault(space: spaces.Space, obs: Any) -> tuple[Literal["error", "warni
     return None
 
 
-def far_outside(space: spaces.Space, obs: Any) -> str | None:
+def far_outside(space: spaces.Space, obs: Observation) -> str | None:
     """Describes which number of a batch of observations lies far outside of the declared bounds.
 
     Far is ``FAR`` times the distance of the two bounds. Images cannot lie outside, and what is unbounded is not looked at.
@@ -491,7 +491,7 @@ def far_outside(space: spaces.Space, obs: Any) -> str | None:
     return None
 
 
-def lost_change(space: spaces.Space, before: Any, after: Any) -> str | None:
+def lost_change(space: spaces.Space, before: PyTree, after: PyTree) -> str | None:
     """Describes which number of an observation changed in a step, and not in float32; None if there is none.
 
     Changes of less than ``LEAST_CHANGE`` do not count: they are the rounding of simulations.
@@ -520,7 +520,7 @@ def leaf_name(path: str) -> str:
     return f"the observation under {path!r}" if path else "the observation"
 
 
-def describe_value(value: Any) -> str:
+def describe_value(value: object) -> str:
     """Returns a description of a value: its type, and its shape or beginning."""
     if isinstance(value, np.ndarray):
         return f"an array of shape {value.shape} and dtype {value.dtype}"

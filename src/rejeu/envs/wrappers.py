@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
+from typing import Any, SupportsFloat
 
 import gymnasium as gym
 import numpy as np
@@ -11,6 +11,7 @@ from gymnasium.envs.classic_control import CartPoleEnv
 from gymnasium.wrappers import TransformObservation
 
 from rejeu.core.spaces import check_goal_space, leaves
+from rejeu.core.types import Action, Info, Observation
 from rejeu.envs import snapshot
 from rejeu.envs.goals import attribute
 
@@ -32,7 +33,7 @@ class TimeLimitTerminates(gym.Wrapper, gym.utils.RecordConstructorArgs):
         gym.utils.RecordConstructorArgs.__init__(self)
         gym.Wrapper.__init__(self, env)
 
-    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+    def step(self, action: Action) -> tuple[Observation, SupportsFloat, bool, bool, Info]:
         """Steps the environment, and reports truncation as termination."""
         obs, reward, terminated, truncated, info = self.env.step(action)
         return obs, reward, terminated or truncated, False, info
@@ -64,12 +65,12 @@ class FlatGoals(gym.ObservationWrapper, gym.utils.RecordConstructorArgs):
             if attribute(env, name) is not None:
                 setattr(self, name, partial(self._of_parts, name))
 
-    def observation(self, observation: Any) -> dict[str, Any]:
+    def observation(self, observation: Observation) -> dict[str, Observation]:
         """Returns an observation with flat goals."""
         flat = {key: gym.spaces.flatten(self._goal, observation[key]) for key in ("achieved_goal", "desired_goal")}
         return {**observation, **{key: np.asarray(goal, np.float32) for key, goal in flat.items()}}
 
-    def _of_parts(self, name: str, achieved: np.ndarray, desired: np.ndarray, info: Any) -> Any:
+    def _of_parts(self, name: str, achieved: np.ndarray, desired: np.ndarray, info: object) -> Any:
         return self.env.get_wrapper_attr(name)(unflat(self._goal, achieved), unflat(self._goal, desired), info)
 
 
@@ -110,14 +111,14 @@ class OldEnvironment(gym.Env):
         self.observation_space = to_space(env.observation_space)
         self.action_space = to_space(env.action_space)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Observation, Info]:
         """Resets the environment, after its ``seed`` method was given the seed if it has one."""
         super().reset(seed=seed)
         if seed is not None and hasattr(self.old, "seed"):
             self.old.seed(seed)
         return self._converted(self.old.reset()), {}
 
-    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+    def step(self, action: Action) -> tuple[Observation, SupportsFloat, bool, bool, Info]:
         """Steps the environment, and tells time limits from ends of the task."""
         obs, reward, done, info = self.old.step(action)
         cut = bool(done) and bool(info.get("TimeLimit.truncated", False))
@@ -131,11 +132,11 @@ class OldEnvironment(gym.Env):
         """Closes the environment if it can be closed."""
         getattr(self.old, "close", lambda: None)()
 
-    def _converted(self, obs: Any) -> Any:
+    def _converted(self, obs: Observation) -> Observation:
         return np.array(obs, np.float32) if self.observation_space.dtype == np.float32 else obs
 
 
-def to_space(space: Any) -> gym.Space:
+def to_space(space: object) -> gym.Space:
     """Returns Gymnasium's space for one of another class: a Box for ``low`` and ``high``, Discrete for ``n``.
 
     Raises:

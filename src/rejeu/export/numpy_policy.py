@@ -14,7 +14,7 @@ import numpy as np
 from rejeu.core import spaces
 from rejeu.core.errors import CheckpointError
 from rejeu.core.records import WRONG, brief, is_sparse, parse_json
-from rejeu.core.types import Observation
+from rejeu.core.types import Observation, PyTree
 from rejeu.export import PRIMITIVES
 
 POLICY = "policy"
@@ -176,7 +176,7 @@ class NumpyPolicy:
         episode_start: Any = None,
         deterministic: bool = True,
         action_masks: Any = None,
-    ) -> tuple[np.ndarray, Any]:
+    ) -> tuple[np.ndarray, PyTree]:
         """Returns the actions of the agent's ``predict(deterministic=True)``, and the state for the next call.
 
         Args:

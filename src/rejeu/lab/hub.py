@@ -21,6 +21,7 @@ from rejeu.checkpoints import pickled
 from rejeu.checkpoints.run_folder import check_free, find_model
 from rejeu.core.errors import requires
 from rejeu.core.records import brief
+from rejeu.core.types import JsonObject
 from rejeu.core.validation import assign
 from rejeu.lab.reporting import run_list
 from rejeu.lab.runs import read as runs
@@ -172,7 +173,7 @@ def card(agent: Agent, repo: str, source: Path, names: set[str]) -> str:
     """
     env_id = agent.trained_on[0] if agent.trained_on is not None else "an unknown environment"
     evaluation = evaluated(source)
-    header: dict[str, Any] = {"library_name": "rejeu", "tags": ["reinforcement-learning", "rejeu", agent.name, env_id]}
+    header: JsonObject = {"library_name": "rejeu", "tags": ["reinforcement-learning", "rejeu", agent.name, env_id]}
     if evaluation is not None:
         metric = {"type": "mean_reward", "name": "mean return", "value": evaluation[1]}
         task, dataset = {"type": "reinforcement-learning"}, {"name": env_id, "type": env_id}

@@ -32,7 +32,7 @@ __all__ = [
 class HER:
     """The name of an algorithm that became a replay buffer."""
 
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
+    def __init__(self, *args: object, **kwargs: Any) -> None:
         raise ImportError(
             "HER is a replay buffer: SAC(..., replay_buffer_class=HerReplayBuffer); see the documentation"
         )

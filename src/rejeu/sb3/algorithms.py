@@ -39,6 +39,7 @@ from rejeu.checkpoints import model_files
 from rejeu.core import checkpoint, schedules, validation
 from rejeu.core.algorithm import Rollout
 from rejeu.core.errors import CheckpointError
+from rejeu.core.types import Action, AnyArray, Observation, PyTree, Settings
 from rejeu.envs.masks import split
 from rejeu.envs.registry import register
 from rejeu.envs.wrappers import TimeLimitTerminates
@@ -155,7 +156,7 @@ class Original(Agent):
             utils.set_random_seed(self.seed)
 
     @staticmethod
-    def _prepared(policy_class: type[Any], env: Any, settings: dict[str, Any]) -> tuple[Any, str, BasePolicy | None]:
+    def _prepared(policy_class: type[Any], env: Any, settings: Settings) -> tuple[Any, str, BasePolicy | None]:
         """Returns the environment, the name of the policy and the policy, for a class of policies."""
         if not issubclass(policy_class, BasePolicy):
             raise TypeError(f"policy={policy_class.__name__} must be a name, or a class derived from BasePolicy")
@@ -374,7 +375,7 @@ class Original(Agent):
         env = super().get_env()
         return env if env is None or not has_channels_last(env.observation_space) else VecTransposeImage(env)
 
-    def start_run(self, env: Any, state: Any = None) -> None:
+    def start_run(self, env: Any, state: PyTree = None) -> None:
         """Starts a run; without a GPU on the CPU, whatever ``device`` is."""
         if self.device == "gpu" and jax.default_backend() != "gpu":
             self.device = "cpu"
@@ -429,12 +430,12 @@ class Original(Agent):
 
     def predict(
         self,
-        observation: Any,
-        state: Any = None,
-        episode_start: Any = None,
+        observation: Observation,
+        state: PyTree = None,
+        episode_start: AnyArray = None,
         deterministic: bool = False,
-        action_masks: Any = None,
-    ) -> tuple[np.ndarray, Any]:
+        action_masks: AnyArray = None,
+    ) -> tuple[np.ndarray, PyTree]:
         """Returns actions in the environment's range, and the next state of a recurrent policy; see :meth:`Agent.predict`.
 
         DQN and QR-DQN act at random with the probability ``exploration_rate`` unless ``deterministic``. Images may have their
@@ -669,10 +670,10 @@ def scaled(buffer: Any, agent: Original) -> Any:
     """Returns a replay buffer that now stores original observations and rewards, and draws them normalized."""
     buffer_class = type(buffer)
 
-    def begin(obs: Any, which: Any = None) -> None:
+    def begin(obs: Observation, which: Any = None) -> None:
         buffer_class.begin(buffer, agent.run.env.original_obs(final=False), which)
 
-    def add(action: Any, reward: Any, terminated: Any, obs: Any) -> None:
+    def add(action: Action, reward: Any, terminated: Any, obs: Observation) -> None:
         env: Any = agent.run.env
         original = env.vec_normalize.get_original_reward()
         buffer_class.add(buffer, action, original, terminated, env.original_obs(final=True))

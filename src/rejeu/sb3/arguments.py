@@ -10,6 +10,7 @@ from rejeu.agents import Agent
 from rejeu.agents.base import AGENT_ARGUMENTS
 from rejeu.algorithms.config import REPLAY_BUFFERS
 from rejeu.core import validation
+from rejeu.core.types import Arguments, Settings
 from rejeu.sb3.common import buffers, utils
 from rejeu.sb3.common.noise import VectorizedActionNoise
 from rejeu.sb3.common.torch_layers import encoder_of, is_torch
@@ -63,10 +64,10 @@ POSITIONAL = {
 """Arguments after ``policy`` and ``env`` by position."""
 
 
-def converted(agent_class: type[Agent], settings: Mapping[str, Any]) -> dict[str, Any]:
+def converted(agent_class: type[Agent], settings: Mapping[str, object]) -> Settings:
     """Returns keyword arguments of the constructor or of ``load`` as rejeu's agent takes them."""
     setting_names = {*validation.field_names(agent_class.algorithm.Config), *AGENT_ARGUMENTS}
-    result: dict[str, Any] = {}
+    result: Settings = {}
     for key, value in settings.items():
         if key in WITHOUT_EFFECT or (key not in setting_names and value in NEUTRAL.get(key, ())):
             if value not in NEUTRAL.get(key, (value,)):
@@ -90,7 +91,7 @@ def converted(agent_class: type[Agent], settings: Mapping[str, Any]) -> dict[str
     return result
 
 
-def convert_buffer(settings: dict[str, Any]) -> None:
+def convert_buffer(settings: Settings) -> None:
     """Replaces the settings of a replay buffer by rejeu's."""
     buffer, options = (settings.get("replay_buffer_class"), dict(settings.get("replay_buffer_kwargs") or {}))
     if isinstance(buffer, type) and issubclass(buffer, buffers.ReplayBuffer):
@@ -114,12 +115,12 @@ def convert_buffer(settings: dict[str, Any]) -> None:
         settings["replay_buffer_kwargs"] = options or None
 
 
-def shape_of(agent_class: type[Agent], policy_kwargs: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+def shape_of(agent_class: type[Agent], policy_kwargs: Arguments) -> tuple[Settings, Settings]:
     """Returns ``policy_kwargs`` as rejeu takes them, and the hyperparameters that they contain."""
     config = agent_class.algorithm.Config
     fields, names = (validation.field_names(owner) for owner in (config.policy_kwargs_class, config))
-    shape: dict[str, Any] = {}
-    others: dict[str, Any] = {}
+    shape: Settings = {}
+    others: Settings = {}
     for key, value in policy_kwargs.items():
         if key in ("features_extractor_class", "optimizer_class", "features_extractor_kwargs", "optimizer_kwargs"):
             continue
@@ -147,7 +148,7 @@ def shape_of(agent_class: type[Agent], policy_kwargs: Mapping[str, Any]) -> tupl
     )
 
 
-def unsupported(name: str, value: Any, effect: str = "has no effect") -> None:
+def unsupported(name: str, value: object, effect: str = "has no effect") -> None:
     """Warns that a setting of Stable-Baselines3 is not followed."""
     warnings.warn(f"{name}={value!r} {effect} in rejeu; see docs/coming-from-sb3.md", UserWarning, stacklevel=5)
 

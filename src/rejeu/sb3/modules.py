@@ -43,7 +43,7 @@ def n_shared(path: str, second: str) -> int:
     return len([*takewhile(lambda pair: pair[0] == pair[1], pairs)])
 
 
-def define(path: str, names: Mapping[str, Any], *others: str) -> None:
+def define(path: str, names: Mapping[str, object], *others: str) -> None:
     """Makes names importable from the module ``path``, which has no file of its own. Its parents must exist.
 
     Args:

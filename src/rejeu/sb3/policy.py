@@ -23,6 +23,7 @@ from gymnasium import spaces
 from rejeu.core import spaces as rejeu_spaces
 from rejeu.core.distributions import TanhNormal
 from rejeu.core.spaces import as_batch
+from rejeu.core.types import Action, AnyArray, Observation, PyTree
 from rejeu.sb3.common.preprocessing import maybe_transpose
 from rejeu.sb3.common.utils import Tensor, is_vectorized_observation
 
@@ -76,7 +77,7 @@ class BaseModel:
     """Function of path and device that returns an agent; set by :mod:`rejeu.sb3.algorithms`."""
 
     def __init__(
-        self, observation_space: gym.Space, action_space: gym.Space, lr_schedule: Any = None, **settings: Any
+        self, observation_space: gym.Space, action_space: gym.Space, lr_schedule: object = None, **settings: Any
     ) -> None:
         self.observation_space, self.action_space = observation_space, action_space
         self.settings = settings
@@ -104,7 +105,7 @@ class BaseModel:
         arrays = self.model.get_parameters()["policy"].items()
         return {name: array for name, array in arrays if self.fields & {*name.split(".")}}
 
-    def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True) -> None:
+    def load_state_dict(self, state_dict: Mapping[str, object], strict: bool = True) -> None:
         """Sets parameters.
 
         Raises:
@@ -140,7 +141,7 @@ class BaseModel:
         self.model.save(path)
 
     @classmethod
-    def load(cls, path: str | Path, device: Any = "auto") -> Any:
+    def load(cls, path: str | Path, device: object = "auto") -> Any:
         """Returns the view of the agent in a file that :meth:`save` wrote."""
         return cls.of(cls.load_agent(path, device), cls.fields)
 
@@ -155,11 +156,11 @@ class BaseModel:
         """Returns itself."""
         return self
 
-    def to(self, device: Any) -> Self:
+    def to(self, device: object) -> Self:
         """Returns itself: an agent stays on the device that it was made for."""
         return self
 
-    def is_vectorized_observation(self, observation: Any) -> bool:
+    def is_vectorized_observation(self, observation: Observation) -> bool:
         """Returns whether an observation is a batch; images may have their channels first or last."""
         if isinstance(self.observation_space, spaces.Dict):
             parts = self.observation_space.spaces.items()
@@ -173,22 +174,26 @@ class BaseModel:
         """What maps observations to features: of PPO and A2C the policy's, of several critics the first one's."""
         return FeaturesExtractor.of(self.model, self.fields)
 
-    def extract_features(self, obs: Any, features_extractor: Any = None) -> np.ndarray:
+    def extract_features(self, obs: Observation, features_extractor: Any = None) -> np.ndarray:
         """Returns the features of a batch of observations, ``(batch, features_dim)``."""
         return (features_extractor or self.features_extractor)(obs)
 
-    def obs_to_tensor(self, observation: Any) -> tuple[Any, bool]:
+    def obs_to_tensor(self, observation: Observation) -> tuple[Any, bool]:
         """Returns observations as a batch of arrays, and whether they were a batch."""
         batch, single = as_batch(observation, self.model.observation_space, self.model.obs_leaves)
         return jax.tree.map(Tensor.of, batch), not single
 
     def predict(
-        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
-    ) -> tuple[np.ndarray, Any]:
+        self,
+        observation: Observation,
+        state: PyTree = None,
+        episode_start: AnyArray = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, PyTree]:
         """Returns actions in the environment's range, and the next state of a recurrent policy."""
         return self.model.predict(observation, state, episode_start, deterministic)
 
-    def _batch(self, obs: Any) -> Any:
+    def _batch(self, obs: Observation) -> Observation:
         return self.obs_to_tensor(obs)[0]
 
 
@@ -199,7 +204,7 @@ class FeaturesExtractor(BaseModel):
         """Returns a copy of the parameters as arrays by name."""
         return {name: array for name, array in super().state_dict().items() if "encoder" in name.split(".")}
 
-    def __call__(self, obs: Any) -> np.ndarray:
+    def __call__(self, obs: Observation) -> np.ndarray:
         """Returns the features of a batch of observations, ``(batch, features_dim)``."""
         return Tensor.of(self._encoder()(jax.tree.map(jnp.asarray, self._batch(obs))))
 
@@ -221,7 +226,7 @@ class FeaturesExtractor(BaseModel):
 class Actor(BaseModel):
     """The actor of an off-policy agent."""
 
-    def __call__(self, obs: Any, deterministic: bool = True) -> np.ndarray:
+    def __call__(self, obs: Observation, deterministic: bool = True) -> np.ndarray:
         """Returns actions in [-1, 1] for a batch of observations."""
         action, _ = self.model.predict(self._batch(obs), deterministic=deterministic)
         return Tensor.of(rejeu_spaces.unscale_action(self.action_space, action))
@@ -236,7 +241,7 @@ class Actor(BaseModel):
 class ContinuousCritic(BaseModel):
     """The critics of an off-policy agent for Box actions."""
 
-    def __call__(self, obs: Any, actions: np.ndarray) -> tuple[np.ndarray, ...]:
+    def __call__(self, obs: Observation, actions: np.ndarray) -> tuple[np.ndarray, ...]:
         """Returns the values of actions in [-1, 1] by each critic, ``(batch, 1)`` each."""
         scaled = rejeu_spaces.scale_action(self.action_space, np.asarray(actions))
         values = self.model.q_values(self._batch(obs), scaled, "all")
@@ -244,7 +249,7 @@ class ContinuousCritic(BaseModel):
 
     forward = __call__
 
-    def q1_forward(self, obs: Any, actions: np.ndarray) -> np.ndarray:
+    def q1_forward(self, obs: Observation, actions: np.ndarray) -> np.ndarray:
         """Returns the values of the first critic, ``(batch, 1)``."""
         return self(obs, actions)[0]
 
@@ -252,7 +257,7 @@ class ContinuousCritic(BaseModel):
 class QNetwork(BaseModel):
     """The network of DQN or QR-DQN."""
 
-    def __call__(self, obs: Any) -> np.ndarray:
+    def __call__(self, obs: Observation) -> np.ndarray:
         """Returns the values of all actions, ``(batch, n_actions)``."""
         return Tensor.of(self.model.q_values(self._batch(obs)))
 
@@ -265,11 +270,11 @@ class BasePolicy(BaseModel):
     policy_name: str | None = None
     """Name of the policy; None: by the observations."""
 
-    def __call__(self, obs: Any, deterministic: bool = False) -> Any:
+    def __call__(self, obs: Observation, deterministic: bool = False) -> Any:
         """Returns actions in the environment's range."""
         return self.predict(obs, deterministic=deterministic)[0]
 
-    def forward(self, obs: Any, deterministic: bool = False) -> Any:
+    def forward(self, obs: Observation, deterministic: bool = False) -> Any:
         """Returns what calling it does."""
         return self(obs, deterministic)
 
@@ -321,18 +326,18 @@ class Distribution:
     def __init__(self, distribution: Any = None, widths: tuple[np.ndarray, np.ndarray] | None = None) -> None:
         self.distribution, self.widths = distribution, widths
 
-    def _own(self, actions: Any) -> Any:
+    def _own(self, actions: Action) -> Any:
         actions = np.asarray(actions)
         return actions if self.widths is None else (actions - self.widths[0]) / self.widths[1]
 
-    def _shown(self, actions: Any) -> np.ndarray:
+    def _shown(self, actions: Action) -> np.ndarray:
         actions = np.asarray(actions)
         return Tensor.of(actions if self.widths is None else actions * self.widths[1] + self.widths[0])
 
     def _log_width(self) -> float:
         return 0.0 if self.widths is None else float(np.sum(np.log(self.widths[1])))
 
-    def log_prob(self, actions: Any) -> np.ndarray:
+    def log_prob(self, actions: Action) -> np.ndarray:
         """Returns the log-probabilities or densities of actions, ``(batch,)``, in nats."""
         return Tensor.of(self.distribution.log_prob(self._own(actions))) - self._log_width()
 
@@ -358,24 +363,24 @@ class Distribution:
 class ActorCriticPolicy(BasePolicy):
     """Policy and value of PPO or A2C."""
 
-    def __call__(self, obs: Any, deterministic: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def __call__(self, obs: Observation, deterministic: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Returns actions, their values ``(batch, 1)`` and log-probabilities ``(batch,)``."""
         distribution = self.get_distribution(obs)
         actions = distribution.get_actions(deterministic)
         return actions, self.predict_values(obs), distribution.log_prob(actions)
 
-    def get_distribution(self, obs: Any, action_masks: Any = None) -> Distribution:
+    def get_distribution(self, obs: Observation, action_masks: AnyArray = None) -> Distribution:
         """Returns the distribution of actions, in the environment's range."""
         network = self.model.state.network
         distribution = network.policy(jax.tree.map(jnp.asarray, self.model.with_masks(self._batch(obs), action_masks)))
         return Distribution(distribution, half_widths(self.action_space))
 
-    def predict_values(self, obs: Any) -> np.ndarray:
+    def predict_values(self, obs: Observation) -> np.ndarray:
         """Returns the values of observations, ``(batch, 1)``."""
         return Tensor.of(self.model.value(self._batch(obs)).reshape(-1, 1))
 
     def evaluate_actions(
-        self, obs: Any, actions: np.ndarray, action_masks: Any = None
+        self, obs: Observation, actions: np.ndarray, action_masks: AnyArray = None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
         """Returns values ``(batch, 1)``, log-probabilities of actions and the entropy of the policy, ``(batch,)`` each."""
         distribution = self.get_distribution(obs, action_masks)

@@ -11,13 +11,14 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, SupportsFloat
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
 from rejeu.algorithms.catalog import CATALOG
+from rejeu.core.types import Action, Info, Observation
 from rejeu.sb3.algorithms import ARS, QRDQN, TQC, TRPO, CrossQ, MaskablePPO, RecurrentPPO
 from rejeu.sb3.common.callbacks import EvalCallback
 from rejeu.sb3.common.envs import IdentityEnv
@@ -75,17 +76,17 @@ class TimeFeatureWrapper(gym.Wrapper):
         if isinstance(space, spaces.Dict):
             self.observation_space = spaces.Dict({**space.spaces, "observation": longer})
 
-    def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
+    def reset(self, **kwargs: Any) -> tuple[Observation, Info]:
         self._step = 0
         obs, info = self.env.reset(**kwargs)
         return self._with_time(obs), info
 
-    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+    def step(self, action: Action) -> tuple[Observation, SupportsFloat, bool, bool, Info]:
         self._step += 1
         obs, *others = self.env.step(action)
         return (self._with_time(obs), *others)
 
-    def _with_time(self, obs: Any) -> Any:
+    def _with_time(self, obs: Observation) -> Any:
         time_left = 1.0 if self._test_mode else 1.0 - self._step / self._max_steps
         if isinstance(obs, dict):
             return {**obs, "observation": np.append(obs["observation"], time_left).astype(np.float32)}

@@ -227,7 +227,7 @@ def small(algorithm: str) -> Mapping[str, Any]:
     return next((p.hyperparameters for p in every() if (p.name, p.algorithm) == ("small", algorithm)), {})
 
 
-def default(env_id: str, algorithm: str, hyperparameters: Mapping[str, Any] = MappingProxyType({})) -> Preset:
+def default(env_id: str, algorithm: str, hyperparameters: Mapping[str, object] = MappingProxyType({})) -> Preset:
     """Returns a preset of the algorithm's defaults and ``hyperparameters``, for an environment that has no preset."""
     return Preset(
         env_id=env_id,

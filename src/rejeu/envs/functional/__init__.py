@@ -79,7 +79,7 @@ def make(env_id: str, **kwargs: Any) -> FunctionalEnv:
     return entry_point(**kwargs)
 
 
-def imported(value: Any) -> Any:
+def imported(value: object) -> Any:
     """Returns the object that one of our own strings names, and other values unchanged."""
     return pkgutil.resolve_name(value) if isinstance(value, str) else value
 

@@ -16,11 +16,12 @@ from gymnasium import spaces
 from jax import Array
 
 from rejeu.core.spaces import leaves
+from rejeu.core.types import Observation, PyTree
 from rejeu.envs.functional.protocol import FunctionalEnv, time_is_up
 from rejeu.envs.wrappers import to_space
 
 
-def from_gymnax(env: Any, params: Any = None) -> GymnaxEnv:
+def from_gymnax(env: Any, params: PyTree = None) -> GymnaxEnv:
     """Returns an environment of gymnax without its automatic resets.
 
     The time limit is ``params.max_steps_in_episode``. gymnax 1.0 separates it from terminations; before, they were one flag.
@@ -46,7 +47,7 @@ class GymnaxEnv(FunctionalEnv):
     """An environment of gymnax; see :func:`from_gymnax`."""
 
     env: Any = eqx.field(static=True)
-    params: Any
+    params: PyTree
     max_episode_steps: int | None = eqx.field(static=True)
 
     @property
@@ -59,24 +60,24 @@ class GymnaxEnv(FunctionalEnv):
         with jax.ensure_compile_time_eval():
             return converted(self.env.action_space(self.params))
 
-    def reset(self, key: Array) -> tuple[Any, Any]:
+    def reset(self, key: Array) -> tuple[PyTree, PyTree]:
         obs, state = self.env.reset_env(jax.random.key_data(key), self.params)
         return strong(state), self._cast(obs)
 
-    def step(self, key: Array, state: Any, action: Array) -> tuple[Any, Any, Array, Array, Array]:
+    def step(self, key: Array, state: PyTree, action: Array) -> tuple[PyTree, PyTree, Array, Array, Array]:
         obs, state, reward, terminated, _ = self.env.step_env(jax.random.key_data(key), state, action, self.params)
         obs = self._cast(obs)
         truncated = jnp.asarray(self.env.is_truncated(state, self.params), bool)
         return strong(state), obs, jnp.asarray(reward, float), jnp.asarray(terminated, bool), truncated
 
-    def _cast(self, obs: Any) -> Any:
+    def _cast(self, obs: Observation) -> Observation:
         """Returns an observation with the dtypes of the space, where gymnax is less strict."""
         arrays, tree = jax.tree.flatten(obs)
         dtypes = [leaf.dtype for leaf in leaves(self.observation_space)]
         return jax.tree.unflatten(tree, [jnp.asarray(a, dtype) for a, dtype in zip(arrays, dtypes, strict=True)])
 
 
-def converted(space: Any) -> gym.Space:
+def converted(space: object) -> gym.Space:
     """Returns a space of gymnax as one of Gymnasium."""
     if isinstance(space, gym.Space):
         return space
@@ -128,11 +129,11 @@ class BraxEnv(FunctionalEnv):
     def action_space(self) -> spaces.Box:
         return spaces.Box(-1.0, 1.0, (self.env.action_size,))
 
-    def reset(self, key: Array) -> tuple[BraxState, Any]:
+    def reset(self, key: Array) -> tuple[BraxState, PyTree]:
         inner = strong(self.env.reset(jax.random.key_data(key)))
         return BraxState(inner, jnp.zeros((), jnp.int32)), inner.obs
 
-    def step(self, key: Array, state: BraxState, action: Array) -> tuple[BraxState, Any, Array, Array, Array]:
+    def step(self, key: Array, state: BraxState, action: Array) -> tuple[BraxState, PyTree, Array, Array, Array]:
         inner = strong(self.env.step(state.inner, action))
         after = BraxState(inner, state.time + 1)
         done = inner.done > 0
@@ -143,6 +144,6 @@ class BraxEnv(FunctionalEnv):
         return after, inner.obs, jnp.asarray(inner.reward, float), done, truncated
 
 
-def strong(tree: Any) -> Any:
+def strong(tree: PyTree) -> Any:
     """Returns a tree whose arrays have fixed dtypes: Python numbers have others in the first step than in later ones."""
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.asarray(leaf).dtype), tree)

@@ -10,6 +10,7 @@ import jax
 import numpy as np
 
 from rejeu.core.spaces import plain
+from rejeu.core.types import Action, Info, JsonObject, Observation, PyTree
 from rejeu.envs import functional
 from rejeu.envs.canvas import Drawing, Scene
 from rejeu.envs.functional.protocol import FunctionalEnv
@@ -83,11 +84,11 @@ class GymnasiumEnv(gym.Env[Any, Any]):
         return self.functional.max_episode_steps
 
     @property
-    def state(self) -> Any:
+    def state(self) -> PyTree:
         """The state of the environment, None before the first reset."""
         return self._vector.state_of(0)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Observation, Info]:
         """Starts an episode."""
         super().reset(seed=seed)
         obs = self._vector.reset(seed)
@@ -96,7 +97,7 @@ class GymnasiumEnv(gym.Env[Any, Any]):
         self._show(None)
         return _first(self.observation_space, obs), self._info()
 
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+    def step(self, action: Action) -> tuple[Observation, float, bool, bool, Info]:
         """Steps the environment.
 
         Raises:
@@ -133,7 +134,7 @@ class GymnasiumEnv(gym.Env[Any, Any]):
         """Whether the environment must be reset before the next step."""
         return self.over
 
-    def get_state(self) -> dict[str, Any]:
+    def get_state(self) -> JsonObject:
         """Returns the state, including the random numbers, as arrays, for :meth:`set_state`."""
         return {"arrays": self._vector.snapshot(), "over": self.over, "rng": self.np_random.bit_generator.state}
 
@@ -151,12 +152,12 @@ class GymnasiumEnv(gym.Env[Any, Any]):
         if self.render_mode is not None and state["arrays"] is not None:
             self._scene.states.append(self.state)
 
-    def _info(self) -> dict[str, Any]:
+    def _info(self) -> Info:
         success, mask = self.functional.success(self.state), self.functional.action_mask(self.state)
         info = {} if success is None else {"is_success": bool(success)}
         return info if mask is None else {**info, "action_mask": np.asarray(mask, np.int8)}
 
-    def _show(self, action: Any) -> None:
+    def _show(self, action: Action) -> None:
         """Adds the state to the scene, and draws it in the window if there is one."""
         if self.render_mode is None:
             return
@@ -165,6 +166,6 @@ class GymnasiumEnv(gym.Env[Any, Any]):
             self.render()
 
 
-def _first(space: gym.Space, obs: Any) -> Any:
+def _first(space: gym.Space, obs: Observation) -> Any:
     """Returns the observation of the only environment of a vector, with the declared dtypes, which JAX may not have."""
     return jax.tree.map(lambda batch, declared: np.array(batch[0], declared.dtype), obs, plain(space, space))

@@ -17,6 +17,7 @@ from gymnasium import spaces
 from jax import Array
 
 from rejeu.core.errors import requires
+from rejeu.core.types import Observation, PyTree
 from rejeu.envs.functional.protocol import FunctionalEnv, time_is_up
 
 INVERTED_PENDULUM = """
@@ -67,18 +68,18 @@ class MjxEnv(FunctionalEnv):
         """Returns positions and velocities at the start of an episode."""
 
     @abstractmethod
-    def observe(self, state: State) -> Any:
+    def observe(self, state: State) -> Observation:
         """Returns the observation of a state."""
 
     @abstractmethod
     def judge(self, state: State, action: Array) -> tuple[Array, Array]:
         """Returns reward and ``terminated`` of the step that led to a state."""
 
-    def reset(self, key: Array) -> tuple[State, Any]:
+    def reset(self, key: Array) -> tuple[State, PyTree]:
         state = State(*self.start(key), jnp.zeros((), jnp.int32))
         return state, self.observe(state)
 
-    def step(self, key: Array, state: State, action: Array) -> tuple[State, Any, Array, Array, Array]:
+    def step(self, key: Array, state: State, action: Array) -> tuple[State, PyTree, Array, Array, Array]:
         mjx = import_mjx()
         data = mjx.make_data(self.model).replace(qpos=state.qpos, qvel=state.qvel, ctrl=action)
         data = jax.lax.fori_loop(0, self.n_frames, lambda _, data: mjx.step(self.model, data), data)

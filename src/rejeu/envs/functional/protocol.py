@@ -18,6 +18,8 @@ import gymnasium as gym
 import jax.numpy as jnp
 from jax import Array
 
+from rejeu.core.types import PyTree
+
 
 class FunctionalEnv(eqx.Module):
     """An environment as pure functions. Its fields are its parameters.
@@ -44,7 +46,7 @@ class FunctionalEnv(eqx.Module):
         """The space of the actions that :meth:`step` takes."""
 
     @abstractmethod
-    def reset(self, key: Array) -> tuple[Any, Any]:
+    def reset(self, key: Array) -> tuple[PyTree, PyTree]:
         """Starts an episode.
 
         Args:
@@ -55,7 +57,7 @@ class FunctionalEnv(eqx.Module):
         """
 
     @abstractmethod
-    def step(self, key: Array, state: Any, action: Array) -> tuple[Any, Any, Array, Array, Array]:
+    def step(self, key: Array, state: PyTree, action: Array) -> tuple[PyTree, PyTree, Array, Array, Array]:
         """Steps the environment.
 
         Args:
@@ -68,11 +70,11 @@ class FunctionalEnv(eqx.Module):
             ``truncated`` ``bool[]`` (the time limit was reached). The state must contain what it needs to count the time.
         """
 
-    def success(self, state: Any) -> Array | None:
+    def success(self, state: PyTree) -> Array | None:
         """Returns whether the state is a success, ``bool[]``, or None if the environment does not define success."""
         return None
 
-    def action_mask(self, state: Any) -> Array | None:
+    def action_mask(self, state: PyTree) -> Array | None:
         """Returns which actions are allowed, ``bool (n_actions,)``, or None if all of them always are."""
         return None
 
@@ -85,10 +87,10 @@ class GoalEnv(FunctionalEnv):
     """
 
     @abstractmethod
-    def compute_reward(self, achieved_goal: Array, desired_goal: Array, info: Any = None) -> Array:
+    def compute_reward(self, achieved_goal: Array, desired_goal: Array, info: object = None) -> Array:
         """Returns the rewards ``(...)`` of reaching ``achieved_goal`` when the goal is ``desired_goal``."""
 
-    def compute_terminated(self, achieved_goal: Array, desired_goal: Array, info: Any = None) -> Array | None:
+    def compute_terminated(self, achieved_goal: Array, desired_goal: Array, info: object = None) -> Array | None:
         """Returns where the goals end the episode, ``bool (...)``; None if relabeled steps keep their termination flags."""
         return None
 

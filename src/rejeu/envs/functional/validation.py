@@ -12,6 +12,7 @@ from gymnasium import spaces
 
 from rejeu.core.errors import BadEnvironmentError
 from rejeu.core.spaces import check_goal_space, leaves, narrow, structure
+from rejeu.core.types import Observation, PyTree
 from rejeu.core.validation import whole
 from rejeu.envs.functional.protocol import FunctionalEnv, GoalEnv, of_two_goals
 
@@ -65,7 +66,7 @@ def check(env: FunctionalEnv) -> None:
         )
 
 
-def _traced(method: str, function: Callable[..., Any], *arguments: Any) -> Any:
+def _traced(method: str, function: Callable[..., Any], *arguments: object) -> Any:
     try:
         return jax.eval_shape(function, *arguments)
     except UNTRACEABLE as error:
@@ -85,7 +86,7 @@ def _line(error: Exception) -> str:
     return f"{type(error).__name__}: {reason[:150]}"
 
 
-def _unpack(result: Any, method: str, names: tuple[str, ...]) -> tuple[Any, ...]:
+def _unpack(result: object, method: str, names: tuple[str, ...]) -> tuple[Any, ...]:
     if not isinstance(result, tuple) or len(result) != len(names):
         type_name = "array" if isinstance(result, jax.ShapeDtypeStruct) else type(result).__name__
         got = f"{len(result)} values" if isinstance(result, tuple) else f"one {type_name}"
@@ -93,7 +94,7 @@ def _unpack(result: Any, method: str, names: tuple[str, ...]) -> tuple[Any, ...]
     return result
 
 
-def _check_obs(method: str, space: spaces.Space, obs: Any) -> None:
+def _check_obs(method: str, space: spaces.Space, obs: Observation) -> None:
     """Compares an observation with its space, but accepts 64-bit numbers, which occur with ``jax_enable_x64``."""
     declared = [jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves(space)]
     narrowed = jax.tree.map(lambda a: a if a.dtype == bool else jax.ShapeDtypeStruct(a.shape, narrow(a.dtype)), obs)
@@ -101,7 +102,7 @@ def _check_obs(method: str, space: spaces.Space, obs: Any) -> None:
     _check_tree(method, "observation", narrowed, expected, "as in observation_space")
 
 
-def _check_tree(method: str, name: str, returned: Any, expected: Any, source: str) -> None:
+def _check_tree(method: str, name: str, returned: PyTree, expected: PyTree, source: str) -> None:
     """Compares the structures of trees, in which every array is an asterisk, and the shapes and dtypes of their arrays."""
     structures: list[Any] = [jax.tree.structure(tree) for tree in (returned, expected)]
     if structures[0] != structures[1]:

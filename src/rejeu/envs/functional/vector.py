@@ -18,6 +18,7 @@ from jax import Array
 
 from rejeu.core import prng
 from rejeu.core.spaces import cast, leaves
+from rejeu.core.types import Action, Observation, PyTree
 from rejeu.core.validation import whole
 from rejeu.envs.base import Seed, Step, VectorEnv, success_of
 from rejeu.envs.functional.protocol import FunctionalEnv, GoalEnv, of_two_goals
@@ -34,7 +35,7 @@ class VectorState(eqx.Module):
     """How many keys were taken from each stream, ``int32 (n,)``."""
     env: Any
     """States of the environments, a pytree of arrays ``(n, ...)``."""
-    obs: Any
+    obs: Observation
     """Their observations, a pytree of arrays ``(n, ...)``."""
 
 
@@ -81,7 +82,7 @@ def step_all(
     return after, obs, reward, terminated, truncated, jax.vmap(env.success)(state)
 
 
-def reset_done(env: FunctionalEnv, vstate: VectorState, done: Array) -> tuple[VectorState, Any]:
+def reset_done(env: FunctionalEnv, vstate: VectorState, done: Array) -> tuple[VectorState, PyTree]:
     """Starts new episodes where ``done``, ``bool (n,)``; returns the state and the observations of all environments."""
 
     def fresh(vstate: VectorState) -> VectorState:
@@ -92,7 +93,7 @@ def reset_done(env: FunctionalEnv, vstate: VectorState, done: Array) -> tuple[Ve
     return vstate, vstate.obs
 
 
-def select(mask: Array, new: Any, old: Any) -> Any:
+def select(mask: Array, new: PyTree, old: PyTree) -> PyTree:
     """Returns the rows of ``new`` where ``mask``, ``bool (n,)``, else those of ``old``, for pytrees of ``(n, ...)``."""
     return jax.tree.map(lambda a, b: jnp.where(jnp.expand_dims(mask, range(1, a.ndim)), a, b), new, old)
 
@@ -108,19 +109,19 @@ def split(env: FunctionalEnv) -> tuple[Any, Any]:
     return arrays, (tuple(leaves), tree)
 
 
-def joined(static: tuple[tuple[Any, ...], Any], arrays: Any) -> FunctionalEnv:
+def joined(static: tuple[tuple[Any, ...], Any], arrays: PyTree) -> FunctionalEnv:
     """Returns the environment whose parts :func:`split` returned."""
     leaves, tree = static
     return eqx.combine(arrays, jax.tree.unflatten(tree, leaves))
 
 
 @partial(jax.jit, static_argnums=0)
-def _reset_streams(static: Any, arrays: Any, keys: Array) -> VectorState:
+def _reset_streams(static: PyTree, arrays: PyTree, keys: Array) -> VectorState:
     return reset_streams(joined(static, arrays), keys)
 
 
 @partial(jax.jit, static_argnums=0)
-def _step(static: Any, arrays: Any, vstate: VectorState, action: Any, active: Any) -> Any:
+def _step(static: PyTree, arrays: PyTree, vstate: VectorState, action: Action, active: Any) -> Any:
     after, _, reward, terminated, truncated, success = step_all(joined(static, arrays), vstate, action)
     if active is not None:
         after = select(active, after, vstate)
@@ -130,7 +131,7 @@ def _step(static: Any, arrays: Any, vstate: VectorState, action: Any, active: An
 
 
 @partial(jax.jit, static_argnums=0)
-def _reset_done(static: Any, arrays: Any, vstate: VectorState, done: Any) -> VectorState:
+def _reset_done(static: PyTree, arrays: PyTree, vstate: VectorState, done: Any) -> VectorState:
     return reset_done(joined(static, arrays), vstate, done)[0]
 
 
@@ -181,7 +182,7 @@ class JaxVector(VectorEnv):
         self._arrays, self._static = split(env)
         self._seed = seed
 
-    def reset(self, seed: Seed = None) -> Any:
+    def reset(self, seed: Seed = None) -> Observation:
         seed = self._seed if seed is None else seed
         self._seed = None
         if seed is None and self.state is not None:
@@ -199,7 +200,7 @@ class JaxVector(VectorEnv):
         obs = self._obs = cast(self.observation_space, self._leaves, obs)
         return Step(obs, np.asarray(reward, np.float32), terminated, truncated, success)
 
-    def reset_done(self, done: np.ndarray) -> Any:
+    def reset_done(self, done: np.ndarray) -> Observation:
         self.state = _reset_done(self._static, self._arrays, self._running(), np.asarray(done, bool))
         return self._observe()
 
@@ -215,7 +216,7 @@ class JaxVector(VectorEnv):
             return None
         return [np.asarray(leaf) for leaf in arrays]
 
-    def restore(self, saved: Any, obs: Any) -> list[int]:
+    def restore(self, saved: object, obs: Observation) -> list[int]:
         template = jax.eval_shape(lambda: reset_all(self.env, jax.random.key(0), self.n_envs))
         expected, tree = jax.tree.flatten(template)
         if not isinstance(saved, list) or len(saved) != len(expected):
@@ -246,7 +247,7 @@ class JaxVector(VectorEnv):
             raise gym.error.ResetNeeded("call reset() before step()")
         return self.state
 
-    def _observe(self) -> Any:
+    def _observe(self) -> Observation:
         self._obs = cast(self.observation_space, self._leaves, jax.tree.map(np.asarray, self._running().obs))
         return self._obs
 

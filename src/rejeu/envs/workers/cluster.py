@@ -14,7 +14,7 @@ import threading
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any
+from types import ModuleType
 
 from rejeu.core.errors import ClusterError, MissingExtra, installed
 
@@ -36,7 +36,7 @@ _is_local = False
 class Connection:
     """The use of a Ray cluster by one part of a program. Mutable; see :func:`connect`."""
 
-    def __init__(self, ray: Any) -> None:
+    def __init__(self, ray: ModuleType) -> None:
         self.ray = ray
         """The module ``ray``."""
         self.is_local = _is_local
@@ -111,7 +111,7 @@ def current_address() -> str | None:
     return address or None
 
 
-def as_ray_resolves(address: str, ray: Any) -> str:
+def as_ray_resolves(address: str, ray: ModuleType) -> str:
     """Returns an address as Ray uses it, which replaces the loopback address by that of this machine in the network."""
     host, _, port = address.rpartition(":")
     return f"{ray.util.get_node_ip_address()}:{port}" if host in ("127.0.0.1", "localhost") else address

@@ -79,7 +79,7 @@ class Worker(ABC):
     def end(self) -> str:
         """Terminates the worker immediately, and returns how it ended as text. Further calls return the same."""
 
-    def ask(self, request: str, *arguments: Any) -> None:
+    def ask(self, request: str, *arguments: object) -> None:
         """Sends a request. The answer must be fetched with :meth:`answer`."""
         name = getattr(arguments[0], "__name__", request) if request == "call" else request
         self.asked = name.removesuffix("_and_reset")

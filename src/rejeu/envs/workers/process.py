@@ -21,6 +21,7 @@ from gymnasium.vector.utils import CloudpickleWrapper
 
 from rejeu.core.errors import BadEnvironmentError
 from rejeu.core.spaces import leaves
+from rejeu.core.types import Action, Observation, Settings
 from rejeu.envs import snapshot, validation
 from rejeu.envs.workers import cluster
 
@@ -47,7 +48,7 @@ class WorkerDescription(NamedTuple):
 
     observation_space: gym.Space
     action_space: gym.Space
-    metadata: dict[str, Any]
+    metadata: dict[str, object]
     render_mode: str | None
 
 
@@ -85,7 +86,7 @@ Handover = Callable[[gym.Space], Encode]
 """How a worker hands over observations of a space; sent to the worker."""
 
 
-def in_shared_memory(buffers: Sequence[Any], n_envs: int, number: int, space: gym.Space) -> Encode:
+def in_shared_memory(buffers: Sequence[object], n_envs: int, number: int, space: gym.Space) -> Encode:
     """Writes observations of environment ``number`` into the memory of :func:`rows`."""
     return partial(validation.make_writer(space, rows(space, buffers, n_envs)), number)
 
@@ -95,7 +96,7 @@ def as_leaves(space: gym.Space) -> Encode:
     stores = [np.zeros((1, *leaf.shape), leaf.dtype) for leaf in leaves(space)]
     put = validation.make_writer(space, stores)
 
-    def encode(obs: Any) -> list[np.ndarray]:
+    def encode(obs: Observation) -> list[np.ndarray]:
         put(0, obs)
         return [np.array(store[0]) for store in stores]
 
@@ -248,7 +249,7 @@ def seed_globals(seed: int | None) -> None:
 
 
 def step_and_reset(
-    env: gym.Env, encode: Encode, action: Any
+    env: gym.Env, encode: Encode, action: Action
 ) -> tuple[Any, float, bool, bool, dict[str, Any], Any, dict[str, Any]]:
     """Steps an environment, and resets it if the episode has ended.
 
@@ -269,6 +270,6 @@ def step_and_reset(
     return encode(obs), reward, terminated, truncated, info, final, reset_info
 
 
-def call_method(env: gym.Env, name: str, arguments: tuple[Any, ...], keywords: dict[str, Any]) -> Any:
+def call_method(env: gym.Env, name: str, arguments: tuple[Any, ...], keywords: Settings) -> Any:
     """Calls a method, looked up through the wrappers, and returns its result."""
     return env.get_wrapper_attr(name)(*arguments, **keywords)

@@ -23,6 +23,7 @@ from gymnasium.vector.utils import CloudpickleWrapper
 
 from rejeu.core import validation
 from rejeu.core.errors import WorkerError
+from rejeu.core.types import Settings
 from rejeu.envs.workers import cluster, process
 from rejeu.envs.workers.pool import LOOK_SECONDS, Starter, Worker, seconds_until
 from rejeu.envs.workers.process import TOKEN_BYTES, RemoteWorker
@@ -63,7 +64,7 @@ class RayOptions:
         }
         validation.assign(self, resources=resources)
 
-    def reserved(self, is_local: bool) -> dict[str, Any]:
+    def reserved(self, is_local: bool) -> Settings:
         """Returns the reservation as options of a Ray actor; ``is_local``: on a cluster started for this process."""
         return {
             "num_cpus": (0.0 if is_local else 1.0) if self.num_cpus is None else self.num_cpus,
@@ -78,7 +79,7 @@ class Actors(Starter):
 
     advice = "backend='gymnasium-async' uses processes of this machine"
 
-    def __init__(self, options: Mapping[str, Any]) -> None:
+    def __init__(self, options: Mapping[str, object]) -> None:
         """Connects to the cluster, and listens for its workers.
 
         Args:

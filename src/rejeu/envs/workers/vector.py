@@ -13,6 +13,7 @@ import numpy as np
 
 from rejeu.core.errors import BadEnvironmentError, DivergedError, WorkerError
 from rejeu.core.spaces import leaves, rows, structure
+from rejeu.core.types import Info, Observation
 from rejeu.envs import goals as goals_module, snapshot, validation
 from rejeu.envs.base import Seed, Step, VectorEnv, describe_spec, each_seed, success_of
 from rejeu.envs.goals import GoalFunctions
@@ -91,12 +92,12 @@ class InWorkers(VectorEnv):
             partial, process.in_shared_memory, buffers, self.n_envs
         )  # without the vector, which may be let go
 
-    def reset(self, seed: Seed = None) -> Any:
+    def reset(self, seed: Seed = None) -> Observation:
         seed = self._seed if seed is None else seed
         self._seed = None
         return self._reset(dict(enumerate(each_seed(seed, self.n_envs))))
 
-    def reset_done(self, done: np.ndarray) -> Any:
+    def reset_done(self, done: np.ndarray) -> Observation:
         return self._reset(dict.fromkeys(np.flatnonzero(done).tolist()))
 
     def _reset(self, seeds: Mapping[int, int | None]) -> Any:
@@ -134,7 +135,7 @@ class InWorkers(VectorEnv):
     def _step_each(self, indices: Sequence[int], action: np.ndarray) -> Step:
         reward = np.zeros(self.n_envs, np.float32)
         terminated, truncated = np.zeros(self.n_envs, bool), np.zeros(self.n_envs, bool)
-        info: list[dict[str, Any]] = [{}] * self.n_envs
+        info: list[Info] = [{}] * self.n_envs
         self.n_steps += 1
         lost = {i: self._lost.pop(i) for i in indices if i in self._lost}
         action = rows(action)
@@ -172,7 +173,7 @@ class InWorkers(VectorEnv):
         where = f"environments {', '.join(map(str, failed))}" if len(failed) > 1 else f"environment {first}"
         raise WorkerError(f"{where} failed in a worker process, at a {method}:\n{failure.trace}")
 
-    def infos(self, begun: bool = False) -> list[dict[str, Any]]:
+    def infos(self, begun: bool = False) -> list[Info]:
         return [self._reset_infos[i] for i in range(self.n_envs)] if begun else super().infos()
 
     def call(self, name: str) -> list[Any]:
@@ -195,7 +196,7 @@ class InWorkers(VectorEnv):
         is_supported = all(isinstance(state, list) for state in replies.values())  # None: not supported
         return [replies[i] for i in range(self.n_envs)] if is_supported else None
 
-    def restore(self, saved: Any, obs: Any) -> list[int]:
+    def restore(self, saved: Any, obs: Observation) -> list[int]:
         snapshot.check_count(saved, self.n_envs)
         replies = self.workers.ask({i: ("restore", state) for i, state in enumerate(saved)})
         for i, reply in replies.items():

@@ -91,7 +91,7 @@ def run_command(argv: Sequence[str]) -> int:
         return 2
 
 
-def show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
+def show_warning(message: Warning | str, *_: object, **__: Any) -> None:
     """Prints a warning on one line, without the line of code that it comes from."""
     print(f"warning: {errors.one_line(message).removeprefix('WARN: ')}", file=sys.stderr, flush=True)
 
@@ -128,7 +128,7 @@ def messages(is_json: bool) -> Iterator[Callable[[Any], None]]:
         yield lambda result: print(dumps(result), file=output, flush=True)
 
 
-def dumps(value: Any) -> str:
+def dumps(value: object) -> str:
     """Returns a value as indented JSON text. NaN and infinities become null, since JSON has none.
 
     >>> import math, pathlib
@@ -143,7 +143,7 @@ def dumps(value: Any) -> str:
     return msgspec.json.format(msgspec.json.encode(value, enc_hook=plain), indent=2).decode()
 
 
-def plain(value: Any) -> Any:
+def plain(value: object) -> Any:
     """Returns a NumPy array or number as Python's, a mapping as a dict, and anything else as text."""
     import numpy as np  # takes longer than all that --help needs
 

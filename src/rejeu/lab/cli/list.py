@@ -8,6 +8,7 @@ from typing import Any
 from rejeu.agents import presets
 from rejeu.agents.presets import Preset
 from rejeu.algorithms.catalog import CATALOG
+from rejeu.core.types import JsonObject
 from rejeu.lab.cli.commands import List
 
 
@@ -52,7 +53,7 @@ def described(is_extended: bool) -> dict[str, str]:
     return {name: entry.summary for name, entry in CATALOG.items()}
 
 
-def as_dict(preset: Preset) -> dict[str, Any]:
+def as_dict(preset: Preset) -> JsonObject:
     """Returns a preset with its measured result, which is None if there is none."""
     fields = {name: value for name, value in vars(preset).items() if name not in ("backend", "success_threshold")}
     return {**fields, "result": presets.find_result(preset.env_id, preset.algorithm, preset.name)}

@@ -12,6 +12,7 @@ from rejeu.agents.exporting import export
 from rejeu.checkpoints.run_folder import RunFolder, find_model
 from rejeu.core import devices
 from rejeu.core.errors import CheckpointError
+from rejeu.core.types import Action, JsonObject
 from rejeu.export import FORMATS, target_of
 from rejeu.lab.cli.commands import Evaluate, Export, Import, Play, Pull, Push, Record, Watch, Which
 from rejeu.lab.runs.config import value
@@ -150,7 +151,7 @@ def agent_of(option: str, run: Path, best_or_last: Which, environment: Environme
     return load(model, device=device)
 
 
-def parse_keys(assignments: Iterable[str]) -> dict[str, Any]:
+def parse_keys(assignments: Iterable[str]) -> dict[str, Action]:
     """Returns the action of each combination of keys.
 
     Raises:
@@ -168,7 +169,7 @@ def parse_keys(assignments: Iterable[str]) -> dict[str, Any]:
     return result
 
 
-def as_dict(game: Game) -> dict[str, Any]:
+def as_dict(game: Game) -> JsonObject:
     """Returns the players with their scores."""
     facts = [(player.name, len(player.scores), player.mean, player.best, player.scores) for player in game.players]
     names = ("name", "episodes", "mean", "best", "scores")

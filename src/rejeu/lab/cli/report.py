@@ -12,6 +12,7 @@ import numpy as np
 
 from rejeu.checkpoints.run_folder import RunFolder, find_model
 from rejeu.core import atomic
+from rejeu.core.types import Observation
 from rejeu.core.validation import whole
 from rejeu.lab.cli.commands import Report
 from rejeu.lab.reporting.report import write_report
@@ -63,7 +64,7 @@ def replay(path: Path, arguments: Report) -> None:
     atomic.write(RunFolder(path).replays, "".join(",".join(map(str, row)) + "\n" for row in [head, *rows]))
 
 
-def goal_of(obs: Any) -> list[float]:
+def goal_of(obs: Observation) -> list[float]:
     """Returns the first two numbers of the goal in an observation, empty if there is none."""
     goal = obs.get("desired_goal") if isinstance(obs, Mapping) else None
     values = [] if goal is None else np.ravel(goal)[:2].astype(float).tolist()

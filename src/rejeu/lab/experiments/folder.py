@@ -16,7 +16,7 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, TypeVar
+from typing import Annotated, NamedTuple, TypeVar
 
 from msgspec import Meta
 
@@ -60,7 +60,7 @@ class Resources:
         assign(self, memory=None if self.memory is None else memory_bytes(self.memory))
 
 
-def memory_bytes(value: Any) -> int:
+def memory_bytes(value: object) -> int:
     """Returns an amount of memory in bytes.
 
     Raises:

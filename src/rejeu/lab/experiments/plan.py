@@ -131,7 +131,7 @@ def read_plan(plan: str | Path | Mapping[str, Any]) -> tuple[Plan, str | None]:
     return parse(content, str(path)), text
 
 
-def parse(content: Mapping[str, Any], plan: str) -> Plan:
+def parse(content: Mapping[str, object], plan: str) -> Plan:
     """Returns the jobs of a plan: environments x algorithms x settings x seeds.
 
     Args:
@@ -223,7 +223,7 @@ def read_run(env_id: str, kwargs: Kwargs, options: Kwargs) -> tuple[RunConfig, d
     return run, files
 
 
-def read_algorithms(value: Any) -> tuple[str, ...]:
+def read_algorithms(value: object) -> tuple[str, ...]:
     """Returns the names of algorithms.
 
     Raises:
@@ -295,7 +295,7 @@ def find_spaces(run: RunConfig) -> tuple[gym.Space, gym.Space]:
         env.close()
 
 
-def read_hyperparameters(algorithm: str, base: Mapping[str, Any], values: Mapping[str, Any]) -> Any:
+def read_hyperparameters(algorithm: str, base: Mapping[str, object], values: Mapping[str, object]) -> Any:
     """Returns the configuration of an algorithm from ``base`` and ``values``, as ``rejeu train`` would.
 
     Raises:

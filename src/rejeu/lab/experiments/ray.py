@@ -14,10 +14,12 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from types import ModuleType
+from typing import TYPE_CHECKING, NamedTuple
 
 from rejeu.core import atomic, hardware
 from rejeu.core.errors import ClusterError
+from rejeu.core.types import Settings
 from rejeu.envs.workers import cluster
 from rejeu.lab.runs.config import read_task, write_task
 from rejeu.lab.runs.process import LOST, THREADS, Process
@@ -105,7 +107,7 @@ def check_node(there: dict[str, str], is_seen: bool, where: str, versions: dict[
 class RayRun:
     """A run on a cluster. Mutable."""
 
-    def __init__(self, ray: Any, result: Any, log: Path, stop: Path) -> None:
+    def __init__(self, ray: ModuleType, result: object, log: Path, stop: Path) -> None:
         self._ray, self._result, self._log, self._stop = ray, result, log, stop
         self._cancel_at = math.inf
 
@@ -260,9 +262,9 @@ def write_marker(folder: Path) -> str:
     return str(path)
 
 
-def requested(resources: Resources) -> dict[str, Any]:
+def requested(resources: Resources) -> Settings:
     """Returns resources as Ray's options."""
-    options: dict[str, Any] = {"num_cpus": resources.cpus, "num_gpus": resources.gpus}
+    options: Settings = {"num_cpus": resources.cpus, "num_gpus": resources.gpus}
     options |= {} if resources.memory is None else {"memory": resources.memory}
     return {**options, "resources": resources.custom} if resources.custom else options
 

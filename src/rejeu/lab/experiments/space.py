@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from rejeu.algorithms.search import Choice, Dimension, Integers, LogUniform, NearOne, Range, SearchSpace, Uniform
 from rejeu.core.records import Malformed, parse_json
+from rejeu.core.types import Settings
 from rejeu.core.validation import with_value
 
 if TYPE_CHECKING:
@@ -84,13 +85,13 @@ def number(text: str) -> int | float:
         return float(text)
 
 
-def suggested(trial: BaseTrial, space: SearchSpace) -> dict[str, Any]:
+def suggested(trial: BaseTrial, space: SearchSpace) -> Settings:
     """Returns the values of a space's hyperparameters in a trial of Optuna; a new trial samples them.
 
     Raises:
         ValueError: if a trial that is recorded does not have all of them.
     """
-    values: dict[str, Any] = {}
+    values: Settings = {}
     for name, dimension in space.items():
         if isinstance(dimension, Choice):
             labels = [label(value) for value in dimension.values]
@@ -107,12 +108,12 @@ def suggested(trial: BaseTrial, space: SearchSpace) -> dict[str, Any]:
     return values
 
 
-def parameters(space: SearchSpace, config: Mapping[str, Any]) -> dict[str, Any]:
+def parameters(space: SearchSpace, config: Mapping[str, object]) -> Settings:
     """Returns Optuna's parameters for those hyperparameters of a configuration, as JSON, that lie in the space.
 
     The value of a schedule is its start.
     """
-    params: dict[str, Any] = {}
+    params: Settings = {}
     for name, dimension in space.items():
         value: Any = config
         for key in name.split("."):
@@ -130,7 +131,7 @@ def parameters(space: SearchSpace, config: Mapping[str, Any]) -> dict[str, Any]:
     return params
 
 
-def label(value: Any) -> str | int | float | bool | None:
+def label(value: object) -> str | int | float | bool | None:
     """Returns a value as a category of Optuna: itself, or its JSON text.
 
     >>> label([64, 64]), label("tanh")
@@ -139,7 +140,7 @@ def label(value: Any) -> str | int | float | bool | None:
     return value if value is None or isinstance(value, str | int | float | bool) else json.dumps(value)
 
 
-def applied(hyperparameters: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+def applied(hyperparameters: Mapping[str, object], values: Mapping[str, object]) -> Settings:
     """Returns hyperparameters with some values replaced; names may be dotted. A schedule keeps its shape.
 
     >>> applied({"learning_rate": "lin_1e-3", "gamma": 0.9}, {"learning_rate": 0.01, "policy_kwargs.net_arch": [8]})
@@ -151,7 +152,7 @@ def applied(hyperparameters: Mapping[str, Any], values: Mapping[str, Any]) -> di
     return changed
 
 
-def rescaled(old: Any, value: Any) -> Any:
+def rescaled(old: object, value: object) -> Any:
     """Returns the schedule ``old`` with the starting value ``value``; just ``value`` if it is no schedule."""
     if isinstance(old, str) and old.startswith("lin_"):
         return f"lin_{value!r}"

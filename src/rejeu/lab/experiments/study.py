@@ -30,6 +30,7 @@ from rejeu.checkpoints.run_folder import File
 from rejeu.core import atomic
 from rejeu.core.errors import CheckpointError, requires
 from rejeu.core.records import brief, json_text
+from rejeu.core.types import JsonObject
 from rejeu.lab.experiments import space as spaces, study_plan as plans
 from rejeu.lab.experiments.folder import begin
 from rejeu.lab.experiments.study_plan import StudyPlan
@@ -215,7 +216,7 @@ class Study:
         trials = self.trials()
         return len(trials) >= self.plan.trials and all(trial.state.is_finished() for trial in trials)
 
-    def record(self, trial: FrozenTrial) -> dict[str, Any]:
+    def record(self, trial: FrozenTrial) -> JsonObject:
         """Returns a trial as plain values, those of a file that may be damaged."""
         with readable(self.folder.journal):
             evaluations = {step: float(value) for step, value in sorted(trial.intermediate_values.items())}

@@ -19,6 +19,7 @@ from rejeu.algorithms.search import HINDSIGHT, Dimension, SearchSpace
 from rejeu.core import validation
 from rejeu.core.errors import CheckpointError
 from rejeu.core.records import Seed, convert, json_text
+from rejeu.core.types import Settings
 from rejeu.lab.experiments import folder as folders, space as spaces
 from rejeu.lab.runs.config import RunConfig
 
@@ -51,11 +52,11 @@ class StudyPlan:
     Its hyperparameters are those of the given preset or of rejeu's; empty for the algorithm's defaults."""
     env_argument: str = ""
     """How the environment was named on the command line, if not by its id; never imported because a file says so."""
-    env_kwargs: dict[str, Any] = field(default_factory=dict)
+    env_kwargs: Settings = field(default_factory=dict)
     """Keyword arguments of the environment."""
     wrappers: tuple[str, ...] = ()
     """Names of its wrappers, innermost first."""
-    fixed: dict[str, Any]
+    fixed: Settings
     """Hyperparameters of every trial, before those that are searched: of the default, with what the user set."""
     space: dict[str, str]
     """Where the others are searched, as ``--search`` takes it."""
@@ -89,7 +90,7 @@ class StudyPlan:
         return {name: spaces.dimension_of(text) for name, text in self.space.items()}
 
     @property
-    def configuration(self) -> dict[str, Any]:
+    def configuration(self) -> Settings:
         """All hyperparameters before those that are searched, as JSON."""
         config_class = AGENTS[self.default.algorithm].algorithm.Config
         return configs.to_json(validation.build(config_class, self.fixed))
@@ -114,7 +115,7 @@ class StudyPlan:
     def _numbers(self, n: int, *key: int) -> list[int]:
         return np.random.SeedSequence([self.seed, *key]).generate_state(max(n, 1)).tolist()[:n]
 
-    def preset(self, hyperparameters: Mapping[str, Any], source: str) -> Preset:
+    def preset(self, hyperparameters: Mapping[str, object], source: str) -> Preset:
         """Returns a preset with these hyperparameters and what all trainings of the study have in common."""
         return dataclasses.replace(self.default, hyperparameters=hyperparameters, source=source)
 
@@ -124,7 +125,7 @@ def make(
     algorithm: str | None = None,
     *,
     preset: Preset | None = None,
-    fixed: Mapping[str, Any] | None = None,
+    fixed: Mapping[str, object] | None = None,
     search: SearchSpace | None = None,
     only: tuple[str, ...] = (),
     steps: int | None = None,
@@ -149,7 +150,7 @@ def make(
     space = choose_space(base.algorithm, values, fixed, search or {}, only)
     total = validation.whole("steps", steps or base.total_steps, least=1)
     settings = {key: value for key, value in others.items() if value is not None}
-    usual: dict[str, Any] = {"name": "", "evaluate_every": max(total // EVALUATIONS, 1)}
+    usual: Settings = {"name": "", "evaluate_every": max(total // EVALUATIONS, 1)}
     if settings.get("env_kwargs") or settings.get("wrappers"):
         usual["backend"] = "auto"
     of_default = usual | {key: settings.pop(key) for key in OF_DEFAULT & settings.keys()}
@@ -166,7 +167,11 @@ def make(
 
 
 def choose_space(
-    algorithm: str, values: Mapping[str, Any], fixed: Mapping[str, Any], search: SearchSpace, only: tuple[str, ...]
+    algorithm: str,
+    values: Mapping[str, object],
+    fixed: Mapping[str, object],
+    search: SearchSpace,
+    only: tuple[str, ...],
 ) -> SearchSpace:
     """Returns the search space of a study, in which every extreme value is known to be valid.
 
@@ -189,7 +194,7 @@ def choose_space(
     return space
 
 
-def is_set(fixed: Mapping[str, Any], name: str) -> bool:
+def is_set(fixed: Mapping[str, object], name: str) -> bool:
     """Returns whether the user set the hyperparameter of a dotted name."""
     head, _, rest = name.partition(".")
     inner = fixed.get(head)
@@ -210,7 +215,7 @@ def read(path: Path) -> StudyPlan:
     return folders.read(path, StudyPlan, MAX_BYTES, check)
 
 
-def check_ends(config_class: type, values: Mapping[str, Any], space: SearchSpace) -> None:
+def check_ends(config_class: type, values: Mapping[str, object], space: SearchSpace) -> None:
     """Raises ``ValueError`` or ``TypeError`` if an extreme value of a space is invalid, where the others are ``values``."""
     for name, dimension in space.items():
         for value in dimension.ends():

@@ -16,6 +16,7 @@ from typing import Any
 from rejeu.agents import modules_of
 from rejeu.checkpoints.run_folder import dated
 from rejeu.core.interrupt import Interrupt
+from rejeu.core.types import JsonObject
 from rejeu.lab.experiments import display
 from rejeu.lab.experiments.folder import SweepFolder, open_folder, read_folder
 from rejeu.lab.experiments.plan import read_plan
@@ -77,7 +78,7 @@ class SweepResult:
         """Returns how many jobs are in each state."""
         return count(work.state for work in self.outcomes)
 
-    def table(self) -> list[dict[str, Any]]:
+    def table(self) -> list[JsonObject]:
         """Returns one row for each job, ready for ``pandas.DataFrame``."""
         return [
             {

@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rejeu import envs
 from rejeu.agents import modules_of, presets
@@ -19,6 +19,7 @@ from rejeu.algorithms.search import SearchSpace
 from rejeu.checkpoints.run_folder import dated
 from rejeu.core.errors import MissingExtra
 from rejeu.core.interrupt import Interrupt
+from rejeu.core.types import Arguments, JsonObject
 from rejeu.lab.experiments import display, study as studies, study_plan as plans
 from rejeu.lab.experiments.final import Final, compare_with_default
 from rejeu.lab.experiments.search import Search
@@ -63,7 +64,7 @@ class Result:
         """The winner as a preset."""
         return None if self.best is None else presets.read(self.study.folder.preset)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """Returns everything as plain values."""
         final, default = self.final or Final("not compared"), self.study.plan.default
         return {
@@ -89,9 +90,9 @@ def tune(
     folder: str | Path | None = None,
     workers: int | None = None,
     verbose: int = 1,
-    env_kwargs: Mapping[str, Any] | None = None,
+    env_kwargs: Arguments | None = None,
     preset: Preset | None = None,
-    hyperparameters: Mapping[str, Any] | None = None,
+    hyperparameters: Mapping[str, object] | None = None,
     search: SearchSpace | None = None,
     only: tuple[str, ...] = (),
     steps: int | None = None,
@@ -255,7 +256,7 @@ def line(study: Study, trial: FrozenTrial) -> str:
     return f"trial {trial.number:>3}  {record['state']}{at}  {study.plan.measure} {number(record['value'])}  {values}"
 
 
-def short(value: Any) -> str:
+def short(value: object) -> str:
     """Returns the value of a hyperparameter in a few digits.
 
     >>> short(0.00123456789), short([64, 64])

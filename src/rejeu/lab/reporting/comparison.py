@@ -15,6 +15,7 @@ import numpy as np
 
 from rejeu.core import atomic, validation
 from rejeu.core.records import shown
+from rejeu.core.types import JsonObject
 from rejeu.lab.reporting.grouping import (
     FINAL,
     N_POINTS,
@@ -30,7 +31,7 @@ from rejeu.lab.reporting.grouping import (
 from rejeu.lab.reporting.run_list import read_all
 from rejeu.lab.runs.read import RunSummary
 from rejeu.logs import statistics
-from rejeu.logs.charts import GROUP_COLORS, group_chart
+from rejeu.logs.charts import GROUP_COLORS, Chart, group_chart
 from rejeu.logs.formatting import cell, counted, csv_text, markdown_table, number
 
 if TYPE_CHECKING:
@@ -123,7 +124,7 @@ class Comparison:
             return "final score: mean return of the last evaluation"
         return f"final score: mean return of the training episodes in the last {FINAL:.0%} of what is compared"
 
-    def table(self) -> list[dict[str, Any]]:
+    def table(self) -> list[JsonObject]:
         """Returns one row for each group, ready for ``pandas.DataFrame``."""
         return [
             {
@@ -180,7 +181,7 @@ class Comparison:
             for x, point in zip(group.x.tolist(), group.curve.T.tolist(), strict=True)
         )
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """Returns everything as JSON values, except that unknown numbers are NaN."""
         return {
             "by": self.by,
@@ -403,7 +404,7 @@ def coverage_notes(n_runs: Sequence[int]) -> list[str]:
     return [*(notes if single else []), *(few if shares else [])]
 
 
-def strata(members: Sequence[Curve], values: Sequence[Any]) -> tuple[np.ndarray, ...]:
+def strata(members: Sequence[Curve], values: Sequence[object]) -> tuple[np.ndarray, ...]:
     """Returns one value of each run as arrays, one for each environment."""
     by_env: dict[str, list[Any]] = {}
     for curve, value in zip(members, values, strict=True):
@@ -479,7 +480,7 @@ def page_of(comparison: Comparison) -> str:
 
     envs = list(dict.fromkeys(group.env_id for group in comparison.groups))
     labels = list(dict.fromkeys(group.label for group in comparison.groups))
-    charts: dict[str, Any] = {}
+    charts: dict[str, Chart] = {}
     entries: dict[str, list[page.Entry]] = {"curve": [], "profile": []}
     for i, env in enumerate(envs):
         for form in entries:

@@ -74,7 +74,7 @@ def env_label(run: RunSummary) -> str:
     return shortened(f"{run.config.env}({kwargs})" if kwargs else run.config.env)
 
 
-def whole_text(value: Any) -> str:
+def whole_text(value: object) -> str:
     """Returns a value of a configuration as text, empty for None."""
     if value is None:
         return ""

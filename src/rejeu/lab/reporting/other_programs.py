@@ -10,7 +10,7 @@ import os
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 import numpy as np
 
@@ -209,7 +209,7 @@ def table_of(values: Mapping[str, Mapping[int, tuple[float, float]]]) -> Table:
     steps = sorted({step for column in values.values() for step in column})
     steps = steps[:: 1 + len(steps) * len(values) // MAX_CELLS]
     row = {step: i for i, step in enumerate(steps)}
-    columns: dict[str, Any] = {"step": np.array(steps, np.float64)}
+    columns: dict[str, np.ndarray] = {"step": np.array(steps, np.float64)}
     wall = np.full(len(steps), np.nan)
     for name, column in values.items():
         columns[name] = np.full(len(steps), np.nan)

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 from msgspec import Meta
 
 from rejeu.core.records import MAX_ENVS, Duration, Positive, Seed
+from rejeu.core.types import Settings
 from rejeu.lab.runs.config import MAX_EPISODES, EnvironmentOptions, RunConfig, Shown, Task, Topic
 
 EPISODES = "Episodes of each evaluation; by default the preset's, else 20."
@@ -119,7 +120,7 @@ class Branch(Continued):
 def of_task(task: Task) -> tuple[str, Any]:
     """Returns the command that does what a process is asked to do, and its arguments."""
     run = vars(task.run)
-    shared: dict[str, Any] = {"no_report": task.no_report, "no_video": task.no_video}
+    shared: Settings = {"no_report": task.no_report, "no_video": task.no_video}
     if not task.resume:
         return "train", Train(**run, **shared, out=Path(task.folder))
     again = {name: run[name] for name in ("imports", "restart_workers", "ray", "env_cpus")}
@@ -128,7 +129,7 @@ def of_task(task: Task) -> tuple[str, Any]:
     return "resume", Resume(run=Path(task.folder), finish=True, **again, **shared)
 
 
-def check_options(arguments: Any) -> None:
+def check_options(arguments: object) -> None:
     """Raises ``ValueError`` if options exclude each other."""
     options = {key: value for key, value in vars(arguments).items() if value is not None}
     if {"steps", "minutes"} <= options.keys():

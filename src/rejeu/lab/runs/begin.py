@@ -26,6 +26,7 @@ from rejeu.checkpoints.run_folder import RunFolder, check_free
 from rejeu.core import devices, validation
 from rejeu.core.errors import BadEnvironmentError
 from rejeu.core.spaces import leaves
+from rejeu.core.types import Settings
 from rejeu.envs.make import VectorEnv, WorkerOptions, make_vector
 from rejeu.envs.registry import ENVPOOL_SIZE, has_package, is_envpool_installed, usable_envpool
 from rejeu.lab.runs.arguments import Train
@@ -50,7 +51,7 @@ def begin(arguments: Train, stack: ExitStack, report: Report) -> Session:
     is_long = arguments.is_long and not arguments.hyperparameters and env.n_envs < MANY
     algorithm = algorithm or choose_algorithm(preset, env.env_id, env.observation_space, env.action_space, is_long)
     config = make_config(arguments, environment, preset, algorithm, env, seed, logs)
-    general: dict[str, Any] = {"seed": seed, "success_threshold": config.success_threshold, "device": config.device}
+    general: Settings = {"seed": seed, "success_threshold": config.success_threshold, "device": config.device}
     agent = AGENTS[algorithm](config.policy, env, **general, **config.hyperparameters)
     if env.backend not in ("envpool", "jax"):
         check_own_environment(environment, agent.config)

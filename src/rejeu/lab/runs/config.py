@@ -36,6 +36,7 @@ from rejeu.core.records import (
     read_json,
     shown,
 )
+from rejeu.core.types import Settings
 from rejeu.core.validation import with_value
 from rejeu.logs.formatting import LOGS, quoted
 
@@ -43,7 +44,7 @@ PACKAGES = ("rejeu", "jax", "jaxlib", "numpy", "equinox", "optax", "gymnasium", 
 """Those whose versions matter for a run."""
 
 
-def assigned(assignments: Iterable[str], option: str = "--set") -> dict[str, Any]:
+def assigned(assignments: Iterable[str], option: str = "--set") -> Settings:
     """Returns the values of assignments by their names, which are dotted where they reach into a nested mapping.
 
     Args:
@@ -66,7 +67,7 @@ def assigned(assignments: Iterable[str], option: str = "--set") -> dict[str, Any
     return result
 
 
-def merged(values: Mapping[str, Any], before: Mapping[str, Any], option: str = "--set") -> dict[str, Any]:
+def merged(values: Mapping[str, object], before: Mapping[str, object], option: str = "--set") -> Settings:
     """Returns ``before`` with the values set; a dotted name reaches into a nested mapping.
 
     Raises:
@@ -81,7 +82,7 @@ def merged(values: Mapping[str, Any], before: Mapping[str, Any], option: str = "
     return result
 
 
-def assignment_words(option: str, values: Mapping[str, Any]) -> list[str]:
+def assignment_words(option: str, values: Mapping[str, object]) -> list[str]:
     """Returns values as an option of the command line.
 
     >>> assignment_words("--set", {"gamma": 0.9, "policy_kwargs.net_arch": [8]})
@@ -104,7 +105,7 @@ def value(text: str) -> Any:
     return text
 
 
-def written(setting: Any) -> str:
+def written(setting: object) -> str:
     """Returns the text from which :func:`value` reads this, if there is one.
 
     >>> [value(written(setting)) for setting in (2, "8x8", True, [1, "a"], "2")]
@@ -395,7 +396,7 @@ def options(schema: type) -> Iterator[Option]:
         )
 
 
-def unmarked(hint: Any) -> tuple[Any, list[Any]]:
+def unmarked(hint: object) -> tuple[Any, list[Any]]:
     """Returns a type without its annotations, and these."""
     return (get_args(hint)[0], [*get_args(hint)[1:]]) if get_origin(hint) is Annotated else (hint, [])
 

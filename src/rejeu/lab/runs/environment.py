@@ -69,7 +69,7 @@ def find_id(name: str) -> str:
     raise ValueError(f"{source} registers {names}, not {env_id!r}")
 
 
-def module_of(entry_point: Any) -> str | None:
+def module_of(entry_point: object) -> str | None:
     """Returns the module of an environment's entry point: a class, a function, or ``MODULE:NAME``."""
     return entry_point.partition(":")[0] if isinstance(entry_point, str) else getattr(entry_point, "__module__", None)
 

@@ -17,6 +17,7 @@ from rejeu.checkpoints.run_folder import RunFolder, checkpoint_files
 from rejeu.core import atomic, xla
 from rejeu.core.errors import RunInUseError
 from rejeu.core.interrupt import NAMES
+from rejeu.core.types import JsonObject
 from rejeu.envs.registry import register
 from rejeu.lab.runs.config import DecidedRun
 from rejeu.lab.runs.environment import Environment
@@ -84,7 +85,7 @@ def reporter(agent: Agent, table: Sink, models: Path, label: str = "") -> Callab
 
 def as_dict(
     agent: Agent, folder: RunFolder, evaluate: Evaluate, signal: int | None, is_complete: bool, stopwatch: Stopwatch
-) -> dict[str, Any]:
+) -> JsonObject:
     """Returns how a run ended, for :func:`summary` and ``--json``."""
     means = ("mean_return", "std_return", "mean_length", "success_rate")
     last = agent.history.summary(agent.stats_window_size).last
@@ -109,9 +110,7 @@ def as_dict(
     }
 
 
-def summary(
-    facts: dict[str, Any], agent: Agent, folder: RunFolder, environment: Environment, evaluate: Evaluate
-) -> str:
+def summary(facts: JsonObject, agent: Agent, folder: RunFolder, environment: Environment, evaluate: Evaluate) -> str:
     """Returns the last lines of a run; ``facts`` are those of :func:`as_dict`."""
     options = environment.run.again()
     lines = [""]

@@ -16,6 +16,7 @@ from decimal import Decimal
 from pathlib import Path
 from typing import Any, Literal, NoReturn, get_args, get_origin
 
+from rejeu.core.types import Settings
 from rejeu.core.validation import field_docs, number, whole
 from rejeu.lab.runs.config import Option, Topic, assigned, options
 
@@ -139,7 +140,7 @@ def make_parser(command: str, schema: type, declared: Iterable[Option], with_hel
         if isinstance(default := option.default, str | int | float | Path):
             text += f" (default: {default:g})" if isinstance(default, float) else f" (default: {default})"
         metavar = option.shown.metavar.removesuffix(" ...")
-        settings: dict[str, Any] = {"metavar": metavar, "help": text, "type": reader(option)}
+        settings: Settings = {"metavar": metavar, "help": text, "type": reader(option)}
         if option.takes_many:
             settings["nargs"] = "+" if option.is_required or not option.shown.is_positional else "*"
         elif option.shown.is_positional and not option.is_required:

@@ -27,6 +27,7 @@ from rejeu.checkpoints.run_folder import RunFolder, newest_inside, newest_step
 from rejeu.core import atomic
 from rejeu.core.errors import CheckpointError
 from rejeu.core.records import Malformed, convert, parse_json, shown
+from rejeu.core.types import Settings
 from rejeu.lab.runs.config import MAX_BYTES, RunConfig
 from rejeu.logs.formatting import quoted
 from rejeu.logs.tables import EMPTY, Table, flat, read_bytes, read_table
@@ -312,7 +313,7 @@ def is_file(path: Path) -> bool:
         return False
 
 
-def default_hyperparameters(algorithm: str | None, tuned: Mapping[str, Any] = MappingProxyType({})) -> dict[str, Any]:
+def default_hyperparameters(algorithm: str | None, tuned: Mapping[str, object] = MappingProxyType({})) -> Settings:
     """Returns ``tuned`` and the defaults of an algorithm as JSON values; empty if it is neither rejeu's nor registered."""
     from rejeu.algorithms import config
 

@@ -15,6 +15,7 @@ from rejeu.checkpoints.run_folder import RunFolder
 from rejeu.core import devices
 from rejeu.core.errors import RunInUseError
 from rejeu.core.interrupt import Interrupt
+from rejeu.core.types import Settings
 from rejeu.envs.make import WorkerOptions
 from rejeu.lab.runs import config as configs_of_runs, environment as environments
 from rejeu.lab.runs.arguments import Continued, Resume
@@ -96,7 +97,7 @@ def train_on(
             return session.run(stop, stopwatch)
 
 
-def changes(arguments: Continued, config: DecidedRun) -> dict[str, Any]:
+def changes(arguments: Continued, config: DecidedRun) -> Settings:
     """Returns the hyperparameters that ``--set`` changes."""
     names = {name.split(".")[0] for name in arguments.hyperparameters}
     changed = merged(arguments.hyperparameters, config.hyperparameters)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from functools import cache, partial
-from typing import Any
 
 from fastapi import Request
 from nicegui import ui
 
 from rejeu.core.language import LANGUAGES, Language, chosen, said
+from rejeu.core.types import JsonObject
 from rejeu.lab.reporting.rows import Row
 from rejeu.lab.studio.judging import Judging
 from rejeu.lab.studio.layout import EVERY, address
@@ -93,7 +93,7 @@ def build(studio: Studio, request: Request) -> None:
     ui.timer(EVERY, look)
 
 
-def columns(titles: list[str]) -> list[dict[str, Any]]:
+def columns(titles: list[str]) -> list[JsonObject]:
     """Returns the columns of the table."""
     pairs = [*zip(NAMES, titles, strict=True)]
     pairs.insert(NAMES.index("interval") + 1, ("bar", ""))
@@ -110,12 +110,12 @@ def columns(titles: list[str]) -> list[dict[str, Any]]:
     ]
 
 
-def lines(studio: Studio, judging: Judging, board: Leaderboard) -> list[dict[str, Any]]:
+def lines(studio: Studio, judging: Judging, board: Leaderboard) -> list[JsonObject]:
     """Returns the lines of the table: the models by mean return, then the runs that train and have no model yet."""
     ends = [end for row in board.rows for end in row.interval] or [0.0]
     scale = 100 / max(max(ends) - min(ends), 1e-9)
     running = {row["run"]: progress(row, board.language) for row in studio.rows if row["state"] == "running"}
-    ranked: list[dict[str, Any]] = []
+    ranked: list[JsonObject] = []
     for row in board.rows:
         low, high = ((end - min(ends)) * scale for end in row.interval)
         path = judging.path_of(row.name)

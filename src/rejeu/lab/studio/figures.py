@@ -11,6 +11,7 @@ from nicegui import app, ui
 from nicegui.element import Element
 
 from rejeu.lab.reporting.report.page import TEMPLATES
+from rejeu.logs.charts import Chart
 
 SCRIPTS = ("/plotly.min.js", "/charts.js")
 
@@ -25,7 +26,7 @@ class Figure(Element, component="chart.js"):
     """
 
     def __init__(
-        self, chart: dict[str, Any] | None = None, height: str = "240px", choose: Callable[[int], object] | None = None
+        self, chart: Chart | None = None, height: str = "240px", choose: Callable[[int], object] | None = None
     ) -> None:
         super().__init__()
         self.props.update(chart=chart, axis="x", height=height)
@@ -33,7 +34,7 @@ class Figure(Element, component="chart.js"):
         if choose is not None:
             self.on("choose", lambda event: choose(int(event.args)))
 
-    def show(self, chart: dict[str, Any] | None = None, **props: Any) -> None:
+    def show(self, chart: Chart | None = None, **props: Any) -> None:
         """Draws another chart, or the same over another ``axis`` ("x" are steps, "t" minutes), or with a ``chosen`` bar."""
         changed = props if chart is None else {"chart": chart, **props}
         if any(self.props.get(name) != value for name, value in changed.items()):

@@ -8,12 +8,13 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from rejeu.agents import load
 from rejeu.checkpoints.run_folder import dated, find_model
 from rejeu.core.errors import one_line
 from rejeu.core.language import said
+from rejeu.core.types import JsonObject
 from rejeu.lab.runs.config import RunConfig
 from rejeu.lab.runs.environment import Environment, environment_of, from_run
 from rejeu.lab.studio.state import Studio
@@ -141,7 +142,7 @@ class HostedGame:
             is_due = game.closed or (at_once and event.type == "press")
 
 
-def caption(game: Game, player: Player) -> dict[str, Any]:
+def caption(game: Game, player: Player) -> JsonObject:
     """Returns the texts of a player's picture."""
     return {
         "name": said(player.name),

@@ -118,7 +118,7 @@ def problem_of(option: Option, text: str | None) -> str | None:
     return None
 
 
-def words_of(option: Option, value: Any) -> list[str]:
+def words_of(option: Option, value: object) -> list[str]:
     """Returns an option as words of a command line, none if nothing was entered.
 
     Raises:

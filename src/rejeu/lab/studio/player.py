@@ -22,6 +22,7 @@ from rejeu.checkpoints.run_folder import RunFolder
 from rejeu.core import checkpoint
 from rejeu.core.errors import one_line
 from rejeu.core.records import convert
+from rejeu.core.types import Action, JsonObject, Observation, PyTree
 from rejeu.envs.base import success_of
 from rejeu.envs.masks import for_agent
 from rejeu.envs.rendering import rgb_frame
@@ -198,7 +199,7 @@ class LivePlayer:
         raise FileNotFoundError("there is no model yet; the first is written within seconds or at the first evaluation")
 
 
-def value_of(agent: Agent, obs: Any, memory: Any, action: Any) -> list[float]:
+def value_of(agent: Agent, obs: Observation, memory: PyTree, action: Action) -> list[float]:
     """Returns the value that the critic gives to what the agent does, as a list that is empty without a critic."""
     algorithm = agent.learner.algorithm
     if isinstance(agent, OnPolicyAgent):
@@ -206,7 +207,7 @@ def value_of(agent: Agent, obs: Any, memory: Any, action: Any) -> list[float]:
     return [float(agent.q_values(obs, action, "mean"))] if algorithm.action_values is not None else []
 
 
-def caption(episode: LiveEpisode) -> dict[str, Any]:
+def caption(episode: LiveEpisode) -> JsonObject:
     """Returns the texts of the picture."""
     ends = {1.0: "reached", 0.0: "not reached"}
     return {

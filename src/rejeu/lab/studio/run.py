@@ -17,6 +17,7 @@ from rejeu.checkpoints.run_folder import RunFolder
 from rejeu.core import atomic
 from rejeu.core.errors import one_line
 from rejeu.core.records import brief
+from rejeu.core.types import JsonObject
 from rejeu.lab.experiments.work import HIDDEN
 from rejeu.lab.reporting import run_list
 from rejeu.lab.reporting.report import sections
@@ -32,6 +33,7 @@ from rejeu.lab.studio.runs import COLORS
 from rejeu.lab.studio.screen import CSS, Screen
 from rejeu.lab.studio.state import Studio
 from rejeu.logs import charts
+from rejeu.logs.charts import Chart
 
 FIRST = (sections.CURVES, sections.GOALS)
 """Headings of the charts that are open; the others are folded."""
@@ -341,7 +343,7 @@ class Episodes:
 
     def __init__(self, page: RunPage) -> None:
         self.page = page
-        self.histogram: dict[str, Any] | None = None
+        self.histogram: Chart | None = None
         with ui.expansion("Episodes", value=True).classes("w-full"):
             self.title = ui.label().classes("text")
             self.figure = Figure(height="200px", choose=self.choose)
@@ -353,7 +355,7 @@ class Episodes:
             self.training_title = ui.label("Returns of the training episodes").classes("text")
             self.training = Figure(height="200px")
 
-    def show(self, replays: dict[str, Any] | None, training: dict[str, Any] | None, has_model: bool) -> None:
+    def show(self, replays: JsonObject | None, training: Chart | None, has_model: bool) -> None:
         """Draws the histograms."""
         self.histogram = replays
         self.title.text = TITLE if replays else ""
@@ -375,7 +377,7 @@ class Episodes:
         self.table.set_visibility(True)
         self.table.update()
 
-    def watch(self, episode: dict[str, Any]) -> None:
+    def watch(self, episode: JsonObject) -> None:
         """Shows an episode again: the best policy acts from its seed."""
         if self.page.live is not None and isinstance(seed := episode.get("seed"), int):
             self.page.live.choose(BEST, seed)

@@ -11,6 +11,7 @@ import numpy as np
 from fastapi import Request
 from nicegui import ui
 
+from rejeu.core.types import JsonObject
 from rejeu.lab.reporting.grouping import group_labels
 from rejeu.lab.reporting.rows import POINTS, Row, best_text, cells
 from rejeu.lab.runs.read import RunSummary
@@ -133,7 +134,7 @@ def lines(rows: Sequence[Row], labels: Sequence[str], opened: set[str]) -> Itera
             yield from ({**line(row), "inner": True} for row in group)
 
 
-def line(row: Row) -> dict[str, Any]:
+def line(row: Row) -> JsonObject:
     """Returns the line of a run."""
     texts = cells(row)
     files = {name: address(f"/file/{name}", run=row["run"]) for name in row["pictures"]}
@@ -155,7 +156,7 @@ def line(row: Row) -> dict[str, Any]:
     }
 
 
-def group_line(label: str, rows: Sequence[Row], is_open: bool) -> dict[str, Any]:
+def group_line(label: str, rows: Sequence[Row], is_open: bool) -> JsonObject:
     """Returns the line of several runs: the mean of their best returns with its 95 % interval over the runs."""
     states = Counter(row["state"] for row in rows)
     bests = np.array([row["best"]["mean_return"] for row in rows if row["best"]])

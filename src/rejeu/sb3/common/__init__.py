@@ -8,7 +8,7 @@ from rejeu.sb3.modules import define
 class RMSpropTFLike:
     """The name of an optimizer for ``optimizer_class``: RMSprop with epsilon inside of the square root, as rejeu's has it."""
 
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
+    def __init__(self, *args: object, **kwargs: Any) -> None:
         raise NotImplementedError(
             "RMSpropTFLike is a name for policy_kwargs here; to optimize by hand use optax.rmsprop"
         )

@@ -9,6 +9,7 @@ import numpy as np
 from gymnasium import spaces
 
 from rejeu.core.errors import requires
+from rejeu.core.types import Action, Info, Observation
 
 __all__ = [
     "AtariWrapper",
@@ -30,17 +31,17 @@ class StickyActionEnv(gym.Wrapper):
         self.action_repeat_probability = action_repeat_probability
         self._sticky_action: Any = 0
 
-    def reset(self, **kwargs: Any) -> Any:
+    def reset(self, **kwargs: Any) -> Observation:
         self._sticky_action = 0
         return self.env.reset(**kwargs)
 
-    def step(self, action: Any) -> Any:
+    def step(self, action: Action) -> Any:
         if self.np_random.random() >= self.action_repeat_probability:
             self._sticky_action = action
         return self.env.step(self._sticky_action)
 
 
-def after(env: gym.Env, action: int, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
+def after(env: gym.Env, action: int, **kwargs: Any) -> tuple[Observation, Info]:
     """Returns observation and info of a step before an episode begins, or of another reset if the step has ended it."""
     obs, _, terminated, truncated, info = env.step(action)
     return env.reset(**kwargs) if terminated or truncated else (obs, info)
@@ -54,7 +55,7 @@ class NoopResetEnv(gym.Wrapper):
         self.noop_max = noop_max
         self.override_num_noops: int | None = None
 
-    def reset(self, **kwargs: Any) -> Any:
+    def reset(self, **kwargs: Any) -> Observation:
         begun = self.env.reset(**kwargs)
         n = self.override_num_noops or int(self.unwrapped.np_random.integers(1, self.noop_max + 1))
         for _ in range(n):
@@ -65,7 +66,7 @@ class NoopResetEnv(gym.Wrapper):
 class FireResetEnv(gym.Wrapper):
     """Begins episodes with the actions 1 (FIRE) and 2, in games that start only then."""
 
-    def reset(self, **kwargs: Any) -> Any:
+    def reset(self, **kwargs: Any) -> Observation:
         self.env.reset(**kwargs)
         after(self.env, 1, **kwargs)
         return after(self.env, 2, **kwargs)
@@ -78,7 +79,7 @@ class EpisodicLifeEnv(gym.Wrapper):
         super().__init__(env)
         self.lives, self.was_real_done = 0, True
 
-    def step(self, action: Any) -> Any:
+    def step(self, action: Action) -> Any:
         obs, reward, terminated, truncated, info = self.env.step(action)
         self.was_real_done = terminated or truncated
         lives = self._lives()
@@ -86,7 +87,7 @@ class EpisodicLifeEnv(gym.Wrapper):
         self.lives = lives
         return obs, reward, terminated, truncated, info
 
-    def reset(self, **kwargs: Any) -> Any:
+    def reset(self, **kwargs: Any) -> Observation:
         begun = self.env.reset(**kwargs) if self.was_real_done else after(self.env, 0, **kwargs)  # or the life after
         self.lives = self._lives()
         return begun
@@ -103,7 +104,7 @@ class MaxAndSkipEnv(gym.Wrapper):
         super().__init__(env)
         self._skip = skip
 
-    def step(self, action: Any) -> Any:
+    def step(self, action: Action) -> Any:
         total, frames = 0.0, []
         for _ in range(self._skip):
             obs, reward, terminated, truncated, info = self.env.step(action)

@@ -20,6 +20,7 @@ import numpy as np
 
 from rejeu.agents import Agent
 from rejeu.callbacks.base import TrainingCallback
+from rejeu.core.types import Info, JsonObject, Variables
 from rejeu.envs.base import each_info
 from rejeu.logs.logging import Logger
 from rejeu.sb3.common.vec_env.base_vec_env import TERMINAL_OBSERVATION, TIME_LIMIT_TRUNCATED, VecEnv
@@ -56,9 +57,9 @@ class BaseCallback(TrainingCallback):
         """Number of calls of ``on_step`` since construction."""
         self.num_timesteps = 0
         """Number of environment steps, as ``model.num_timesteps``."""
-        self.locals: dict[str, Any] = {}
+        self.locals: Variables = {}
         """Variables of the loop: ``actions``, ``new_obs``, ``rewards``, ``dones``, ``infos``, ``self`` and ``env``."""
-        self.globals: dict[str, Any] = {}
+        self.globals: Variables = {}
         self.parent: BaseCallback | None = None
         """The callback that calls this one, if there is one."""
 
@@ -119,11 +120,11 @@ class BaseCallback(TrainingCallback):
         """Records values for the next row of statistics: ``self.logger.record("group/name", value)``."""
         return self.model.logger
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> JsonObject:
         """Returns the attributes named in ``carried``, for a checkpoint."""
         return {name: getattr(self, name) for name in self.carried}
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+    def load_state_dict(self, state: Mapping[str, object]) -> None:
         """Restores what :meth:`state_dict` returned."""
         for name in self.carried:
             setattr(self, name, state[name])
@@ -135,7 +136,7 @@ class BaseCallback(TrainingCallback):
         for child in self._children():
             child.init_callback(model)
 
-    def on_training_start(self, locals_: dict[str, Any], globals_: dict[str, Any]) -> None:
+    def on_training_start(self, locals_: Variables, globals_: Variables) -> None:
         """Called before the first step."""
         self.locals, self.globals = locals_, globals_
         self.num_timesteps = self.model.num_timesteps
@@ -165,12 +166,12 @@ class BaseCallback(TrainingCallback):
         """Called after the last step."""
         self._on_training_end()
 
-    def update_locals(self, locals_: dict[str, Any]) -> None:
+    def update_locals(self, locals_: Variables) -> None:
         """Updates ``locals``, also of the child callbacks."""
         self.locals.update(locals_)
         self.update_child_locals(locals_)
 
-    def update_child_locals(self, locals_: dict[str, Any]) -> None:
+    def update_child_locals(self, locals_: Variables) -> None:
         """Updates ``locals`` of the child callbacks."""
         for child in self._children():
             child.update_locals(locals_)
@@ -201,7 +202,7 @@ class BaseCallback(TrainingCallback):
 class ParentCallback(BaseCallback):
     """A callback that contains others. Abstract: subclasses define ``_children``."""
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> JsonObject:
         """Returns its own state, and that of each callback in it with the name of its class."""
         parts = [[type(child).__name__, child.state_dict()] for child in self._children()]
         return {"self": super().state_dict(), "inside": parts}
@@ -298,7 +299,7 @@ def to_callback(callback: BaseCallback | Callable[..., Any]) -> BaseCallback:
     return callback if isinstance(callback, BaseCallback) else ConvertCallback(callback)
 
 
-def env_infos(agent: Agent, progress: Progress) -> list[dict[str, Any]]:
+def env_infos(agent: Agent, progress: Progress) -> list[Info]:
     """Returns one info for each environment, with the keys that Stable-Baselines3's ``VecEnv`` and ``Monitor`` add."""
     result, env = progress.result, agent.run.env
     assert result is not None

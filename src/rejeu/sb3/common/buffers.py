@@ -14,6 +14,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from rejeu.core.algorithm import unmasked
+from rejeu.core.types import Observation
 from rejeu.replay.hindsight import GoalSelectionStrategy
 from rejeu.replay.ring import LAST, TERMINATED
 from rejeu.sb3.common.preprocessing import get_action_dim, get_obs_shape
@@ -42,14 +43,14 @@ KEY_TO_GOAL_STRATEGY = {strategy.value: strategy for strategy in GoalSelectionSt
 """Where the goals of hindsight come from, by name."""
 
 
-def by_leaf(function: Callable[..., Any], *observations: Any) -> Any:
+def by_leaf(function: Callable[..., Any], *observations: Observation) -> Any:
     """Returns a function of arrays applied to observations, key by key where they are dicts."""
     if isinstance(observations[0], dict):
         return {key: by_leaf(function, *(observation[key] for observation in observations)) for key in observations[0]}
     return function(*observations)
 
 
-def fixed(array: Any) -> np.ndarray:
+def fixed(array: object) -> np.ndarray:
     """Returns an array that cannot be written to: writing to a copy would change nothing that is learned from."""
     array = np.asarray(array)
     array.flags.writeable = False
@@ -63,7 +64,7 @@ class BaseBuffer:
     """The agent."""
     optimize_memory_usage, handle_timeout_termination = False, True
 
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
+    def __init__(self, *args: object, **kwargs: Any) -> None:
         raise TypeError(
             f"{type(self).__name__} shows the buffer of an agent, as model.replay_buffer or model.rollout_buffer, and cannot "
             "be made by hand; use rejeu.replay.replay_memory.ReplayMemory to store transitions yourself"
@@ -83,7 +84,7 @@ class BaseBuffer:
         self.agent.run.replay = self.agent.make_buffer(self.agent.run.env)
         self.agent.abandon_episodes()
 
-    def to_torch(self, array: Any, copy: bool = True) -> Tensor:
+    def to_torch(self, array: object, copy: bool = True) -> Tensor:
         """Returns a NumPy array with the methods of tensors."""
         return Tensor.of(np.array(array) if copy else array)
 
@@ -187,7 +188,7 @@ class ReplayBuffer(BaseBuffer):
         if self.own is None:
             self.agent.abandon_episodes()
 
-    def extend(self, *args: Any) -> None:
+    def extend(self, *args: object) -> None:
         """Adds several rows, with the arguments of :meth:`add` and a leading axis."""
         for row in zip(*args, strict=True):
             self.add(*row)
@@ -270,7 +271,7 @@ class HerReplayBuffer(ReplayBuffer):
 class RolloutBuffer(BaseBuffer):
     """The steps of one rollout, with their advantages."""
 
-    observations: Any
+    observations: Observation
     pos: int
     """Number of steps of each environment."""
     full: bool

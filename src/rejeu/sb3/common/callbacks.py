@@ -19,6 +19,7 @@ from rejeu.agents import Agent
 from rejeu.agents.off_policy import OffPolicyAgent
 from rejeu.callbacks.progress_bar import ProgressBar
 from rejeu.core import atomic
+from rejeu.core.types import Settings, Variables
 from rejeu.core.validation import whole
 from rejeu.envs.masks import make_masked
 from rejeu.sb3.common.base_callback import (
@@ -87,7 +88,7 @@ class CheckpointCallback(BaseCallback):
                 self._write(statistics.save, "vecnormalize_")
         return True
 
-    def _write(self, save: Callable[[Path], Any], kind: str) -> None:
+    def _write(self, save: Callable[[Path], object], kind: str) -> None:
         """Saves one file, or warns."""
         suffix = ".pkl" if kind else ".zip"
         path = self.save_path / f"{self.name_prefix}_{kind}{self.num_timesteps}_steps{suffix}"
@@ -215,7 +216,7 @@ class EvalCallback(EventCallback):
                 continues = self.callback_on_new_best.on_step()
         return continues and self._on_event()
 
-    def _record_success(self, locals_: dict[str, Any], globals_: dict[str, Any]) -> None:
+    def _record_success(self, locals_: Variables, globals_: Variables) -> None:
         if locals_["done"] and (success := locals_["info"].get("is_success")) is not None:
             self._is_success_buffer.append(bool(success))
 
@@ -225,16 +226,16 @@ class EvalCallback(EventCallback):
         self.evaluations_timesteps.append(self.num_timesteps)
         self.evaluations_results.append(returns)
         self.evaluations_length.append(lengths)
-        parts: dict[str, Any] = {}
+        arrays: dict[str, np.ndarray] = {}
         if self._is_success_buffer:
             self.evaluations_successes.append(self._is_success_buffer)
             if {len(row) for row in self.evaluations_successes} == {self.n_eval_episodes}:
-                parts["successes"] = np.array(self.evaluations_successes)
-        parts["timesteps"] = np.array(self.evaluations_timesteps)
-        parts["results"] = np.array(self.evaluations_results)
-        parts["ep_lengths"] = np.array(self.evaluations_length)
+                arrays["successes"] = np.array(self.evaluations_successes)
+        arrays["timesteps"] = np.array(self.evaluations_timesteps)
+        arrays["results"] = np.array(self.evaluations_results)
+        arrays["ep_lengths"] = np.array(self.evaluations_length)
         path = Path(f"{self.log_path}.npz")
-        self.model.failed_writes.attempt(f"evaluations {path}", partial(_write_npz, path, parts))
+        self.model.failed_writes.attempt(f"evaluations {path}", partial(_write_npz, path, arrays))
 
     def _report(self, returns: list[float], lengths: list[int]) -> None:
         self.last_mean_reward = float(np.mean(returns))
@@ -307,7 +308,7 @@ class LogEveryNTimesteps(EveryNTimesteps):
     def __init__(self, n_steps: int) -> None:
         super().__init__(n_steps, ConvertCallback(self._log))
 
-    def _log(self, locals_: dict[str, Any], globals_: dict[str, Any]) -> bool:
+    def _log(self, locals_: Variables, globals_: Variables) -> bool:
         for name, value in self.model.statistics().items():
             self.logger.record(name, value)
         self.logger.dump(self.num_timesteps)

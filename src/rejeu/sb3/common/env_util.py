@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import gymnasium as gym
 
+from rejeu.core.types import Arguments
 from rejeu.core.validation import whole
 from rejeu.envs.registry import make_env
 from rejeu.sb3.common.atari_wrappers import AtariWrapper
@@ -27,11 +27,11 @@ def make_vec_env(
     start_index: int = 0,
     monitor_dir: str | Path | None = None,
     wrapper_class: Callable[..., gym.Env] | None = None,
-    env_kwargs: Mapping[str, Any] | None = None,
+    env_kwargs: Arguments | None = None,
     vec_env_cls: Callable[..., VecEnv] | None = None,
-    vec_env_kwargs: Mapping[str, Any] | None = None,
-    monitor_kwargs: Mapping[str, Any] | None = None,
-    wrapper_kwargs: Mapping[str, Any] | None = None,
+    vec_env_kwargs: Arguments | None = None,
+    monitor_kwargs: Arguments | None = None,
+    wrapper_kwargs: Arguments | None = None,
 ) -> VecEnv:
     """Returns a vector environment of ``n_envs`` environments, each wrapped in a ``Monitor``.
 
@@ -81,18 +81,18 @@ def make_atari_env(
     seed: int | None = None,
     start_index: int = 0,
     monitor_dir: str | Path | None = None,
-    wrapper_kwargs: Mapping[str, Any] | None = None,
-    env_kwargs: Mapping[str, Any] | None = None,
+    wrapper_kwargs: Arguments | None = None,
+    env_kwargs: Arguments | None = None,
     vec_env_cls: Callable[..., VecEnv] | None = None,
-    vec_env_kwargs: Mapping[str, Any] | None = None,
-    monitor_kwargs: Mapping[str, Any] | None = None,
+    vec_env_kwargs: Arguments | None = None,
+    monitor_kwargs: Arguments | None = None,
 ) -> VecEnv:
     """Returns a vector environment of Atari games in ``AtariWrapper``s; see :func:`make_vec_env`."""
     unsupported = (vec_env_cls, vec_env_kwargs, monitor_kwargs, wrapper_kwargs)
     return make_vec_env(env_id, n_envs, seed, start_index, monitor_dir, AtariWrapper, env_kwargs, *unsupported)
 
 
-def made(env_id: str | Callable[..., gym.Env], kwargs: Mapping[str, Any]) -> gym.Env:
+def made(env_id: str | Callable[..., gym.Env], kwargs: Arguments) -> gym.Env:
     """Returns an environment; one of an id with ``render_mode="rgb_array"`` where it accepts that."""
     if not isinstance(env_id, str):
         return env_id(**kwargs)

@@ -8,6 +8,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+from rejeu.core.types import Action, Info, Observation
 from rejeu.sb3.modules import alias
 
 __all__ = [
@@ -37,7 +38,7 @@ class IdentityEnv(gym.Env):
         self.ep_length, self.current_step, self.num_resets = ep_length, 0, -1
         self.state: Any = None
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Observation, Info]:
         super().reset(seed=seed)
         if seed is not None:
             self.observation_space.seed(seed)
@@ -46,13 +47,13 @@ class IdentityEnv(gym.Env):
         self.state = self.observation_space.sample()
         return self.state, {}
 
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+    def step(self, action: Action) -> tuple[Observation, float, bool, bool, Info]:
         reward = self._get_reward(action)
         self.state = self.observation_space.sample()
         self.current_step += 1
         return self.state, reward, False, self.current_step >= self.ep_length, {}
 
-    def _get_reward(self, action: Any) -> float:
+    def _get_reward(self, action: Action) -> float:
         return float(np.all(self.state == action))
 
     def render(self) -> None:
@@ -66,7 +67,7 @@ class IdentityEnvBox(IdentityEnv):
         super().__init__(space=spaces.Box(low=low, high=high, shape=(1,), dtype=np.float32), ep_length=ep_length)
         self.eps = eps
 
-    def _get_reward(self, action: Any) -> float:
+    def _get_reward(self, action: Action) -> float:
         return float(np.all(np.abs(self.state - action) <= self.eps))
 
 
@@ -110,7 +111,7 @@ class FakeImageEnv(IdentityEnv):
         super().__init__(space=spaces.Box(0, 255, shape, np.uint8), ep_length=10)
         self.action_space = spaces.Discrete(action_dim) if discrete else spaces.Box(-1, 1, (5,), np.float32)
 
-    def _get_reward(self, action: Any) -> float:
+    def _get_reward(self, action: Action) -> float:
         return 0.0
 
 
@@ -136,13 +137,13 @@ class BitFlippingEnv(gym.Env):
     def _observation(self) -> dict[str, np.ndarray]:
         return {"observation": self.state, "achieved_goal": self.state, "desired_goal": self.desired_goal}
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Observation, Info]:
         super().reset(seed=seed)
         self.current_step = 0
         self.state = self.np_random.integers(0, 2, len(self.state), np.int8)
         return self._observation(), {}
 
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+    def step(self, action: Action) -> tuple[Observation, float, bool, bool, Info]:
         flipped = np.asarray(action) > 0 if self.continuous else np.arange(len(self.state)) == action
         self.state = self.state ^ flipped.astype(np.int8)
         self.current_step += 1
@@ -183,12 +184,12 @@ class SimpleMultiObsEnv(gym.Env):
         self.num_col, self.random_start, self.discrete_actions = num_col, random_start, discrete_actions
         self.state, self.count, self.max_count = 0, 0, 100
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Observation, Info]:
         super().reset(seed=seed)
         self.count, self.state = 0, int(self.np_random.integers(len(self.cells) - 1)) if self.random_start else 0
         return dict(self.cells[self.state]), {}
 
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+    def step(self, action: Action) -> tuple[Observation, float, bool, bool, Info]:
         move = int(action) if self.discrete_actions else int(np.argmax(action))
         size = len(self.cells) // self.num_col, self.num_col
         cell = np.add(divmod(self.state, self.num_col), ((0, -1), (1, 0), (0, 1), (-1, 0))[move])

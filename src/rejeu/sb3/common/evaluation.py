@@ -13,6 +13,7 @@ from rejeu.agents import Agent
 from rejeu.agents.policy import lent
 from rejeu.core import interrupt
 from rejeu.core.algorithm import Masked
+from rejeu.core.types import Variables
 from rejeu.envs.make import make_vector
 from rejeu.envs.masks import make_masked
 from rejeu.logs.evaluation import MOST_STEPS, cut_off
@@ -27,7 +28,7 @@ def evaluate_policy(
     n_eval_episodes: int = 10,
     deterministic: bool = True,
     render: bool = False,
-    callback: Callable[[dict[str, Any], dict[str, Any]], None] | None = None,
+    callback: Callable[[Variables, Variables], object] | None = None,
     reward_threshold: float | None = None,
     return_episode_rewards: bool = False,
     warn: bool = True,

@@ -24,6 +24,7 @@ from typing import IO, Any
 import numpy as np
 
 from rejeu.core import atomic
+from rejeu.core.types import JsonObject, Settings
 from rejeu.logs import logging
 from rejeu.logs.formatting import LOGS
 from rejeu.logs.logging import CsvFile, JsonLines, TensorBoard, add_text, open_log
@@ -131,7 +132,7 @@ class KVWriter(ABC):
 
 def filter_excluded_keys(
     key_values: Mapping[str, Any], key_excluded: Mapping[str, Any], *formats: str
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """Returns the values that none of these formats leaves out."""
     excluded = {key: {*np.atleast_1d(key_excluded.get(key) or ())} for key in key_values}
     return {key: value for key, value in key_values.items() if not {*formats} & excluded[key]}
@@ -327,10 +328,10 @@ class Logger(logging.Logger):
         super().__init__(folder, [_Rows(self)])
         self.output_formats = [*output_formats]
         self.level = INFO
-        self.name_to_excluded: dict[str, Any] = {}
-        self.exclusions: dict[str, Any] = {}
-        """What :meth:`take` took from ``name_to_excluded``."""
-        self.left: dict[str, Any] = {}
+        self.name_to_excluded: dict[str, str | tuple[str, ...] | None] = {}
+        self.exclusions: dict[str, str | tuple[str, ...] | None] = {}
+        """The ``name_to_excluded`` of the row that :meth:`take` returned."""
+        self.left: dict[str, float] = {}
         """Values of the last row that a ``dump`` of one's own did not clear."""
 
     def record(self, key: str, value: Any, exclude: str | tuple[str, ...] | None = None) -> None:
@@ -425,7 +426,7 @@ def configure(folder: str | Path | None = None, format_strings: Sequence[str] | 
     return logger
 
 
-def read_json(filename: str | Path) -> list[dict[str, Any]]:
+def read_json(filename: str | Path) -> list[JsonObject]:
     """Returns the rows of a file of JSON lines."""
     with Path(filename).open(encoding="utf-8") as file:
         return [json.loads(line) for line in lines_of(file)]

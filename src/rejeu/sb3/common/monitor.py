@@ -9,13 +9,14 @@ import time
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, SupportsFloat
 
 import gymnasium as gym
 import numpy as np
 
 from rejeu.core import atomic
 from rejeu.core.failed_writes import FailedWrites
+from rejeu.core.types import Action, Info, JsonObject, Observation, Settings
 from rejeu.envs.snapshot import check_types
 from rejeu.logs.tables import MAX_LINE, lines_of
 
@@ -75,13 +76,13 @@ class Monitor(gym.Wrapper, gym.utils.RecordConstructorArgs):
         self.episode_lengths: list[int] = []
         self.episode_times: list[float] = []
         self.total_steps = 0
-        self.current_reset_info: dict[str, Any] = {}
+        self.current_reset_info: Info = {}
         keywords = (*self.reset_keywords, *self.info_keywords)
         start = {"t_start": self.t_start, "env_id": str(env.spec.id if env.spec is not None else None)}
         self._file = None if filename is None else ResultsWriter(filename, start, keywords, override_existing)
         self.path = None if self._file is None else self._file.path
 
-    def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
+    def reset(self, **kwargs: Any) -> tuple[Observation, Info]:
         """Resets the environment with the arguments given.
 
         Raises:
@@ -101,7 +102,7 @@ class Monitor(gym.Wrapper, gym.utils.RecordConstructorArgs):
         self.needs_reset = False
         return result
 
-    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+    def step(self, action: Action) -> tuple[Observation, SupportsFloat, bool, bool, Info]:
         """Steps the environment.
 
         Raises:
@@ -119,7 +120,7 @@ class Monitor(gym.Wrapper, gym.utils.RecordConstructorArgs):
             info["episode"] = self._end_episode(info)
         return obs, reward, terminated, truncated, info
 
-    def _end_episode(self, info: dict[str, Any]) -> dict[str, Any]:
+    def _end_episode(self, info: Info) -> Info:
         total, length, seconds = sum(self.rewards), len(self.rewards), time.time() - self.t_start
         self.episode_returns.append(total)
         self.episode_lengths.append(length)
@@ -130,11 +131,11 @@ class Monitor(gym.Wrapper, gym.utils.RecordConstructorArgs):
             self._file.write_row(row)
         return row
 
-    def get_wrapper_state(self) -> dict[str, Any]:
+    def get_wrapper_state(self) -> JsonObject:
         """Returns what the wrapper stores, for the checkpoint of a run."""
         return {name: vars(self)[name] for name in STATE}
 
-    def set_wrapper_state(self, state: Mapping[str, Any]) -> None:
+    def set_wrapper_state(self, state: Mapping[str, object]) -> None:
         """Restores what :meth:`get_wrapper_state` returned.
 
         Raises:
@@ -179,7 +180,7 @@ class ResultsWriter:
     def __init__(
         self,
         filename: str | Path = "",
-        header: Mapping[str, Any] | None = None,
+        header: Mapping[str, object] | None = None,
         extra_keys: Sequence[str] = (),
         override_existing: bool = True,
     ) -> None:
@@ -191,7 +192,7 @@ class ResultsWriter:
                 file.write(f"#{json.dumps(header or {})}\n")
                 csv.writer(file).writerow(self.columns)
 
-    def write_row(self, epinfo: Mapping[str, Any]) -> None:
+    def write_row(self, epinfo: Info) -> None:
         """Writes the row of an episode."""
         text = io.StringIO()
         csv.DictWriter(text, self.columns).writerow(epinfo)
@@ -202,7 +203,7 @@ class ResultsWriter:
         """Does nothing, because rows are not buffered."""
 
 
-def keywords_of(info: Mapping[str, Any], keywords: Sequence[str]) -> dict[str, Any]:
+def keywords_of(info: Info, keywords: Sequence[str]) -> Info:
     """Returns the entries of an episode's last info that are recorded.
 
     Raises:

@@ -10,6 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from gymnasium import spaces
 
+from rejeu.core.types import Observation
+
 __all__ = [
     "check_for_nested_spaces",
     "get_action_dim",
@@ -60,7 +62,7 @@ def maybe_transpose(observation: np.ndarray, observation_space: spaces.Space) ->
     return next((candidate for candidate in moved if candidate.shape[-3:] == shape), observation)
 
 
-def preprocess_obs(obs: Any, observation_space: spaces.Space, normalize_images: bool = True) -> Any:
+def preprocess_obs(obs: Observation, observation_space: spaces.Space, normalize_images: bool = True) -> Observation:
     """Returns a batch of observations as networks take them, ``float32``: images in [0, 1], choices one-hot.
 
     Raises:

@@ -37,6 +37,7 @@ from jax import Array
 from rejeu.core.algorithm import PyTree
 from rejeu.core.records import convert, parse_json
 from rejeu.core.spaces import Leaf
+from rejeu.core.types import Observation, Settings
 from rejeu.envs.registry import are_plain
 from rejeu.networks import ENCODERS, register_encoder
 from rejeu.networks.layers import own_module
@@ -73,18 +74,18 @@ class BaseFeaturesExtractor(eqx.Module):
         """The number of features."""
         return self._features_dim
 
-    def forward(self, observations: Any) -> Array:
+    def forward(self, observations: Observation) -> Array:
         """Returns the features of one observation, or of a batch."""
         raise NotImplementedError(f"{type(self).__name__} does not define forward")
 
-    def __call__(self, observations: Any) -> Array:
+    def __call__(self, observations: Observation) -> Array:
         return self.forward(observations)
 
 
 class FlattenExtractor(BaseFeaturesExtractor):
     """Observations as they are, in one vector."""
 
-    def forward(self, observations: Any) -> Array:
+    def forward(self, observations: Observation) -> Array:
         return jnp.ravel(observations)
 
 
@@ -125,7 +126,7 @@ def get_actor_critic_arch(net_arch: Any) -> tuple[list[int], list[int]]:
     return [*each[0]], [*each[1]]
 
 
-def is_torch(value: Any) -> bool:
+def is_torch(value: object) -> bool:
     """Returns whether something is a class or an object of PyTorch, which need not be installed."""
     value_class = value if isinstance(value, type) else type(value)
     return any(base.__module__.partition(".")[0] == "torch" for base in value_class.__mro__)
@@ -143,7 +144,7 @@ class Prepared(eqx.Module):
         return self.extractor(prepared(obs, self.leaves, self.normalize_images))
 
 
-def prepared(obs: PyTree, leaves: tuple[Leaf, ...], normalize_images: bool) -> Any:
+def prepared(obs: PyTree, leaves: tuple[Leaf, ...], normalize_images: bool) -> Observation:
     """Returns a batch of observations as extractors take them: a dict by path, or the only part as it is."""
     parts = {}
     for leaf in leaves:
@@ -171,7 +172,7 @@ def space_of(leaves: tuple[Leaf, ...]) -> spaces.Space:
     return parts[""] if list(parts) == [""] else spaces.Dict(parts)
 
 
-def encoder_of(extractor: Any, settings: Mapping[str, Any], normalize_images: bool = True) -> dict[str, Any]:
+def encoder_of(extractor: object, settings: Mapping[str, object], normalize_images: bool = True) -> Settings:
     """Returns the ``policy_kwargs`` of rejeu that stand for a feature extractor and its arguments.
 
     Raises:
@@ -197,7 +198,7 @@ def encoder_of(extractor: Any, settings: Mapping[str, Any], normalize_images: bo
     return {"encoder": name}
 
 
-def _register(name: str, extractor: type[eqx.Module], settings: Mapping[str, Any], normalize_images: bool) -> None:
+def _register(name: str, extractor: type[eqx.Module], settings: Mapping[str, object], normalize_images: bool) -> None:
     @register_encoder(name)
     def make(key: Array, leaves: tuple[Leaf, ...]) -> Any:
         takes_key = "key" in inspect.signature(extractor).parameters
@@ -214,7 +215,7 @@ def _register(name: str, extractor: type[eqx.Module], settings: Mapping[str, Any
         return Prepared(own_module(extractor.__name__, module, example)[0], leaves, normalize_images)
 
 
-def register_again(name: Any) -> None:
+def register_again(name: object) -> None:
     """Makes the extractor that a model file names known again, if a class of that name is defined. Imports nothing.
 
     Its arguments must be numbers up to a million, words, or lists of these; else it must be given again.

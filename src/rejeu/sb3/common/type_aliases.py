@@ -10,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 
 from rejeu.callbacks.base import Callback
+from rejeu.core.types import Observation
 from rejeu.sb3.common.vec_env.base_vec_env import VecEnv
 
 GymEnv = gym.Env | VecEnv
@@ -29,7 +30,7 @@ Schedule = Callable[[float], float]
 class RolloutBufferSamples(NamedTuple):
     """A minibatch of a rollout; every array has a leading batch axis."""
 
-    observations: Any
+    observations: Observation
     actions: np.ndarray
     old_values: np.ndarray
     old_log_prob: np.ndarray
@@ -40,9 +41,9 @@ class RolloutBufferSamples(NamedTuple):
 class ReplayBufferSamples(NamedTuple):
     """A batch of transitions; every array has a leading batch axis."""
 
-    observations: Any
+    observations: Observation
     actions: np.ndarray
-    next_observations: Any
+    next_observations: Observation
     dones: np.ndarray
     """``(batch, 1)``, 1 where the MDP terminated."""
     rewards: np.ndarray

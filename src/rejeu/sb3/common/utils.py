@@ -21,6 +21,7 @@ from gymnasium import spaces
 
 from rejeu.core import schedules
 from rejeu.core.schedules import Exponential, Linear, TableSchedule
+from rejeu.core.types import Observation, Settings
 from rejeu.sb3.modules import passes_on
 
 __all__ = [
@@ -125,12 +126,12 @@ def constant_fn(val: float) -> ConstantSchedule:
     return ConstantSchedule(val)
 
 
-def get_schedule_fn(value_schedule: Any) -> FloatSchedule:
+def get_schedule_fn(value_schedule: object) -> FloatSchedule:
     """Returns a number or a function of the remaining progress as a function of the remaining progress."""
     return FloatSchedule(value_schedule)
 
 
-def of_progress(value: Any) -> Any:
+def of_progress(value: object) -> Any:
     """Returns a schedule of the remaining progress as one of the progress, as data; anything else unchanged.
 
     A function becomes a table of its values at every thousandth of the run, which a model file contains.
@@ -164,7 +165,7 @@ class Device(str):
         return "cuda" if name in ("gpu", "cuda") else "cpu"
 
 
-def get_device(device: Any = "auto") -> Device:
+def get_device(device: object = "auto") -> Device:
     """Returns the device of a name; ``"auto"`` and ``"cuda"`` are the CPU where JAX has no GPU."""
     return Device("cuda" if jax.default_backend() == "gpu" and Device(device).type == "cuda" else "cpu")
 
@@ -176,11 +177,11 @@ class Tensor(np.ndarray):
     """
 
     @classmethod
-    def of(cls, array: Any) -> Tensor:
+    def of(cls, array: object) -> Tensor:
         """Returns an array, or a JAX array, as one of this class."""
         return np.asarray(array).view(cls)
 
-    def __array_wrap__(self, array: Any, context: Any = None, return_scalar: bool = False) -> Any:
+    def __array_wrap__(self, array: object, context: object = None, return_scalar: bool = False) -> Any:
         """Returns results as arrays of this class, also a mean or a sum of all values."""
         return np.asarray(array).view(type(self))
 
@@ -201,7 +202,7 @@ class Tensor(np.ndarray):
         """Returns itself."""
         return self
 
-    def to(self, *args: Any, **kwargs: Any) -> Tensor:
+    def to(self, *args: object, **kwargs: Any) -> Tensor:
         """Returns itself."""
         return self
 
@@ -219,7 +220,7 @@ class Tensor(np.ndarray):
 
     @classmethod
     def __torch_function__(
-        cls, function: Callable[..., Any], types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
+        cls, function: Callable[..., Any], types: object, args: tuple[Any, ...] = (), kwargs: Settings | None = None
     ) -> Any:
         """Returns what a function of PyTorch's does, which calls this where an argument is of this class."""
         torch = sys.modules["torch"]
@@ -270,7 +271,7 @@ def check_for_correct_spaces(env: Any, observation_space: gym.Space, action_spac
             raise ValueError(f"{kind} spaces do not match: {own} != {other}")
 
 
-def is_vectorized_observation(observation: Any, observation_space: gym.Space) -> bool:
+def is_vectorized_observation(observation: Observation, observation_space: gym.Space) -> bool:
     """Returns whether an observation is a batch of observations of the space.
 
     Raises:
@@ -317,7 +318,7 @@ def get_parameters_by_name(model: Any, included_names: Iterable[str]) -> list[An
     return [value for name, value in model.state_dict().items() if any(pattern in name for pattern in included_names)]
 
 
-def obs_as_tensor(obs: Any, device: Any = "auto") -> Any:
+def obs_as_tensor(obs: Observation, device: object = "auto") -> Any:
     """Returns observations as arrays, which is what stands for tensors here."""
     return {key: Tensor.of(leaf) for key, leaf in obs.items()} if isinstance(obs, Mapping) else Tensor.of(obs)
 

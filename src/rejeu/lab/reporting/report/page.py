@@ -27,7 +27,7 @@ class Entry(NamedTuple):
     note: str = ""
 
 
-def render(template: str, data: Any, **context: Any) -> str:
+def render(template: str, data: object, **context: Any) -> str:
     """Returns a page that extends ``base.html``.
 
     Args:

@@ -13,11 +13,13 @@ import numpy as np
 
 from rejeu.checkpoints.run_folder import RunFolder
 from rejeu.core.records import shown
+from rejeu.core.types import JsonObject
 from rejeu.lab.reporting.report.page import Entry
 from rejeu.lab.reporting.report.videos import BUDGET, Video, collect
 from rejeu.lab.runs.config import RunConfig
 from rejeu.lab.runs.read import MAX_WORD, RunSummary, best_row
 from rejeu.logs import charts as chart_data
+from rejeu.logs.charts import Chart
 from rejeu.logs.formatting import counted, quoted
 from rejeu.logs.tables import flat
 
@@ -75,7 +77,7 @@ class RunSection(NamedTuple):
     """Number of further videos in the run folder."""
     histograms: set[str]
     """Those that exist: ``"episodes"`` of training, ``"replays"`` of the trained agent."""
-    evaluations: list[dict[str, Any]]
+    evaluations: list[JsonObject]
     has_success: bool
     evaluations_note: str
     settings: list[tuple[str, str]]
@@ -94,7 +96,7 @@ class Parts(NamedTuple):
     """The content of a page."""
 
     runs: list[RunSection]
-    data: dict[str, Any]
+    data: JsonObject
     """For the script."""
 
 
@@ -109,8 +111,8 @@ def title_of(runs: Sequence[RunSummary]) -> str:
 def build(runs: Sequence[RunSummary], folder: Path | None) -> Parts:
     """Returns the content of a report; ``folder`` as for :func:`rejeu.lab.reporting.report.render`."""
     sections, budget = [], BUDGET
-    charts: dict[str, Any] = {}
-    histograms: dict[str, Any] = {}
+    charts: dict[str, Chart] = {}
+    histograms: dict[str, Chart] = {}
     for i, run in enumerate(runs):
         own_charts, groups = charts_of(run, f"run{i}")
         charts |= own_charts
@@ -133,7 +135,7 @@ def charts_of(run: RunSummary, prefix: str) -> tuple[dict[str, Any], list[ChartG
         curves.append((chart_data.group_of(name), f"metric{i}", shown(name), chart))
     curves.append((GOALS, "goals", "Goals of the trained agent", chart_data.goal_chart(run.replays)))
     curves.append((TIME, "time", "Shares of the time", chart_data.time_chart(run.metrics)))
-    charts: dict[str, Any] = {}
+    charts: dict[str, Chart] = {}
     groups: dict[str, list[Entry]] = {heading: [] for heading in (CURVES, GOALS, *chart_data.GROUPS, TIME)}
     for heading, key, title, chart in curves:
         if chart is not None:
@@ -142,13 +144,13 @@ def charts_of(run: RunSummary, prefix: str) -> tuple[dict[str, Any], list[ChartG
     return charts, [ChartGroup(heading, entries) for heading, entries in groups.items() if entries]
 
 
-def histogram_of(run: RunSummary) -> dict[str, Any] | None:
+def histogram_of(run: RunSummary) -> Chart | None:
     """Returns the histogram of the training episodes."""
     columns = {name: run.episodes.column(name) for name in ("step", "env", "return", "length", "success")}
     return chart_data.histogram(columns["return"], {"episode": np.arange(1, len(run.episodes) + 1), **columns})
 
 
-def replays_of(run: RunSummary) -> dict[str, Any] | None:
+def replays_of(run: RunSummary) -> JsonObject | None:
     """Returns the histogram of the episodes that the trained agent played from known seeds; None without any."""
     columns = {name: run.replays.column(name) for name in ("seed", "return", "length", "success")}
     return chart_data.histogram(columns["return"], columns, replay_command(run))
@@ -281,7 +283,7 @@ def facts(run: RunSummary) -> list[str]:
     return texts
 
 
-def evaluation_rows(run: RunSummary) -> list[dict[str, Any]]:
+def evaluation_rows(run: RunSummary) -> list[JsonObject]:
     """Returns the table of evaluations; of many rows the best and others, evenly spaced."""
     table = run.evaluations
     (low, high), (rate_low, rate_high) = chart_data.interval(table, "return"), chart_data.interval(table, "success")
@@ -309,7 +311,7 @@ def evaluations_note(run: RunSummary) -> str:
     return f"{MAX_EVALUATIONS} of {n:,} evaluations, evenly spaced" if n > MAX_EVALUATIONS else ""
 
 
-def value_text(value: Any) -> str:
+def value_text(value: object) -> str:
     """Returns a value of a configuration as text; a schedule in words.
 
     >>> value_text({"schedule": "linear", "start": 0.2, "end": 0.0, "fraction": 1.0}), value_text(None)

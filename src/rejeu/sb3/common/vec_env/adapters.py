@@ -13,9 +13,11 @@ from typing import Any
 import gymnasium as gym
 import jax
 import numpy as np
+from numpy.typing import DTypeLike
 
 from rejeu.core.errors import BadEnvironmentError
 from rejeu.core.spaces import leaves, plain
+from rejeu.core.types import Action, Info, Observation
 from rejeu.envs import goals as goals_module, validation
 from rejeu.envs.base import Seed, Step, VectorEnv, step_whole, success_of
 from rejeu.envs.goals import GoalFunctions
@@ -99,7 +101,7 @@ class VecEnvAdapter(VectorEnv):
         self._desynced = np.zeros(self.n_envs, bool)
         """Environments that were stepped although they were not active, and have not been reset since."""
 
-    def reset(self, seed: Seed = None) -> Any:
+    def reset(self, seed: Seed = None) -> Observation:
         seed = self._seed if seed is None else seed
         self._seed = None
         if seed is not None:
@@ -147,7 +149,7 @@ class VecEnvAdapter(VectorEnv):
         self._obs = obs
         return Step(obs, reward, done & ~truncated, truncated, infos, returns)
 
-    def _write_final(self, obs: Any, i: int, info: dict[str, Any]) -> None:
+    def _write_final(self, obs: Observation, i: int, info: Info) -> None:
         """Writes the final observation of environment ``i`` into a batch of observations."""
         if TERMINAL_OBSERVATION not in info:
             raise BadEnvironmentError(
@@ -170,7 +172,7 @@ class VecEnvAdapter(VectorEnv):
         self._obs = step.obs
         return step
 
-    def reset_done(self, done: np.ndarray) -> Any:
+    def reset_done(self, done: np.ndarray) -> Observation:
         done = np.asarray(done, bool)
         if not (done & self._desynced).any():
             self._obs = self._after_reset
@@ -183,7 +185,7 @@ class VecEnvAdapter(VectorEnv):
             )
         return self._obs
 
-    def infos(self, begun: bool = False) -> list[dict[str, Any]]:
+    def infos(self, begun: bool = False) -> list[Info]:
         return self.venv.reset_infos if begun else super().infos()
 
     def call(self, name: str) -> list[Any]:
@@ -201,14 +203,14 @@ class VecEnvAdapter(VectorEnv):
         reward = self._over_batches("compute_reward", np.float32)
         return None if reward is None else GoalFunctions(reward, self._over_batches("compute_terminated", np.bool_))
 
-    def _over_batches(self, name: str, dtype: Any) -> Any:
+    def _over_batches(self, name: str, dtype: DTypeLike) -> Any:
         """Returns a method of the first environment as a function of batches, None if there is none."""
         if not self.venv.has_attr(name):
             return None
         one = lambda achieved, desired, info: self.venv.env_method(name, achieved, desired, info, indices=[0])[0]  # noqa: E731
         return goals_module.over_batches(one, dtype)
 
-    def original_obs(self, final: bool) -> Any:
+    def original_obs(self, final: bool) -> Observation:
         """Returns the observations of the last step as they were before ``VecNormalize``, the outermost wrapper.
 
         With ``final``, those where an episode ended are its last ones, else the first ones of the next.
@@ -225,7 +227,7 @@ class VecEnvAdapter(VectorEnv):
     def close(self) -> None:
         self.venv.close()
 
-    def _cast(self, obs: Any) -> Any:
+    def _cast(self, obs: Observation) -> Observation:
         try:
             return validation.to_batch(self.observation_space, self._leaves, self.n_envs, obs)
         except BadEnvironmentError as error:
@@ -253,20 +255,20 @@ class AutoResetView(SingleEnvs):
     def __init__(self, vector: VectorEnv) -> None:
         self.vector = vector
         super().__init__(vector.n_envs, vector.observation_space, vector.action_space)
-        self._actions: Any = None
+        self._actions: Action = None
 
-    def reset(self) -> Any:
+    def reset(self) -> Observation:
         seed = self._seeds[0]
         self._reset_seeds()
         return jax.tree.map(np.copy, self.vector.reset(seed))
 
-    def step_async(self, actions: Any) -> None:
+    def step_async(self, actions: Action) -> None:
         self._actions = np.asarray(actions)
 
     def step_wait(self) -> VecEnvStepReturn:
         step = self.vector.step(self._actions)
         dones = step.terminated | step.truncated
-        infos: list[dict[str, Any]] = []
+        infos: list[Info] = []
         given = self.vector.infos()
         for i in range(self.num_envs):
             info = dict(given[i])
@@ -283,7 +285,7 @@ class AutoResetView(SingleEnvs):
     def close(self) -> None:
         self.vector.close()
 
-    def _call(self, indices: VecEnvIndices, function: Callable[..., Any], *arguments: Any) -> list[Any]:
+    def _call(self, indices: VecEnvIndices, function: Callable[..., Any], *arguments: object) -> list[Any]:
         if function is is_wrapped:
             return [False for _ in self._get_indices(indices)]
         raise AttributeError(

@@ -21,6 +21,7 @@ import numpy as np
 from gymnasium.vector.utils import concatenate, create_empty_array
 
 from rejeu.core.errors import requires
+from rejeu.core.types import Action, Info, Observation, Settings
 from rejeu.envs.rendering import check_renders, rgb_frame
 from rejeu.envs.workers.process import call_method
 from rejeu.logs.formatting import counted
@@ -70,17 +71,17 @@ class VecEnv(ABC):
         self.num_envs = num_envs
         self.observation_space, self.action_space = observation_space, action_space
         self.metadata, self.render_mode = {}, None
-        self.reset_infos: list[dict[str, Any]] = [{} for _ in range(num_envs)]
+        self.reset_infos: list[Info] = [{} for _ in range(num_envs)]
         """Info returned by the last ``reset`` of each environment."""
         self._seeds: list[int | None] = [None] * num_envs
         self._options: list[dict[str, Any] | None] = [None] * num_envs
 
     @abstractmethod
-    def reset(self) -> Any:
+    def reset(self) -> Observation:
         """Resets every environment and returns the observations ``(num_envs, ...)``."""
 
     @abstractmethod
-    def step_async(self, actions: Any) -> None:
+    def step_async(self, actions: Action) -> None:
         """Starts a step with one action for each environment."""
 
     @abstractmethod
@@ -96,12 +97,12 @@ class VecEnv(ABC):
         """Returns an attribute of each environment."""
 
     @abstractmethod
-    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+    def set_attr(self, attr_name: str, value: object, indices: VecEnvIndices = None) -> None:
         """Sets an attribute of each environment."""
 
     @abstractmethod
     def env_method(
-        self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
+        self, method_name: str, *method_args: object, indices: VecEnvIndices = None, **method_kwargs: Any
     ) -> list[Any]:
         """Calls a method of each environment and returns the results."""
 
@@ -113,7 +114,7 @@ class VecEnv(ABC):
         spaces = f"observations {self.observation_space}, actions {self.action_space}"
         return f"<{type(self).__name__}: {counted(self.num_envs, 'environment')}, {spaces}>"
 
-    def step(self, actions: Any) -> VecEnvStepReturn:
+    def step(self, actions: Action) -> VecEnvStepReturn:
         """Steps every environment and returns observations, rewards, dones and infos.
 
         Where an episode ended, the observation is the first of the next episode, and ``info["terminal_observation"]`` is
@@ -192,7 +193,7 @@ class VecEnv(ABC):
     def _reset_options(self) -> None:
         self._options = [None] * self.num_envs
 
-    def _check_count(self, actions: Any) -> None:
+    def _check_count(self, actions: Action) -> None:
         if len(actions) < self.num_envs:
             raise ValueError(f"step got {len(actions)} actions for {self.num_envs} environments")
         if len(actions) > self.num_envs:
@@ -213,7 +214,7 @@ class SingleEnvs(VecEnv):
     """A vector of Gymnasium environments, in this process or in others. Abstract."""
 
     @abstractmethod
-    def _call(self, indices: VecEnvIndices, function: Callable[..., Any], *arguments: Any) -> list[Any]:
+    def _call(self, indices: VecEnvIndices, function: Callable[..., Any], *arguments: object) -> list[Any]:
         """Returns ``function(env, *arguments)`` of some environments."""
 
     def get_images(self) -> list[np.ndarray]:
@@ -223,7 +224,7 @@ class SingleEnvs(VecEnv):
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         return self._call(indices, methodcaller("get_wrapper_attr", attr_name))
 
-    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+    def set_attr(self, attr_name: str, value: object, indices: VecEnvIndices = None) -> None:
         """Sets an attribute of each environment.
 
         It is set where it exists, also inside wrappers. (Stable-Baselines3 sets it on the outermost wrapper, where the
@@ -232,14 +233,14 @@ class SingleEnvs(VecEnv):
         self._call(indices, methodcaller("set_wrapper_attr", attr_name, value))
 
     def env_method(
-        self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
+        self, method_name: str, *method_args: object, indices: VecEnvIndices = None, **method_kwargs: Any
     ) -> list[Any]:
         return self._call(indices, call_method, method_name, method_args, method_kwargs)
 
     def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
         return self._call(indices, is_wrapped, wrapper_class)
 
-    def _stepped(self, answers: Iterable[Any]) -> VecEnvStepReturn:
+    def _stepped(self, answers: Iterable[object]) -> VecEnvStepReturn:
         """Returns what :func:`rejeu.envs.workers.process.step_and_reset` returned for each environment as one result."""
         obs, rewards, terminated, truncated, infos, finals, reset_infos = map(list, zip(*answers, strict=True))
         dones = np.logical_or(terminated, truncated)
@@ -283,7 +284,7 @@ class VecEnvWrapper(VecEnv):
         self.metadata, self.render_mode = venv.metadata, venv.render_mode
         self.reset_infos = getattr(venv, "reset_infos", self.reset_infos)  # its own __init__ may not call VecEnv's
 
-    def step_async(self, actions: Any) -> None:
+    def step_async(self, actions: Action) -> None:
         self.venv.step_async(actions)
 
     def close(self) -> None:
@@ -307,11 +308,11 @@ class VecEnvWrapper(VecEnv):
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         return self.venv.get_attr(attr_name, indices)
 
-    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+    def set_attr(self, attr_name: str, value: object, indices: VecEnvIndices = None) -> None:
         self.venv.set_attr(attr_name, value, indices)
 
     def env_method(
-        self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
+        self, method_name: str, *method_args: object, indices: VecEnvIndices = None, **method_kwargs: Any
     ) -> list[Any]:
         return self.venv.env_method(method_name, *method_args, indices=indices, **method_kwargs)
 
@@ -335,10 +336,10 @@ class ObservationWrapper(VecEnvWrapper):
     """A wrapper that maps observations, those of ``terminal_observation`` included. Abstract."""
 
     @abstractmethod
-    def map_observation(self, obs: Any) -> Any:
+    def map_observation(self, obs: Observation) -> Observation:
         """Returns the observation of one or of several environments as this wrapper shows it."""
 
-    def reset(self) -> Any:
+    def reset(self) -> Observation:
         return self.map_observation(self.venv.reset())
 
     def step_wait(self) -> VecEnvStepReturn:
@@ -389,13 +390,13 @@ def tile_images(images: Sequence[np.ndarray]) -> np.ndarray:
     return np.concatenate([np.concatenate(filled[r * columns : (r + 1) * columns], axis=1) for r in range(rows)])
 
 
-def stacked(space: gym.Space, parts: list[Any]) -> Any:
+def stacked(space: gym.Space, parts: list[Any]) -> Observation:
     """Returns the observations of all environments as one, ``(num_envs, ...)``."""
     empty: Any = create_empty_array(space, len(parts))
     return concatenate(space, parts, empty)
 
 
-def by_key(obs: Any) -> dict[str, Any]:
+def by_key(obs: Observation) -> dict[str, Observation]:
     """Returns Dict observations as they are, others under the key ``""``."""
     return obs if isinstance(obs, dict) else {"": obs}
 

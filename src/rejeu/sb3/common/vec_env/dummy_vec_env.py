@@ -8,6 +8,7 @@ from typing import Any
 import gymnasium as gym
 
 from rejeu.core.errors import BadEnvironmentError
+from rejeu.core.types import Action, Observation
 from rejeu.envs.validation import environment_fault, id_of, reset_env, with_location
 from rejeu.envs.workers.process import as_declared, step_and_reset
 from rejeu.sb3.common.vec_env.base_vec_env import SingleEnvs, VecEnvIndices, VecEnvStepReturn, stacked
@@ -53,10 +54,10 @@ class DummyVecEnv(SingleEnvs):
         self.metadata, self.render_mode = self.envs[0].metadata, self.envs[0].render_mode
         self.n_steps = 0
         """Number of steps of the vector."""
-        self._actions: Any = None
+        self._actions: Action = None
         self._encode = [as_declared(env.observation_space) for env in self.envs]
 
-    def reset(self) -> Any:
+    def reset(self) -> Observation:
         parts = []
         for i, env in enumerate(self.envs):
             obs, self.reset_infos[i] = self._located(i, reset_env, env, self._seeds[i], self._options[i])
@@ -65,7 +66,7 @@ class DummyVecEnv(SingleEnvs):
         self._reset_options()
         return stacked(self.observation_space, parts)
 
-    def step_async(self, actions: Any) -> None:
+    def step_async(self, actions: Action) -> None:
         self._check_count(actions)
         self._actions = actions
 
@@ -77,7 +78,7 @@ class DummyVecEnv(SingleEnvs):
             for i, (env, encode, action) in enumerate(zip(self.envs, self._encode, self._actions, strict=False))
         )
 
-    def _located(self, i: int, function: Callable[..., Any], *arguments: Any) -> Any:
+    def _located(self, i: int, function: Callable[..., Any], *arguments: object) -> Any:
         """Calls a function; says of an invalid value that it is of environment ``i``."""
         try:
             return function(*arguments)
@@ -89,5 +90,5 @@ class DummyVecEnv(SingleEnvs):
         for env in self.envs:
             env.close()
 
-    def _call(self, indices: VecEnvIndices, function: Callable[..., Any], *arguments: Any) -> list[Any]:
+    def _call(self, indices: VecEnvIndices, function: Callable[..., Any], *arguments: object) -> list[Any]:
         return [function(self.envs[i], *arguments) for i in self._get_indices(indices)]

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
+from rejeu.core.types import Info, Observation, Settings
 from rejeu.sb3.common.vec_env.base_vec_env import TERMINAL_OBSERVATION, by_key, is_image
 
 __all__ = ["StackedObservations"]
@@ -42,7 +43,7 @@ class StackedObservations:
         parts = observation_space.spaces if isinstance(observation_space, spaces.Dict) else {"": observation_space}
         if isinstance(channels_order, Mapping) and not is_dict:
             raise TypeError(f"channels_order={channels_order!r} must be one value for observations {observation_space}")
-        stacked: dict[str, Any] = {}
+        stacked: dict[str, Observation] = {}
         for key, space in parts.items():
             if not isinstance(space, spaces.Box):
                 raise TypeError(f"VecFrameStack stacks Box observations, got {space}" + f" under {key!r}" * bool(key))
@@ -68,12 +69,12 @@ class StackedObservations:
         shape[axis] *= n_stack
         return is_first, 1 if is_first else -1, tuple(shape), axis
 
-    def reset(self, observation: Any) -> Any:
+    def reset(self, observation: Observation) -> Observation:
         """Returns the stacks of first observations."""
         self._stack = {key: self._begun(key, newest) for key, newest in by_key(observation).items()}
         return self._stacked()
 
-    def update(self, observations: Any, dones: np.ndarray, infos: list[dict[str, Any]]) -> tuple[Any, list[Any]]:
+    def update(self, observations: Observation, dones: np.ndarray, infos: list[Info]) -> tuple[Any, list[Any]]:
         """Returns the stacks after a step, and the infos, whose ``terminal_observation`` become stacks too."""
         ended = np.flatnonzero(dones).tolist()
         last = {i: by_key(infos[i][TERMINAL_OBSERVATION]) for i in ended if TERMINAL_OBSERVATION in infos[i]}
@@ -94,6 +95,6 @@ class StackedObservations:
         missing = [np.zeros_like(newest)] * (self.n_stack - 1)
         return np.concatenate([*missing, newest], axis=self._axes[key] + 1)
 
-    def _stacked(self) -> Any:
+    def _stacked(self) -> Observation:
         copies = {key: stack.copy() for key, stack in self._stack.items()}
         return copies.get("", copies)

@@ -8,6 +8,7 @@ from typing import Any
 import gymnasium as gym
 
 from rejeu.core.errors import BadEnvironmentError, WorkerError
+from rejeu.core.types import Action, Observation
 from rejeu.envs.validation import with_location
 from rejeu.envs.workers.pool import RESTARTED, TIMEOUT, Processes, ProcessWorker, Restarted, Workers
 from rejeu.envs.workers.process import WorkerFailure
@@ -65,7 +66,7 @@ class SubprocVecEnv(SingleEnvs):
         """The processes, one for each environment."""
         return [worker.process for worker in self.workers.workers if isinstance(worker, ProcessWorker)]
 
-    def reset(self) -> Any:
+    def reset(self) -> Observation:
         for i, (obs, info) in self._reset(range(self.num_envs)).items():
             self._last[i], self.reset_infos[i] = obs, info
         self._reset_seeds()
@@ -82,7 +83,7 @@ class SubprocVecEnv(SingleEnvs):
             done |= {i: reply for i, reply in replies.items() if not isinstance(reply, Restarted)}
         return done
 
-    def step_async(self, actions: Any) -> None:
+    def step_async(self, actions: Action) -> None:
         self._check_count(actions)
         self._n_steps += 1
         self.workers.send(
@@ -103,7 +104,7 @@ class SubprocVecEnv(SingleEnvs):
         """Ends the processes; a second call does nothing."""
         self.workers.close()
 
-    def _call(self, indices: VecEnvIndices, function: Callable[..., Any], *arguments: Any) -> list[Any]:
+    def _call(self, indices: VecEnvIndices, function: Callable[..., Any], *arguments: object) -> list[Any]:
         """Calls ``function(env, *arguments)`` in some processes and returns the results.
 
         Raises:

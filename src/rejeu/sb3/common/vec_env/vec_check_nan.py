@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from rejeu.core.errors import BadEnvironmentError
+from rejeu.core.types import Action, Observation
 from rejeu.sb3.common.vec_env.base_vec_env import VecEnv, VecEnvStepReturn, VecEnvWrapper, by_key
 
 __all__ = ["VecCheckNan"]
@@ -36,12 +37,12 @@ class VecCheckNan(VecEnvWrapper):
         self._last_actions: Any = None
         """Actions of the last step, None after a reset."""
 
-    def step_async(self, actions: Any) -> None:
+    def step_async(self, actions: Action) -> None:
         self._check(actions, "the actions")
         self._last_actions = actions
         self.venv.step_async(actions)
 
-    def reset(self) -> Any:
+    def reset(self) -> Observation:
         obs = self.venv.reset()
         self._last_actions = None
         self._check(obs, "the observations of reset")
@@ -53,7 +54,7 @@ class VecCheckNan(VecEnvWrapper):
         self._check(rewards, "the rewards")
         return obs, rewards, dones, infos
 
-    def _check(self, values: Any, name: str) -> None:
+    def _check(self, values: object, name: str) -> None:
         if self._warned and self.warn_once and not self.raise_exception:
             return
         for key, value in by_key(values).items():

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
+from rejeu.core.types import Observation
 from rejeu.sb3.common.vec_env.base_vec_env import VecEnv, VecEnvStepReturn, VecEnvWrapper
 from rejeu.sb3.common.vec_env.stacked_observations import StackedObservations
 
@@ -29,7 +29,7 @@ class VecFrameStack(VecEnvWrapper):
         self.stacked_obs = StackedObservations(venv.num_envs, n_stack, venv.observation_space, channels_order)
         super().__init__(venv, self.stacked_obs.stacked_observation_space)
 
-    def reset(self) -> Any:
+    def reset(self) -> Observation:
         return self.stacked_obs.reset(self.venv.reset())
 
     def step_wait(self) -> VecEnvStepReturn:

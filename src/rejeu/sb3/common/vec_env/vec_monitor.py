@@ -5,10 +5,10 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from rejeu.core.types import Info, JsonObject, Observation
 from rejeu.sb3.common.monitor import Monitor, ResultsWriter, keywords_of
 from rejeu.sb3.common.vec_env.base_vec_env import VecEnv, VecEnvStepReturn, VecEnvWrapper
 
@@ -42,7 +42,7 @@ class VecMonitor(VecEnvWrapper):
             self._file.close()
         super().close()
 
-    def reset(self) -> Any:
+    def reset(self) -> Observation:
         self.episode_returns = np.zeros(self.num_envs)
         self.episode_lengths = np.zeros(self.num_envs, np.int64)
         return self.venv.reset()
@@ -56,9 +56,9 @@ class VecMonitor(VecEnvWrapper):
             infos[i] = {**infos[i], "episode": self._end_episode(i, infos[i])}
         return obs, rewards, dones, infos
 
-    def _end_episode(self, i: int, info: dict[str, Any]) -> dict[str, Any]:
+    def _end_episode(self, i: int, info: Info) -> Info:
         seconds = round(time.time() - self.t_start, 6)
-        row: dict[str, Any] = {"r": float(self.episode_returns[i]), "l": int(self.episode_lengths[i]), "t": seconds}
+        row: JsonObject = {"r": float(self.episode_returns[i]), "l": int(self.episode_lengths[i]), "t": seconds}
         row |= keywords_of(info, self.info_keywords)
         self.episode_count += 1
         self.episode_returns[i] = self.episode_lengths[i] = 0

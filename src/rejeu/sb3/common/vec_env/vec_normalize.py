@@ -22,6 +22,7 @@ from rejeu.checkpoints.pickled import array_of, explained, read_normalization
 from rejeu.core import checkpoint
 from rejeu.core.errors import CheckpointError
 from rejeu.core.records import convert
+from rejeu.core.types import Observation
 from rejeu.sb3.common.running_mean_std import RunningMeanStd
 from rejeu.sb3.common.vec_env.base_vec_env import (
     TERMINAL_OBSERVATION,
@@ -159,7 +160,7 @@ class VecNormalize(VecEnvWrapper):
         VecEnvWrapper.__init__(self, venv, view.observation_space)
         self.returns, self.old_reward = np.zeros(self.num_envs), np.zeros(self.num_envs, np.float32)
 
-    def reset(self) -> Any:
+    def reset(self) -> Observation:
         obs = self.venv.reset()
         self.old_obs, self.returns = obs, np.zeros(self.num_envs)
         self._update(obs)
@@ -186,16 +187,16 @@ class VecNormalize(VecEnvWrapper):
         self.returns[dones] = 0.0
         return self.normalize_obs(obs), self.normalize_reward(rewards), dones, infos
 
-    def _update(self, obs: Any) -> None:
+    def _update(self, obs: Observation) -> None:
         if self.training and self.norm_obs:
             for key, moments in by_key(self.obs_rms).items():
                 moments.update(by_key(obs)[key])
 
-    def normalize_obs(self, obs: Any) -> Any:
+    def normalize_obs(self, obs: Observation) -> Any:
         """Returns normalized observations; does not update the statistics."""
         return self._map(obs, self._scale)
 
-    def unnormalize_obs(self, obs: Any) -> Any:
+    def unnormalize_obs(self, obs: Observation) -> Any:
         """Returns the original observations, except where they were clipped."""
         return self._map(obs, self._unscale)
 
@@ -218,7 +219,7 @@ class VecNormalize(VecEnvWrapper):
         """Returns the original rewards of the last step."""
         return self.old_reward.copy()
 
-    def _map(self, obs: Any, function: Any) -> Any:
+    def _map(self, obs: Observation, function: Any) -> Any:
         if not self.norm_obs:
             return obs
         parts = by_key(obs)

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from gymnasium import spaces
 
+from rejeu.core.types import Observation
 from rejeu.sb3.common.vec_env.base_vec_env import ObservationWrapper, VecEnv, by_key, is_image
 
 __all__ = ["VecTransposeImage"]
@@ -44,12 +43,12 @@ class VecTransposeImage(ObservationWrapper):
         """Returns an image, or a batch of images, with the channels first."""
         return np.moveaxis(image, -1, -3)
 
-    def transpose_observations(self, observations: Any) -> Any:
+    def transpose_observations(self, observations: Observation) -> Observation:
         """Returns observations with their images transposed."""
         parts = by_key(observations)
         transposed = {key: self.transpose_image(image) if key in self._keys else image for key, image in parts.items()}
         return transposed.get("", transposed)
 
-    def map_observation(self, obs: Any) -> Any:
+    def map_observation(self, obs: Observation) -> Observation:
         """Returns observations with their images transposed."""
         return self.transpose_observations(obs)

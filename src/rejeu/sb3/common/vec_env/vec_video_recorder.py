@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
+from rejeu.core.types import Observation
 from rejeu.envs.rendering import check_renders
 from rejeu.logs.video import VideoFile
 from rejeu.sb3.common.vec_env.base_vec_env import VecEnv, VecEnvStepReturn, VecEnvWrapper, tile_images
@@ -60,7 +60,7 @@ class VecVideoRecorder(VecEnvWrapper):
         """Whether a recording is in progress."""
         return self._video is not None
 
-    def reset(self) -> Any:
+    def reset(self) -> Observation:
         obs = self.venv.reset()
         if self.record_video_trigger(self.step_id):
             self._start()
