@@ -85,7 +85,7 @@ class OriginalPolicy(NamedTuple):
         """Returns whether there is a module of that name."""
         return any(key.startswith(f"{prefix}.") for key in self.weights)
 
-    def order(self, extra: int = 0) -> Any:
+    def order(self, extra: int = 0) -> np.ndarray | slice:
         """Returns the index in theirs of each feature of ours, with ``extra`` further inputs at the end."""
         sizes = {leaf.path: self.n_features(leaf) for leaf in self.leaves}
         if not self.keys or self.keys == [*sizes]:
@@ -189,7 +189,7 @@ def plain(policy: OriginalPolicy, extractor: str, hidden: Sequence[str], head: N
     return under("encoder", encoder(policy, extractor)) | under("torso", mlp(hidden, order)) | under("head", head)
 
 
-def reordered(head: Network, order: Any) -> Network:
+def reordered(head: Network, order: np.ndarray | slice) -> Network:
     """Returns a layer whose inputs are in another order."""
     weight = head["weight"]
     return {**head, "weight": lambda view: weight(view)[order]}

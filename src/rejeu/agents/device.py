@@ -115,7 +115,7 @@ def reducible(run: Run) -> str:
     return f"buffer_size (it is {run.replay.ring.rows * run.replay.ring.n_envs:,})"
 
 
-def total(leaves: Sequence[Any]) -> int:
+def total(leaves: Sequence[jax.ShapeDtypeStruct]) -> int:
     """Returns the bytes of arrays of these shapes and dtypes."""
     return sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in leaves)
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Any
 
 import equinox as eqx
 import jax
+from jax import Array
 
 from rejeu.core import algorithm as core, normalization
 from rejeu.core.spaces import Leaf
@@ -40,7 +40,7 @@ def describe(state: PyTree, leaves: tuple[Leaf, ...]) -> str:
 
 def layers(network: PyTree) -> list[tuple[str, str, str]]:
     """Returns a row for each layer: its name, the shapes of its arrays, and its number of parameters."""
-    by_layer: dict[str, list[tuple[str, Any]]] = {}
+    by_layer: dict[str, list[tuple[str, Array]]] = {}
     for path, leaf in zip(core.names(network), jax.tree.leaves(network), strict=True):
         layer, _, name = path.rpartition(".")
         by_layer.setdefault(layer, []).append((name, leaf))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -86,7 +86,7 @@ class RecordVideo:
         """Returns its state for a checkpoint."""
         return {"n_episodes": self._n_episodes, "paths": [str(path) for path in self.paths]}
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+    def load_state_dict(self, state: JsonObject) -> None:
         """Restores what :meth:`state_dict` returned."""
         self._n_episodes = int(state["n_episodes"])
         self.paths = [Path(path) for path in state["paths"]]

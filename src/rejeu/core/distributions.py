@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+
+from rejeu.core.types import PyTree
 
 LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
 FORBIDDEN = -1e9
@@ -181,7 +183,7 @@ class Bernoulli(NamedTuple):
 class Joint(NamedTuple):
     """Independent parts of one action; a value is the values of the parts one after the other, ``float32 (..., width)``."""
 
-    parts: tuple[Any, ...]
+    parts: tuple[PyTree, ...]
     """Distributions of the same leading shape."""
 
     def sample(self, key: Array) -> Array:
@@ -214,7 +216,7 @@ class Joint(NamedTuple):
         return jnp.concatenate([column.astype(jnp.float32) for column in columns], axis=-1)
 
 
-def width(distribution: Any) -> int:
+def width(distribution: PyTree) -> int:
     """Returns the numbers of a value of a distribution."""
     if isinstance(distribution, Joint):
         return sum(map(width, distribution.parts))

@@ -19,6 +19,7 @@ import numpy as np
 from msgspec import Meta
 
 from rejeu.core.errors import CheckpointError, printable
+from rejeu.core.types import JsonObject
 
 T = TypeVar("T")
 
@@ -107,7 +108,7 @@ def json_text(value: object, indent: int = 1) -> str:
     return json.dumps(value, indent=indent, allow_nan=False, default=_as_dict) + "\n"
 
 
-def _as_dict(value: Any) -> dict[str, Any]:
+def _as_dict(value: Any) -> JsonObject:
     """Returns a mapping, or the fields of a dataclass, as a dict."""
     if isinstance(value, Mapping):
         return dict(value)

@@ -42,7 +42,7 @@ class Linear:
         coerce(self, ("start", "end"), number)
         coerce(self, "fraction", number, above=0, most=1)
 
-    def __call__(self, progress: Scalar) -> Any:
+    def __call__(self, progress: Scalar) -> Scalar:
         done = _clip(progress / self.fraction)
         return self.start + (self.end - self.start) * done
 
@@ -66,7 +66,7 @@ class Exponential:
         coerce(self, ("start", "end"), number, above=0)
         coerce(self, "fraction", number, above=0, most=1)
 
-    def __call__(self, progress: Scalar) -> Any:
+    def __call__(self, progress: Scalar) -> Scalar:
         done = _clip(progress / self.fraction)
         return self.start * (self.end / self.start) ** done
 
@@ -87,7 +87,7 @@ class TableSchedule:
         if len(self.values) < 2 or not all(map(math.isfinite, self.values)):
             raise ValueError(f"a schedule needs two values or more, all finite; got {self.values!s:.80}")
 
-    def __call__(self, progress: Scalar) -> Any:
+    def __call__(self, progress: Scalar) -> Scalar:
         position = _clip(progress) * (len(self.values) - 1)
         if isinstance(position, int | float):
             below = min(int(position), len(self.values) - 2)
@@ -191,5 +191,5 @@ def to_json(schedule: Any) -> dict[str, Any]:
     return {"schedule": name, **asdict(schedule)}
 
 
-def _clip(done: Any) -> Any:
+def _clip(done: Scalar) -> Scalar:
     return min(max(done, 0.0), 1.0) if isinstance(done, int | float) else jnp.clip(done, 0.0, 1.0)

@@ -13,7 +13,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import DTypeLike
 
-from rejeu.core.types import Action, AnyArray, Observation, PyTree
+from rejeu.core.types import Action, AnyArray, JsonObject, Observation, PyTree
 from rejeu.core.validation import choice
 
 POLICIES = ("MlpPolicy", "MultiInputPolicy", "CnnPolicy")
@@ -108,7 +108,7 @@ def groups(leaves: tuple[Leaf, ...], share_goals: bool = True) -> list[int | Non
     return result
 
 
-def structure(space: spaces.Space) -> Any:
+def structure(space: spaces.Space) -> PyTree:
     """Returns the tree structure of one observation of ``space``."""
     import jax  # here, so that worker processes start without it
 
@@ -210,7 +210,7 @@ def is_finite(array: np.ndarray) -> bool:
     return bool(np.isfinite(array).all())
 
 
-def parts(space: spaces.Space, observation: Observation) -> list[Any]:
+def parts(space: spaces.Space, observation: Observation) -> list[Observation]:
     """Returns the parts of an observation, one for each of :func:`leaves`, in their order; of the space itself its leaves.
 
     Raises:
@@ -224,7 +224,7 @@ def parts(space: spaces.Space, observation: Observation) -> list[Any]:
     return [observation]
 
 
-def plain(space: spaces.Space, observation: Observation) -> Any:
+def plain(space: spaces.Space, observation: Observation) -> Observation:
     """Returns an observation as plain dicts and tuples, nested like ``space``; its arrays are not copied.
 
     JAX sorts the keys of a dict, but keeps the order of an ``OrderedDict`` (which highway-env returns), and distinguishes
@@ -240,7 +240,7 @@ def plain(space: spaces.Space, observation: Observation) -> Any:
     return observation
 
 
-def cast(space: spaces.Space, space_leaves: tuple[Leaf, ...], observation: Observation) -> Any:
+def cast(space: spaces.Space, space_leaves: tuple[Leaf, ...], observation: Observation) -> Observation:
     """Returns a batch of observations as plain dicts and tuples of arrays of the stored dtypes; copies only if needed.
 
     Raises:
@@ -399,7 +399,9 @@ def action_width(space: spaces.Space) -> int:
     return int(np.prod(space.shape or (), dtype=int))
 
 
-def nested_action(space: spaces.Dict | spaces.Tuple, action: Action, scale: Callable[[spaces.Space, Any], Any]) -> Any:
+def nested_action(
+    space: spaces.Dict | spaces.Tuple, action: Action, scale: Callable[[spaces.Space, Action], Action]
+) -> Action:
     """Returns actions ``(batch, action_width)`` of a Dict or Tuple as one, each part by ``scale(part's space, numbers)``.
 
     The arrays are of NumPy or of JAX.
@@ -412,7 +414,7 @@ def nested_action(space: spaces.Dict | spaces.Tuple, action: Action, scale: Call
     return dict(zip(_keys(space), actions, strict=True)) if isinstance(space, spaces.Dict) else tuple(actions)
 
 
-def rows(action: Action) -> Any:
+def rows(action: Action) -> Action:
     """Returns a batch of actions as a sequence of single ones: an array as it is, of a Dict or Tuple a list."""
     if isinstance(action, dict):
         parts = zip(*map(rows, action.values()), strict=True)
@@ -420,7 +422,7 @@ def rows(action: Action) -> Any:
     return [*zip(*map(rows, action), strict=True)] if isinstance(action, tuple) else action
 
 
-def scale_action(space: spaces.Space, action: Action, xp: ModuleType = np) -> Any:
+def scale_action(space: spaces.Space, action: Action, xp: ModuleType = np) -> Action:
     """Returns actions in the range of the environment from those of an algorithm.
 
     Box: from [-1, 1] to [low, high], ``(batch, action_dim)`` to ``(batch, *shape)``; actions are clipped, and components
@@ -436,7 +438,7 @@ def scale_action(space: spaces.Space, action: Action, xp: ModuleType = np) -> An
     return action_scaler(space, xp)(action)
 
 
-def action_scaler(space: spaces.Space, xp: ModuleType = np) -> Callable[[Any], Any]:
+def action_scaler(space: spaces.Space, xp: ModuleType = np) -> Callable[[Action], Action]:
     """Returns :func:`scale_action` for one space."""
     if isinstance(space, spaces.Dict | spaces.Tuple):
         return lambda action: nested_action(space, action, lambda member, numbers: scale_action(member, numbers, xp))
@@ -458,7 +460,7 @@ def action_scaler(space: spaces.Space, xp: ModuleType = np) -> Callable[[Any], A
 
 def box_scaler(
     space: spaces.Box, shape: tuple[int, ...], dtype: DTypeLike | None, xp: ModuleType
-) -> Callable[[Any], Any]:
+) -> Callable[[Action], Action]:
     """Returns :func:`scale_action` for a Box."""
     if space.dtype == np.float32 and (space.low == -1.0).all() and (space.high == 1.0).all():
         return lambda action: action.reshape(shape).clip(-1.0, 1.0)
@@ -497,7 +499,7 @@ def unscale_action(space: spaces.Space, action: np.ndarray) -> np.ndarray:
     return scaled.astype(np.float32).reshape(len(action), -1)
 
 
-def random_action(space: spaces.Space, n: int, rng: Any, mask: Any = None) -> Any:
+def random_action(space: spaces.Space, n: int, rng: Any, mask: AnyArray = None) -> AnyArray:
     """Returns ``n`` uniformly random actions in the algorithm's range (see :func:`scale_action`).
 
     With ``mask``, ``bool (n, n_actions)``, the actions are Discrete and among the allowed ones.
@@ -521,7 +523,7 @@ def random_action(space: spaces.Space, n: int, rng: Any, mask: Any = None) -> An
     raise TypeError(f"the actions are {space}; agents choose Box, Discrete, MultiDiscrete, MultiBinary, Dict and Tuple")
 
 
-def nth_allowed(mask: AnyArray, n: AnyArray) -> Any:
+def nth_allowed(mask: AnyArray, n: AnyArray) -> AnyArray:
     """Returns the actions that are the ``n``-th allowed ones, counted from 0; arrays of NumPy or of JAX.
 
     >>> nth_allowed(np.array([[False, True, True]]), np.array([1])).tolist()
@@ -561,7 +563,7 @@ def same(space: spaces.Space, compared: spaces.Space, bounds: bool) -> bool:
     return leaves(space) == leaves(compared)
 
 
-def describe(space: spaces.Space, single: bool = False) -> Any:
+def describe(space: spaces.Space, single: bool = False) -> JsonObject:
     """Returns a description of a space in JSON values; infinite bounds are strings. With ``single`` floats are float32."""
     if isinstance(space, spaces.Dict):
         return {"Dict": {key: describe(subspace, single) for key, subspace in sorted(space.spaces.items())}}
@@ -583,7 +585,7 @@ def describe(space: spaces.Space, single: bool = False) -> Any:
     raise TypeError(f"cannot describe the space {space}")
 
 
-def rebuild(description: Any, largest: int = MAX_NUMBERS) -> spaces.Space:
+def rebuild(description: object, largest: int = MAX_NUMBERS) -> spaces.Space:
     """Returns the space that :func:`describe` described: the inverse, over a fixed set of names.
 
     Args:
@@ -646,7 +648,7 @@ def _bounds(bounds: np.ndarray, dtype: DTypeLike | None) -> Any:
     return numbers.flat[0] if values.size and (values == values.flat[0]).all() else numbers.tolist()
 
 
-def as_batch(observation: Observation, space: spaces.Space, leaves: Sequence[Leaf]) -> tuple[Any, bool]:
+def as_batch(observation: Observation, space: spaces.Space, leaves: Sequence[Leaf]) -> tuple[Observation, bool]:
     """Returns observations as a batch of arrays of the right types, and whether it was a single observation.
 
     The arguments and errors are those of :func:`batch_arrays`.

@@ -17,7 +17,7 @@ from gymnasium.envs.registration import EnvSpec
 from rejeu.core import atomic
 from rejeu.core.errors import requires
 from rejeu.core.failed_writes import FailedWrites
-from rejeu.core.types import Action, Observation
+from rejeu.core.types import Action, Observation, PyTree
 from rejeu.demonstrations import dataset
 from rejeu.envs.validation import id_of
 from rejeu.logs.formatting import counted
@@ -75,7 +75,7 @@ class Recording:
         self._writes = FailedWrites()
         self._video = None if fps is None else VideoFile(self.folder / VIDEO_NAME, fps)
         self._seed: int | None = None
-        self._steps: list[tuple[Any, ...]] = []
+        self._steps: list[tuple[PyTree, ...]] = []
         """Of the running episode: ``(obs,)``, then ``(obs, action, reward, terminated, truncated)``."""
         self._frame: Any = None
 

@@ -9,13 +9,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rejeu.core.errors import requires
-from rejeu.core.types import Action
+from rejeu.core.types import Action, PyTree
 
 
 class Scene(NamedTuple):
     """The states of an episode to draw."""
 
-    states: list[Any]
+    states: list[PyTree]
     """The states of the episode up to now, as NumPy arrays."""
     action: Action
     """The last action; None after a reset."""

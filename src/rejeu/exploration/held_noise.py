@@ -9,7 +9,7 @@ after ``n`` steps and where an episode begins. Each ``n`` is drawn with a probab
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -31,7 +31,7 @@ class Held(NamedTuple):
     """Steps for which it stays, ``int32 (n_envs,)``."""
 
 
-def held_explorer(policy: Callable[[Any, PyTree], TanhNormal], action_dim: int, max_steps: int) -> Explorer:
+def held_explorer(policy: Callable[[PyTree, PyTree], TanhNormal], action_dim: int, max_steps: int) -> Explorer:
     """Returns exploration by the policy with noise that is held for up to ``max_steps`` steps."""
 
     def init(actor: PyTree, n_envs: int) -> Held:

@@ -78,7 +78,7 @@ class ActionNoise(ABC):
     sigma: tuple[float, ...]
     _rng: np.random.Generator | None = None
     """Of :meth:`__call__`."""
-    _state: Any = None
+    _state: PyTree = None
     """That of :meth:`__call__`; None at the start of an episode."""
 
     @abstractmethod
@@ -228,7 +228,7 @@ class OrnsteinUhlenbeckActionNoise(ActionNoise):
         return state, action
 
 
-def barrier(action: Action) -> Any:
+def barrier(action: Action) -> AnyArray:
     """Returns the repulsive barrier ``B(u) = (pi u / 2)^6``, which is flat within [-1, 1] and steep beyond.
 
     >>> float(barrier(2 / math.pi))
@@ -237,7 +237,7 @@ def barrier(action: Action) -> Any:
     return (0.5 * math.pi * action) ** 6
 
 
-def barrier_slope(action: Action) -> Any:
+def barrier_slope(action: Action) -> AnyArray:
     """Returns the barrier's derivative ``B'(u) = 3 pi (pi u / 2)^5``: the push for a ``repulsive`` of 1."""
     return 3.0 * math.pi * (0.5 * math.pi * action) ** 5
 

@@ -11,7 +11,6 @@ import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from string import Template
-from typing import Any
 
 import numpy as np
 
@@ -43,7 +42,7 @@ def identifier(name: str) -> str:
     return f"{name}_" if {name, name.removesuffix("f"), name.removesuffix("l")} & TAKEN else name
 
 
-def filled(template: str, **texts: Any) -> bytes:
+def filled(template: str, **texts: object) -> bytes:
     """Returns a file made of one of the templates."""
     return Template((TEMPLATES / template).read_text(encoding="utf-8")).substitute(texts).encode()
 

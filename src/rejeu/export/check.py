@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
 
+from rejeu.core.types import AnyArray
 from rejeu.export.contract import Policy
 from rejeu.export.program import Value
 
@@ -90,7 +91,7 @@ def compare(policy: Policy, recording: SeenSteps, run: Run) -> Check:
     return Check(len(actions), recording.source, difference, 0, p50, p99, allowed)
 
 
-def computed(policy: Policy, in_double: bool) -> Callable[[dict[str, np.ndarray]], Mapping[str, Any]]:
+def computed(policy: Policy, in_double: bool) -> Callable[[dict[str, np.ndarray]], Mapping[str, AnyArray]]:
     """Returns a policy as a function from inputs to outputs by name, in double precision or as it is."""
     wide = lambda x: x.astype(np.float64) if in_double and x.dtype == np.float32 else x  # noqa: E731
     operations = []
@@ -104,7 +105,7 @@ def computed(policy: Policy, in_double: bool) -> Callable[[dict[str, np.ndarray]
     program = policy.program._replace(operations=tuple(operations))
     run = jax.jit(lambda *arrays: program(*arrays))
 
-    def call(inputs: dict[str, np.ndarray]) -> Mapping[str, Any]:
+    def call(inputs: dict[str, np.ndarray]) -> Mapping[str, AnyArray]:
         with jax.enable_x64(in_double):
             results = run(*(wide(inputs[port.name]) for port in policy.inputs))
             return {port.name: np.asarray(result) for port, result in zip(policy.outputs, results, strict=True)}
@@ -138,7 +139,7 @@ def is_tie(policy: Policy, inputs: Mapping[str, np.ndarray], row: int) -> bool:
     return False
 
 
-def one_by_one(policy: Policy, call: Callable[[dict[str, np.ndarray]], Mapping[str, Any]]) -> Run:
+def one_by_one(policy: Policy, call: Callable[[dict[str, np.ndarray]], Mapping[str, AnyArray]]) -> Run:
     """Returns the run of a function from inputs to outputs by name, which is given one observation at a time."""
     state = policy.of("state")
 

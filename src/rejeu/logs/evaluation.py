@@ -7,13 +7,13 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from rejeu.core import interrupt, xla
 from rejeu.core.spaces import scale_action
-from rejeu.core.types import JsonObject
+from rejeu.core.types import JsonObject, Observation
 from rejeu.envs.base import VectorEnv
 from rejeu.logs import statistics
 from rejeu.logs.formatting import counted, html_table
@@ -138,7 +138,7 @@ class Evaluation:
 
 
 def evaluate(
-    policy: Callable[[Any, np.ndarray], np.ndarray],
+    policy: Callable[[Observation, np.ndarray], np.ndarray],
     env: VectorEnv,
     episodes: int | None,
     success_threshold: float | None = None,

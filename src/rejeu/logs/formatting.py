@@ -75,7 +75,7 @@ def cell(value: str) -> str:
     return shown(value, 400)
 
 
-def csv_text(rows: Iterable[Mapping[str, Any]]) -> str:
+def csv_text(rows: Iterable[Mapping[str, object]]) -> str:
     """Returns rows as CSV. Text that a spreadsheet would take for a formula gets an apostrophe."""
     rows = [
         {

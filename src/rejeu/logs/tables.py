@@ -68,7 +68,7 @@ def evaluation_table(evaluations: Iterable[tuple[int, Any]], episodes: Table = E
     return Table({"step": steps, **columns})
 
 
-def flat(values: Mapping[str, object], prefix: str = "") -> Iterator[tuple[str, Any]]:
+def flat(values: Mapping[str, object], prefix: str = "") -> Iterator[tuple[str, object]]:
     """Yields the values of nested mappings by dotted name. A schedule is one value.
 
     >>> dict(flat({"gamma": 0.9, "policy_kwargs": {"net_arch": [8]}}))

@@ -22,7 +22,7 @@ returns the output and the network with updated statistics. Because an optimizer
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import equinox as eqx
 import jax
@@ -150,8 +150,8 @@ class RenormalizedNetwork(eqx.Module):
         leaves: tuple[Leaf, ...],
         action_dim: int | None,
         n_outputs: int,
-        make_torso: Callable[[Array, int], Any],
-        make_head: Callable[[Array, int, int], Any] = Linear,
+        make_torso: Callable[[Array, int], PyTree],
+        make_head: Callable[[Array, int, int], PyTree] = Linear,
     ) -> None:
         """Draws the weights.
 
@@ -181,7 +181,7 @@ class RenormalizedNetwork(eqx.Module):
 def with_statistics(network: Network, trained: Network) -> Network:
     """Returns ``network`` with the running statistics of ``trained``, a network of the same structure."""
 
-    def take(node: PyTree, trained_node: PyTree) -> Any:
+    def take(node: PyTree, trained_node: PyTree) -> PyTree:
         return eqx.tree_at(_statistics, node, _statistics(trained_node)) if isinstance(node, BatchRenorm) else node
 
     return jax.tree.map(take, network, trained, is_leaf=lambda node: isinstance(node, BatchRenorm))

@@ -184,7 +184,7 @@ class OwnEncoder(eqx.Module):
     module: PyTree
     n_features: int = eqx.field(static=True)
 
-    def __init__(self, key: Array, leaves: tuple[Leaf, ...], make: Callable[[Array, tuple[Leaf, ...]], Any]) -> None:
+    def __init__(self, key: Array, leaves: tuple[Leaf, ...], make: Callable[[Array, tuple[Leaf, ...]], PyTree]) -> None:
         """Builds ``make(key, leaves)``.
 
         Raises:
@@ -199,13 +199,13 @@ class OwnEncoder(eqx.Module):
         """Maps observations ``(batch, ...)`` to features ``(batch, n_features)``."""
         return self.module(self.arrange(jax.tree.leaves(unmasked(obs)[0])))
 
-    def arrange(self, arrays: list[Any]) -> Any:
+    def arrange(self, arrays: list[PyTree]) -> Any:
         """Returns what the module is called with: an array, or for a Dict or Tuple space a dict from path to array."""
         paths = [leaf.path for leaf in self.leaves]
         return arrays[0] if paths == [""] else dict(zip(paths, arrays, strict=True))
 
 
-def make_encoder(key: Array, leaves: tuple[Leaf, ...], shape: PolicyConfig) -> Any:
+def make_encoder(key: Array, leaves: tuple[Leaf, ...], shape: PolicyConfig) -> PyTree:
     """Returns the encoder of these leaves: rejeu's own, or the module of the user's."""
     if shape.encoder is not None:
         return OwnEncoder(key, leaves, find_encoder(shape.encoder))

@@ -15,7 +15,7 @@ from rejeu.core import xla
 from rejeu.core.algorithm import PyTree
 
 M = TypeVar("M", bound=Callable[..., Any])
-ENCODERS: dict[str, Callable[..., Any]] = {}
+ENCODERS: dict[str, Callable[..., PyTree]] = {}
 """Encoders by name; :func:`register_encoder` adds to it."""
 
 ACTIVATIONS: dict[str, Callable[[Array], Array]] = {
@@ -136,7 +136,7 @@ class Dropout(eqx.Module):
         return jnp.where(is_kept, x / (1.0 - self.rate), 0.0)
 
 
-def with_dropout(networks: PyTree, key: Array | None) -> Any:
+def with_dropout(networks: PyTree, key: Array | None) -> PyTree:
     """Returns stacked networks whose dropout layers draw from ``key``, each layer its own numbers; unchanged for None."""
     if key is None:
         return networks
@@ -203,7 +203,7 @@ def register_encoder(name: str) -> Callable[[M], M]:
     return register
 
 
-def find_encoder(encoder: PyTree) -> Any:
+def find_encoder(encoder: PyTree) -> PyTree:
     """Returns the encoder of a name; anything but a name is returned unchanged.
 
     Raises:
@@ -225,9 +225,9 @@ class OwnModule(eqx.Module):
     Its arrays are learned; everything else, such as an activation function, is constant.
     """
 
-    arrays: Any
+    arrays: PyTree
     """The module, with None in place of what is no array."""
-    constants: Any = eqx.field(static=True)
+    constants: PyTree = eqx.field(static=True)
     """The module, with None in place of arrays."""
     takes_batch: bool = eqx.field(static=True)
     n_outputs: int = eqx.field(static=True)
@@ -238,7 +238,7 @@ class OwnModule(eqx.Module):
         return module(x) if self.takes_batch else jax.vmap(module)(x)
 
 
-def own_module(role: str, module: PyTree, example: PyTree) -> tuple[Any, int]:
+def own_module(role: str, module: PyTree, example: PyTree) -> tuple[PyTree, int]:
     """Returns a module of the user's own as one that takes a batch, and the number of its outputs.
 
     Args:

@@ -115,7 +115,7 @@ class Cell(eqx.Module):
             absent: where there is no step, likewise; the memory is then kept. None: nowhere.
         """
 
-        def step(before: tuple[Array, ...], inputs: Any) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+        def step(before: tuple[Array, ...], inputs: PyTree) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
             projected, begins, absent = inputs
             after = self.step(renew(begins, self.empty(begins.shape[0]), before), projected)
             after = after if absent is None else renew(absent, before, after)
@@ -129,7 +129,7 @@ class Recurrent(eqx.Module):
 
     encoder: PyTree
     cell: Cell
-    reader: Any
+    reader: PyTree
     """Maps what is remembered, ``(batch, size)``; stacked networks share the memory."""
     slot: int = eqx.field(static=True)
     """Which part of the memory of all networks is that of this one."""
@@ -188,7 +188,7 @@ def with_memory(
     key: Array,
     leaves: tuple[Leaf, ...],
     shape: Any,
-    make: Callable[[tuple[Leaf, ...], Any], Any],
+    make: Callable[[tuple[Leaf, ...], PyTree], PyTree],
     slot: int = 0,
 ) -> Any:
     """Returns the networks ``make(leaves, shape)``; with a memory, they read what a cell remembers of the observations.
@@ -204,7 +204,7 @@ def with_memory(
     return Recurrent(encoder, cell, make((remembered,), dataclasses.replace(shape, encoder=None)), slot, shape.burn_in)
 
 
-def each(critics: PyTree, obs: PyTree, call: Callable[[Any, PyTree], Array]) -> Array:
+def each(critics: PyTree, obs: PyTree, call: Callable[[PyTree, PyTree], Array]) -> Array:
     """Returns ``call(critic, obs)`` of each of the stacked critics, ``(n_critics, ...)``, which may share a memory."""
     if isinstance(critics, Recurrent):
         critics, obs = critics.reader, critics.remembered(obs)

@@ -131,7 +131,7 @@ def make_torso(
     return plain, (n_inputs, *widths)[-1]
 
 
-def make_head(key: Array, n_inputs: int, n_outputs: int, shape: PolicyConfig) -> Any:
+def make_head(key: Array, n_inputs: int, n_outputs: int, shape: PolicyConfig) -> PyTree:
     """Returns the last layer of a network: a linear one, or the module of the user's own.
 
     Raises:
@@ -215,10 +215,10 @@ def actor_and_critics(
     inputs: tuple[tuple[Leaf, ...], PolicyConfig],
     n_outputs: int,
     n_critics: int,
-    critic_class: Any,
+    critic_class: type[PyTree],
     *sizes: int,
     critic_shape: PolicyConfig | None = None,
-) -> tuple[Callable[[Array], Any], Callable[[Array], Any]]:
+) -> tuple[Callable[[Array], PyTree], Callable[[Array], PyTree]]:
     """Returns functions of a key that build an actor of ``n_outputs``, and ``n_critics`` stacked critics.
 
     Args:
@@ -238,7 +238,7 @@ def actor_and_critics(
     def critics(key: Array) -> PyTree:
         size, *more = sizes
 
-        def build(leaves: tuple[Leaf, ...], shape: PolicyConfig) -> Any:
+        def build(leaves: tuple[Leaf, ...], shape: PolicyConfig) -> PyTree:
             critic = lambda key: critic_class(key, leaves, size, shape.critic_widths(), shape, *more)  # noqa: E731
             return ensemble(critic, key, n_critics)
 

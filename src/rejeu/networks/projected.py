@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import equinox as eqx
 import jax
@@ -139,12 +139,12 @@ def projected(network: Network) -> Network:
     """
     is_part = lambda node: isinstance(node, UnitLinear | RMSNorm | BatchRenorm)  # noqa: E731
 
-    def scaled(node: PyTree) -> Any:
+    def scaled(node: PyTree) -> PyTree:
         if isinstance(node, UnitLinear):
             return eqx.tree_at(lambda layer: layer.weight, node, unit(node.weight, axis=-2))
         return jax.tree.map(with_gains, node, is_leaf=is_part) if isinstance(node, InvertedResidual) else node
 
-    def with_gains(node: PyTree) -> Any:
+    def with_gains(node: PyTree) -> PyTree:
         if isinstance(node, RMSNorm):
             return eqx.tree_at(lambda norm: norm.scale, node, unit(node.scale) * math.sqrt(node.scale.shape[-1]))
         if isinstance(node, BatchRenorm):

@@ -9,7 +9,7 @@ from typing import Any, Literal, NamedTuple
 from jax import Array
 
 from rejeu.core.spaces import Leaf
-from rejeu.core.types import Settings
+from rejeu.core.types import PyTree, Settings
 from rejeu.core.validation import MOST_LAYERS, MOST_WIDTH, assign, choice, coerce, flag, number, whole
 from rejeu.networks.layers import ACTIVATIONS, find_encoder
 
@@ -69,15 +69,15 @@ class PolicyConfig:
     """Widths between the common layers and the critics' values."""
     actor_layers: tuple[int, ...] = ()
     """Widths between the common layers and the actor's outputs."""
-    encoder: Callable[[Array, tuple[Leaf, ...]], Any] | str | None = None
+    encoder: Callable[[Array, tuple[Leaf, ...]], PyTree] | str | None = None
     """Encoder of your own in every network, such as another CNN: ``encoder(key, leaves)`` returns an ``equinox.Module``
     that maps an observation to a vector; or its name, see ``rejeu.networks.register_encoder``. A model file keeps its name
     only: give it again to ``load``, unless it is registered."""
-    torso: Callable[[Array, int], Any] | None = None
+    torso: Callable[[Array, int], PyTree] | None = None
     """Hidden layers of your own in every network: ``torso(key, n_inputs)`` returns an ``equinox.Module`` that maps
     ``(n_inputs,)`` to ``(n_outputs,)``, or batches of these. A model file keeps its name only: give it again to
     ``load``."""
-    head: Callable[[Array, int, int], Any] | None = None
+    head: Callable[[Array, int, int], PyTree] | None = None
     """Last layer of your own in every network: ``head(key, n_inputs, n_outputs)`` returns an ``equinox.Module``
     likewise."""
 

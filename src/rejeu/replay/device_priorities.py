@@ -11,13 +11,14 @@ here, 64 on the host.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from rejeu.core.types import AnyArray
 from rejeu.replay.prioritized import Draw, Priorities, PriorityConfig
 
 WIDTH = 128
@@ -76,7 +77,7 @@ def changed(priorities: DevicePriorities, index: Array, value: Array) -> DeviceP
     )
 
 
-def added_up(values: Any) -> Any:
+def added_up(values: AnyArray) -> AnyArray:
     """Returns the sums over the last axis, ``WIDTH`` long, in an order that does not depend on the program."""
     width = WIDTH
     while width > 1:
@@ -165,7 +166,7 @@ def updated(
 
 
 def uploaded(
-    priorities: Priorities, td_errors: Sequence[tuple[Draw, Any]], most_updates: int, batch_size: int
+    priorities: Priorities, td_errors: Sequence[tuple[Draw, AnyArray]], most_updates: int, batch_size: int
 ) -> DevicePriorities:
     """Returns the priorities of the host, and the TD errors that are to change them, which must :func:`fit`."""
     ring = priorities.ring
@@ -188,7 +189,7 @@ def uploaded(
     return jax.tree.map(jnp.array, host)
 
 
-def fit(td_errors: Sequence[tuple[Draw, Any]], most_updates: int, batch_size: int) -> bool:
+def fit(td_errors: Sequence[tuple[Draw, AnyArray]], most_updates: int, batch_size: int) -> bool:
     """Returns whether TD errors are of whole batches, and of no more than one turn."""
     sizes = [len(draw.position) for draw, _ in td_errors]
     return all(size % batch_size == 0 for size in sizes) and sum(sizes) <= most_updates * batch_size

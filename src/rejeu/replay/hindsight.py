@@ -36,7 +36,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rejeu.core.algorithm import PyTree, Transition
-from rejeu.core.types import Observation
+from rejeu.core.types import AnyArray, Observation
 from rejeu.core.validation import assign, coerce, flag, whole
 from rejeu.envs.goals import GoalFunctions
 from rejeu.replay.prioritized import Draw, Priorities
@@ -57,31 +57,31 @@ class HindsightSteps:
     observations of one environment over the whole run, so only their differences matter.
     """
 
-    np: Any
+    np: ModuleType
     """The module that computes with the arrays: ``numpy`` or ``jax.numpy``."""
-    env: Any
+    env: AnyArray
     """Their environments."""
-    time: Any
+    time: AnyArray
     """Times of the observations; ``time + 1`` is that of the next ones."""
-    newest: Any
+    newest: AnyArray
     """Times of the newest observations of the same environments."""
     rows: int
     """How many observations of an environment are stored at most."""
-    begin: Callable[[Any], Any]
+    begin: Callable[[AnyArray], AnyArray]
     """``begin(times)`` returns the times of the first observations of the episodes at times ``(n,)``, or the oldest stored."""
-    end: Callable[[Any], Any]
+    end: Callable[[AnyArray], AnyArray]
     """``end(times)`` returns the times of the last observations of these episodes, or the newest."""
-    integers: Callable[[Any, Any], Any]
+    integers: Callable[[AnyArray, AnyArray], AnyArray]
     """``integers(low, high)`` returns random whole numbers from ``low`` to ``high - 1``, arrays ``(n,)`` or ``(n, k)``."""
-    drawn: Callable[[], tuple[Any, ...]]
+    drawn: Callable[[], tuple[AnyArray, ...]]
     """``drawn()[:2]`` are environments and times of steps drawn from all that are stored."""
-    index: Callable[[Any, Any], Any]
+    index: Callable[[AnyArray, AnyArray], AnyArray]
     """Returns positions in the ring, given environments and times."""
-    goals_at: Sequence[Callable[[Any], Any]]
+    goals_at: Sequence[Callable[[AnyArray], AnyArray]]
     """Return the achieved and the desired goals at positions."""
 
     @cached_property
-    def oldest(self) -> Any:
+    def oldest(self) -> AnyArray:
         """Times of the oldest observations of the same environments that are stored."""
         return self.np.maximum(self.newest - self.rows + 1, 0)
 
@@ -91,19 +91,19 @@ class HindsightSteps:
         return self.begin(self.time) + 1
 
     @cached_property
-    def last(self) -> Any:
+    def last(self) -> AnyArray:
         """The last times of the same episodes."""
         return self.end(self.time)
 
-    def achieved(self, times: Any) -> Any:
+    def achieved(self, times: AnyArray) -> AnyArray:
         """Returns the achieved goals of the same environments at times ``(n,)`` or ``(n, k)``."""
         return self.goals_at[0](self.index(self.env.reshape(-1, *[1] * (times.ndim - 1)), times))
 
-    def desired(self) -> Any:
+    def desired(self) -> AnyArray:
         """Returns the goals that the transitions have."""
         return self.goals_at[1](self.index(self.env, self.time))
 
-    def chosen_by(self, strategy: str | GoalStrategy) -> Any:
+    def chosen_by(self, strategy: str | GoalStrategy) -> AnyArray:
         """Returns the positions of the new goals that a strategy, or the one of this name, chooses."""
         if strategy in ANY_STEP:
             env, time = self.drawn()[:2]
@@ -121,22 +121,22 @@ those of others. Others are an error on the host, and the nearest stored time on
 :func:`register_goal_strategy` gives it a name, by which it is saved."""
 
 
-def future(steps: HindsightSteps) -> Any:
+def future(steps: HindsightSteps) -> AnyArray:
     """Returns later times."""
     return steps.integers(steps.time + 1, steps.last + 1)
 
 
-def final(steps: HindsightSteps) -> Any:
+def final(steps: HindsightSteps) -> AnyArray:
     """Returns the last times."""
     return steps.last
 
 
-def episode(steps: HindsightSteps) -> Any:
+def episode(steps: HindsightSteps) -> AnyArray:
     """Returns any times of the episodes."""
     return steps.integers(steps.first, steps.last + 1)
 
 
-def closest(steps: HindsightSteps) -> Any:
+def closest(steps: HindsightSteps) -> AnyArray:
     """Returns the time, of :data:`N_CANDIDATES` later ones, whose achieved goal has the least distance to the goal."""
     np = steps.np
     times = steps.integers(np.repeat(steps.time[:, None] + 1, N_CANDIDATES, axis=1), steps.last[:, None] + 1)
@@ -145,7 +145,7 @@ def closest(steps: HindsightSteps) -> Any:
     return np.take_along_axis(times, distance.argmin(axis=1)[:, None], axis=1)[:, 0]
 
 
-def next_future(steps: HindsightSteps) -> Any:
+def next_future(steps: HindsightSteps) -> AnyArray:
     """Returns the next time for one of :data:`N_GOALS` transitions, chosen at random, and later times for the others."""
     nothing = steps.np.zeros_like(steps.time)
     is_next = steps.integers(nothing, nothing + N_GOALS) == 0
@@ -208,13 +208,13 @@ class MixedStrategies(NamedTuple):
     shares: tuple[tuple[str | GoalStrategy, int], ...]
     """Strategies and shares, such as ``(("future", 2), ("desired", 2))`` for half of the transitions each."""
 
-    def joined(self, xp: ModuleType, choose: Callable[..., Any], *arrays: Any) -> Any:
+    def joined(self, xp: ModuleType, choose: Callable[..., AnyArray], *arrays: AnyArray) -> AnyArray:
         """Returns ``choose(number, *rows, strategy)`` of all strategies, each with its rows of the arrays, in their order."""
         rows, order = rows_of_shares(tuple(share for _, share in self.shares), len(arrays[0]))
         parts = [choose(i, *(array[rows[i]] for array in arrays), self.shares[i][0]) for i in range(len(rows))]
         return xp.concatenate(parts)[order]
 
-    def goals(self, achieved: Any, index: Any, desired: Callable[[Any], Any]) -> Any:
+    def goals(self, achieved: AnyArray, index: AnyArray, desired: Callable[[AnyArray], AnyArray]) -> AnyArray:
         """Returns the goals at positions, of which ``achieved`` are those of one kind, and ``desired`` returns the other."""
         for i, (strategy, _) in enumerate(self.shares):
             if strategy == "desired":
@@ -421,7 +421,7 @@ def relabeled_positions(shape: tuple[int, ...], k: int) -> slice | np.ndarray:
     return np.flatnonzero(is_relabeled)
 
 
-def stored(steps: HindsightSteps, times: Any) -> Any:
+def stored(steps: HindsightSteps, times: AnyArray) -> AnyArray:
     """Returns the times that a strategy of the user's own chose; on the device, where they are not known yet, in the range.
 
     Raises:

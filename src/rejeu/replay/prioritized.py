@@ -13,10 +13,11 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rejeu.core import schedules
 from rejeu.core.schedules import Schedule
-from rejeu.core.types import Settings
+from rejeu.core.types import AnyArray, Settings
 from rejeu.core.validation import coerce, number
 from rejeu.replay.ring import LAST, Ring, Rows
 
@@ -62,10 +63,10 @@ class SumTree:
         """Sum of all values."""
         return float(self.nodes[1])
 
-    def __getitem__(self, index: Any) -> Any:
+    def __getitem__(self, index: AnyArray) -> AnyArray:
         return self.nodes[self.n_leaves + index]
 
-    def set(self, index: np.ndarray, value: Any) -> None:
+    def set(self, index: np.ndarray, value: ArrayLike) -> None:
         """Sets the values at ``index`` to ``value``, ``(n,)`` or a scalar. Of repeated indices, the last one counts."""
         node = index + self.n_leaves
         self.nodes[node] = value
@@ -133,7 +134,7 @@ class Priorities:
         rows = Rows(env, time, index, ring.kind.take(index))
         return rows, weight.astype(np.float32), Draw(index, time, ring.version)
 
-    def update(self, td_errors: Iterable[tuple[Draw, Any]]) -> None:
+    def update(self, td_errors: Iterable[tuple[Draw, AnyArray]]) -> None:
         """Updates the priorities of sampled steps from their absolute TD errors, in any shape of size ``n``.
 
         TD errors of steps that have been overwritten since are ignored. TD errors that are not finite are ignored too,

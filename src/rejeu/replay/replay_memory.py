@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import gymnasium as gym
 import jax
 import numpy as np
@@ -128,7 +126,7 @@ class ReplayMemory:
             self._discount[index],
         )
 
-    def _tree(self, stores: list[np.ndarray], index: np.ndarray) -> Any:
+    def _tree(self, stores: list[np.ndarray], index: np.ndarray) -> Observation:
         return jax.tree.unflatten(spaces.structure(self.observation_space), [store[index] for store in stores])
 
     def _parts(self, obs: Observation, name: str) -> list[np.ndarray]:

@@ -156,7 +156,7 @@ class BaseReplayBuffer(ABC):
             return shaped._replace(weight=shaped.weight / shaped.weight.max(axis=-1, keepdims=True))
         return shaped
 
-    def update_priorities(self, td_errors: Iterable[tuple[Draw, Any]]) -> None:
+    def update_priorities(self, td_errors: Iterable[tuple[Draw, AnyArray]]) -> None:
         """Sets priorities by pairs of a :class:`Draw` and the absolute TD errors of its batch."""
         if self.priorities is not None:
             self.priorities.update(td_errors)
@@ -209,7 +209,7 @@ class ReplayBuffer(BaseReplayBuffer):
         memory = ring.memory[position[:, 0]]
         tree, mask = unmasked(ring.tree(obs))
 
-        def read(rows: np.ndarray) -> Any:
+        def read(rows: np.ndarray) -> AnyArray:
             sequences = Sequences(tree, begins, n_absent, memory, rows.astype(np.int32))
             if mask is None:
                 return sequences
@@ -231,15 +231,15 @@ def discounts_of(gamma: float, n_steps: int) -> np.ndarray:
 class StepWindow(NamedTuple):
     """The steps that n-step returns sum, ``(batch, n)`` each."""
 
-    position: Any
+    position: AnyArray
     """Positions in the ring of the n rows from the sampled one on."""
-    valid: Any
+    valid: AnyArray
     """Which of them belong to the return; the first always does."""
-    terminal: Any
+    terminal: AnyArray
     """Which of these entered a terminal state."""
 
 
-def look_ahead(xp: ModuleType, ring: Any, index: Callable[..., Any], rows: Any, n: int) -> StepWindow:
+def look_ahead(xp: ModuleType, ring: Any, index: Callable[..., AnyArray], rows: PyTree, n: int) -> StepWindow:
     """Returns the up to ``n`` steps from each of ``rows`` to its episode's end or to the newest step."""
     times = rows.time[:, None] + xp.arange(n)[None]
     position = index(rows.env[:, None], times)
@@ -253,18 +253,18 @@ def look_ahead(xp: ModuleType, ring: Any, index: Callable[..., Any], rows: Any, 
 class NewGoals(NamedTuple):
     """The goals that replace those of some transitions of a batch."""
 
-    which: Any
+    which: AnyArray
     """Which transitions."""
-    goal: Any
+    goal: AnyArray
     """Their new goals, ``(n_goals, ...)``."""
     leaves: tuple[int, int]
     """Indices of the leaves of the achieved and of the desired goal."""
-    reward: Callable[[Any, Any], Any]
+    reward: Callable[[AnyArray, AnyArray], AnyArray]
     """The reward of achieved and desired goals."""
-    terminated: Any
+    terminated: AnyArray
     """Whether they end the episode, a function as ``reward``; None if the steps keep their own flags."""
 
-    def ends(self, reached: AnyArray, goal: AnyArray, own_goal: AnyArray, ended: AnyArray) -> Any:
+    def ends(self, reached: AnyArray, goal: AnyArray, own_goal: AnyArray, ended: AnyArray) -> AnyArray:
         """Returns which steps end an episode: those that reach ``goal``, and those that ended otherwise, as in a crash.
 
         ``ended`` says which of them ended with ``own_goal``.
@@ -277,16 +277,16 @@ class NewGoals(NamedTuple):
 class Outcome(NamedTuple):
     """What transitions lead to."""
 
-    rewards: Any
+    rewards: AnyArray
     """``(batch,)``; of n steps ``(batch, n)``, 0 after the last."""
-    steps: Any
+    steps: AnyArray
     """Number of steps to the next observation, ``(batch,)``, or 1 for all."""
-    terminated: Any
+    terminated: AnyArray
     """1 where the MDP terminated, else 0, of any dtype, ``(batch,)``."""
 
 
 def outcome(
-    xp: ModuleType, ring: Any, index: Callable[..., Any], rows: Any, n_steps: int, goals: NewGoals | None = None
+    xp: ModuleType, ring: Any, index: Callable[..., AnyArray], rows: PyTree, n_steps: int, goals: NewGoals | None = None
 ) -> Outcome:
     """Returns what ``rows`` lead to in up to ``n_steps`` steps, with new goals if there are any."""
     if goals is not None:
@@ -314,7 +314,7 @@ def outcome(
     return Outcome(xp.where(valid, rewards, xp.float32(0)), valid.sum(axis=1), terminal.any(axis=1))
 
 
-def replaced(array: Any, index: Any, values: Any) -> Any:
+def replaced(array: AnyArray, index: AnyArray, values: AnyArray) -> AnyArray:
     """Returns ``array`` with ``values`` at ``index``; an array of NumPy is mutated."""
     if isinstance(array, np.ndarray):
         array[index] = values

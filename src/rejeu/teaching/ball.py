@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -168,7 +167,7 @@ class Ball(gym.Env[np.ndarray, np.ndarray]):
             "rng": self.np_random.bit_generator.state,
         }
 
-    def set_state(self, state: Mapping[str, Any]) -> None:
+    def set_state(self, state: JsonObject) -> None:
         """Restores a state of :meth:`get_state`. The trajectory starts at its position.
 
         Raises:

@@ -23,6 +23,7 @@ from jax import Array
 from rejeu.core import checkpoint
 from rejeu.core.algorithm import Clock, Rollout, Transition
 from rejeu.core.errors import NonFiniteError
+from rejeu.core.types import PyTree
 from rejeu.training.learner import PackedState, Readings, bad_leaves, checked, is_finite
 
 MAX_SKIPPED = 100
@@ -94,7 +95,7 @@ class NonFiniteMonitor:
         return len(self._unread)
 
     def update(
-        self, function: Callable[..., Any], state: PackedState, batches: Any, clock: Clock, n_updates: int
+        self, function: Callable[..., PyTree], state: PackedState, batches: PyTree, clock: Clock, n_updates: int
     ) -> tuple[PackedState, Readings, Array | None]:
         """Returns ``function(state, batches, clock)``, an update before which ``n_updates`` gradient steps were taken."""
         after, readings, td_error = function(state, batches, clock)

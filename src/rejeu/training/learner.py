@@ -35,6 +35,7 @@ from rejeu.core.algorithm import (
     names,
 )
 from rejeu.core.prng import nth
+from rejeu.core.types import AnyArray
 from rejeu.exploration import explorer as exploration
 from rejeu.exploration.noise import Noise
 
@@ -70,15 +71,15 @@ class Packing:
         self.longest = max((sum(self.sizes[i] for i in group) for group in self.groups), default=0)
         """Number of elements of the longest vector."""
 
-    def pack(self, tree: PyTree, concatenate: Callable[..., Any] = jnp.concatenate) -> list[Any]:
+    def pack(self, tree: PyTree, concatenate: Callable[..., Any] = jnp.concatenate) -> list[AnyArray]:
         """Returns the vectors of ``tree`` and then its large leaves; with ``np.concatenate`` of NumPy arrays."""
         leaves = jax.tree.leaves(tree)
         vectors = [concatenate([leaves[i].reshape(-1) for i in group]) for group in self.groups]
         return vectors + [leaves[i] for i in self.large]
 
-    def unpack(self, arrays: list[Any]) -> PyTree:
+    def unpack(self, arrays: list[AnyArray]) -> PyTree:
         """Returns the tree that was packed: the inverse of :meth:`pack`."""
-        leaves: list[Any] = [None] * len(self.shapes)
+        leaves: list[AnyArray] = [None] * len(self.shapes)
         for vector, group in zip(arrays, self.groups, strict=False):
             end = 0
             for i in group:
@@ -171,7 +172,7 @@ class Learner:
             batches have importance weights.
         """
 
-        def step(before: PyTree, drawn: tuple[Any, Clock]) -> tuple[PyTree, Metrics]:
+        def step(before: PyTree, drawn: tuple[PyTree, Clock]) -> tuple[PyTree, Metrics]:
             after, metrics = self.algorithm.update(before, *drawn)
             metrics = {name: jnp.asarray(value) for name, value in metrics.items()}
             return undo(before, after, metrics) if self.skips else (after, metrics)

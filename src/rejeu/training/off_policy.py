@@ -184,14 +184,14 @@ def observe(run: Run, learner: Learner) -> None:
 
 
 @timed("replay")
-def sample(run: Run, config: OffPolicyConfig, n_updates: int, progress: float) -> list[tuple[Any, Any]]:
+def sample(run: Run, config: OffPolicyConfig, n_updates: int, progress: float) -> list[tuple[PyTree, PyTree]]:
     """Returns the batches of a number of gradient steps, each with its draw."""
     shapes = batch_shapes(n_updates, config, run.env.n_envs)
     return [run.replay.draw(run.rng, shape, progress) for shape in shapes]
 
 
 @timed("update")
-def update(run: Run, learner: Learner, samples: list[tuple[Any, Any]], clock: Clock) -> None:
+def update(run: Run, learner: Learner, samples: list[tuple[PyTree, PyTree]], clock: Clock) -> None:
     """Starts and counts the updates on samples, and sets priorities by the TD errors of the last ones."""
     run.replay.update_priorities(run.td_errors)
     run.td_errors = []

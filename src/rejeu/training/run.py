@@ -19,7 +19,7 @@ from jax import Array
 
 from rejeu.core.algorithm import Clock, PyTree
 from rejeu.core.records import Count, Duration, Positive, Seconds, convert
-from rejeu.core.types import JsonObject
+from rejeu.core.types import AnyArray, JsonObject
 from rejeu.core.validation import number, whole
 from rejeu.core.xla import clock
 from rejeu.envs.base import Step, VectorEnv, seed_of_run
@@ -292,7 +292,7 @@ class TrainingCall:
         """Time it has taken, without interruptions and compilation, in seconds."""
         return self.spent + clock() - self.began
 
-    def progress(self, step: Any, episode: int) -> Any:
+    def progress(self, step: AnyArray, episode: int) -> AnyArray:
         """Returns the progress of schedules, in [0, 1], after ``step`` environment steps and ``episode`` episodes in total.
 
         ``step`` is a number, or an array of numbers, each of which gets its own progress.
@@ -349,7 +349,7 @@ def checked_limits(
     )
 
 
-def share(before: float, n_done: Any, limit: float | None) -> Any:
+def share(before: float, n_done: AnyArray, limit: float | None) -> AnyArray:
     """Returns the share of ``before + limit`` that is done after ``n_done`` more; 0 without a limit.
 
     >>> share(100, 0, 300), share(100, 300, 300), share(100, 50, None)

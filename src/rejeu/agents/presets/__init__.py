@@ -17,7 +17,7 @@ from functools import cache
 from importlib import resources
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any
+from typing import Annotated
 
 import msgspec
 from msgspec import Meta
@@ -39,7 +39,7 @@ class Preset:
     """Id of the environment."""
     algorithm: Name
     """Name of the algorithm, a key of ``rejeu.AGENTS``."""
-    hyperparameters: Mapping[str, Any] = field(hash=False)
+    hyperparameters: Mapping[str, object] = field(hash=False)
     """Hyperparameters that differ from the algorithm's defaults, as keyword arguments of the agent; read-only."""
     n_envs: EnvCount
     """Number of parallel environments."""
@@ -222,7 +222,7 @@ def named(name: str, env_id: str, algorithm: str | None = None) -> Preset | None
     return max(presets, key=lambda preset: (preset.algorithm == algorithm, preset.env_id == env_id), default=None)
 
 
-def small(algorithm: str) -> Mapping[str, Any]:
+def small(algorithm: str) -> Mapping[str, object]:
     """Returns the hyperparameters of an algorithm's preset ``small``, which is for any environment; empty if it has none."""
     return next((p.hyperparameters for p in every() if (p.name, p.algorithm) == ("small", algorithm)), {})
 

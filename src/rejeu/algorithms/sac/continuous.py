@@ -24,7 +24,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -113,7 +113,7 @@ class Config(EntropyConfig):
         """What the actor's loss makes of the values of all critics."""
         return jnp.min if self.target_subset is None else jnp.mean
 
-    def dropout_keys(self, key: Array) -> Any:
+    def dropout_keys(self, key: Array) -> PyTree:
         """Returns keys for the dropout of critics that learn and that are learned from; None for both without dropout."""
         return jax.random.split(jax.random.fold_in(key, 1)) if self.policy_kwargs.dropout else (None, None)
 
@@ -193,7 +193,9 @@ def make_with(
     return algorithm_of(parts, config, explore, exploit, {**queries, "explorer": explorer_of(config, action_dim)})
 
 
-def algorithm_of(parts: SoftCritic, config: Config, explore: Any, exploit: Any, others: Settings) -> Algorithm:
+def algorithm_of(
+    parts: SoftCritic, config: Config, explore: Callable[..., Array], exploit: Callable[..., Array], others: Settings
+) -> Algorithm:
     """Returns the algorithm of these parts and parts of :class:`Algorithm`, with REDQ, dropout and memory if they are set."""
     parts = parts if config.target_subset is None and not config.policy_kwargs.dropout else drawn(parts, config)
     bounds, target = (config.v_min, config.v_max), parts.target

@@ -24,6 +24,7 @@ import msgspec
 import rejeu
 from rejeu.core import errors, hardware, interrupt
 from rejeu.core.records import utf8
+from rejeu.core.types import JsonObject
 from rejeu.lab.cli.commands import COMMANDS, MODULES, TASKS
 from rejeu.lab.runs import parsing
 from rejeu.lab.runs.arguments import check_options, of_task
@@ -91,7 +92,7 @@ def run_command(argv: Sequence[str]) -> int:
         return 2
 
 
-def show_warning(message: Warning | str, *_: object, **__: Any) -> None:
+def show_warning(message: Warning | str, *_: object, **__: object) -> None:
     """Prints a warning on one line, without the line of code that it comes from."""
     print(f"warning: {errors.one_line(message).removeprefix('WARN: ')}", file=sys.stderr, flush=True)
 
@@ -115,7 +116,7 @@ def place_of(error: Exception) -> str:
 
 
 @contextmanager
-def messages(is_json: bool) -> Iterator[Callable[[Any], None]]:
+def messages(is_json: bool) -> Iterator[Callable[[JsonObject], None]]:
     """Context that yields a function to call with the result, which prints it with ``is_json`` and else does nothing.
 
     With ``is_json``, what is printed otherwise goes to standard error.

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from contextlib import closing
-from typing import Any
 
 import gymnasium as gym
 
+from rejeu.core.types import JsonObject
 from rejeu.lab.cli.commands import Check
 from rejeu.lab.runs import environment
 from rejeu.lab.runs.begin import counted, is_installed
 
 
-def run_check(arguments: Check) -> tuple[int, dict[str, Any]]:
+def run_check(arguments: Check) -> tuple[int, JsonObject]:
     """Prints the findings, errors first; the exit status is 1 if there are errors."""
     from rejeu.envs import checker  # Gymnasium's checker, which it imports, is for environments of one's own only
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import ExitStack, closing
 from pathlib import Path
-from typing import Any
 
 import gymnasium as gym
 
@@ -14,6 +13,7 @@ from rejeu.agents import Agent
 from rejeu.callbacks import Checkpoint
 from rejeu.callbacks.base import stateful
 from rejeu.core.interrupt import Interrupt
+from rejeu.core.types import Action, JsonObject, Observation
 from rejeu.demonstrations import Demonstrations
 from rejeu.envs.registry import register
 from rejeu.lab.cli.commands import Clone
@@ -28,7 +28,7 @@ from rejeu.lab.runs.session import Session
 from rejeu.logs.formatting import counted
 
 
-def run_clone(arguments: Clone) -> tuple[int, dict[str, Any]]:
+def run_clone(arguments: Clone) -> tuple[int, JsonObject]:
     """Clones and evaluates; the exit status is that of ``rejeu train``."""
     stopwatch = Stopwatch()
     shown = demonstrations.read(arguments.dataset)
@@ -93,7 +93,7 @@ def learn_from_expert(
             from rejeu.teaching.play.assist import Expert
 
             env = stack.enter_context(closing(session.environment.rendering()))
-            label: Callable[[Any], Any] = stack.enter_context(closing(Expert(env, fps=arguments.fps)))
+            label: Callable[[Observation], Action] = stack.enter_context(closing(Expert(env, fps=arguments.fps)))
         else:
             env = stack.enter_context(closing(session.environment.make()))
             label = lambda obs: expert.predict(obs, deterministic=True)[0]  # noqa: E731

@@ -5,14 +5,14 @@ from __future__ import annotations
 import webbrowser
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
+from rejeu.core.types import JsonObject
 from rejeu.lab.cli.commands import Compare
 from rejeu.lab.reporting.comparison import Comparison, compare
 from rejeu.logs.formatting import show_table
 
 
-def run_compare(arguments: Compare) -> tuple[int, dict[str, Any]]:
+def run_compare(arguments: Compare) -> tuple[int, JsonObject]:
     """Compares runs, prints a table, and writes what was asked for."""
     comparison = compare(
         arguments.runs,

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from rejeu.core import atomic
 from rejeu.core.language import chosen, said
+from rejeu.core.types import JsonObject
 from rejeu.core.validation import whole
 from rejeu.lab.cli import dumps
 from rejeu.lab.cli.commands import Class, Course
@@ -21,7 +21,7 @@ from rejeu.teaching.courses import grading, leaderboard, write
 MAX_EPISODES = 1_000
 
 
-def run_course(arguments: Course) -> tuple[int, dict[str, Any]]:
+def run_course(arguments: Course) -> tuple[int, JsonObject]:
     """Writes or grades notebooks, and prints a line for each file."""
     if arguments.language == "grade":
         return grade(arguments)
@@ -36,7 +36,7 @@ def run_course(arguments: Course) -> tuple[int, dict[str, Any]]:
     return 0, {"written": written, "kept": existing}
 
 
-def grade(arguments: Course) -> tuple[int, dict[str, Any]]:
+def grade(arguments: Course) -> tuple[int, JsonObject]:
     """Prints which checks each notebook passes; the exit status is 2 if a file could not be graded."""
     grades = []
     for path in arguments.paths:
@@ -52,7 +52,7 @@ def grade(arguments: Course) -> tuple[int, dict[str, Any]]:
     return status, {"notebooks": [notebook._asdict() | {"passed": notebook.n_passed} for notebook in grades]}
 
 
-def run_class(arguments: Class) -> tuple[int, dict[str, Any]]:
+def run_class(arguments: Class) -> tuple[int, JsonObject]:
     """Evaluates the models in a folder, prints a line for each and the leaderboard, and writes it if asked to."""
     episodes = whole("--episodes", arguments.episodes, 1, MAX_EPISODES)
     formats = {".md": leaderboard.markdown, ".json": lambda board: dumps(leaderboard.to_dict(board)) + "\n"}

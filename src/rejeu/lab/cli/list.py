@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 from rejeu.agents import presets
 from rejeu.agents.presets import Preset
@@ -12,7 +11,7 @@ from rejeu.core.types import JsonObject
 from rejeu.lab.cli.commands import List
 
 
-def run_list(arguments: List) -> tuple[int, dict[str, Any]]:
+def run_list(arguments: List) -> tuple[int, JsonObject]:
     """Prints the lists."""
     algorithms = described(is_extended=bool(arguments.imports))
     if not arguments.json:

@@ -8,9 +8,9 @@ from importlib import resources
 from importlib.machinery import PathFinder
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import Any
 
 from rejeu.core import atomic
+from rejeu.core.types import JsonObject
 from rejeu.lab.cli.commands import New
 from rejeu.lab.runs.output import echo
 
@@ -18,7 +18,7 @@ NAME = "my_project"
 """The name of the project in the templates, which are the files under ``project``."""
 
 
-def run_new(arguments: New) -> tuple[int, dict[str, Any]]:
+def run_new(arguments: New) -> tuple[int, JsonObject]:
     """Writes the project to a new folder and prints what to do next."""
     folder = arguments.folder
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):

@@ -6,9 +6,8 @@ another.
 
 from __future__ import annotations
 
-from typing import Any
-
 from rejeu.core import atomic
+from rejeu.core.types import JsonObject
 from rejeu.lab.cli import sweep, tune
 from rejeu.lab.experiments.folder import is_sweep
 from rejeu.lab.experiments.study import StudyFolder
@@ -18,7 +17,7 @@ from rejeu.lab.runs.branch import branch
 from rejeu.lab.runs.resume import resume
 
 
-def run_resume(arguments: Resume) -> tuple[int, dict[str, Any]]:
+def run_resume(arguments: Resume) -> tuple[int, JsonObject]:
     """Trains, as ``rejeu train``, ``rejeu sweep`` or ``rejeu tune`` does.
 
     Raises:
@@ -37,6 +36,6 @@ def run_resume(arguments: Resume) -> tuple[int, dict[str, Any]]:
     return resume(arguments, write_report)
 
 
-def run_branch(arguments: Branch) -> tuple[int, dict[str, Any]]:
+def run_branch(arguments: Branch) -> tuple[int, JsonObject]:
     """Trains a new run from a checkpoint of another; the exit status is that of ``rejeu train``."""
     return branch(arguments, write_report)

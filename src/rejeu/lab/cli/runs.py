@@ -5,10 +5,10 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from rejeu.core.interrupt import leaving
 from rejeu.core.records import utf8
+from rejeu.core.types import JsonObject
 from rejeu.lab.cli.commands import Runs, Status
 from rejeu.lab.reporting import run_list
 from rejeu.lab.reporting.rows import COLUMNS, N_TEXT, Row, Rows, cells, describe, texts
@@ -20,7 +20,7 @@ EVERY = 1.0
 """Seconds between two looks at the folder with ``--follow``."""
 
 
-def run_runs(arguments: Runs) -> tuple[int, dict[str, Any]]:
+def run_runs(arguments: Runs) -> tuple[int, JsonObject]:
     """Prints a table of the runs in a folder, with ``--follow`` until Ctrl-C."""
     if not arguments.folder.exists():
         raise FileNotFoundError(f"there is no folder {arguments.folder}; rejeu train ENV makes runs in the folder runs")

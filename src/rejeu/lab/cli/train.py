@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
-from typing import Any
 
 from rejeu.core.interrupt import Interrupt
+from rejeu.core.types import JsonObject
 from rejeu.lab.cli import sweep
 from rejeu.lab.reporting.report import write_report
 from rejeu.lab.runs.arguments import Train
@@ -13,7 +13,7 @@ from rejeu.lab.runs.begin import begin, with_dataset
 from rejeu.lab.runs.output import Stopwatch, echo, header
 
 
-def run_train(arguments: Train) -> tuple[int, dict[str, Any]]:
+def run_train(arguments: Train) -> tuple[int, JsonObject]:
     """Trains; the exit status is 0, 2 if something could not be written, 130 after Ctrl-C, 143 after SIGTERM."""
     if arguments.offline is not None:
         arguments = with_dataset(arguments)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
 
 from rejeu.agents import AGENTS, find_agent, find_preset
 from rejeu.algorithms.search import Dimension
 from rejeu.core.interrupt import NAMES, Interrupt
+from rejeu.core.types import JsonObject
 from rejeu.lab.cli.commands import Tune
 from rejeu.lab.experiments import space, study as studies, study_plan as plans, tune as tuning
 from rejeu.lab.experiments.final import announcement
@@ -26,7 +26,7 @@ OF_THE_PLAN = (
 """Options that are arguments of a plan."""
 
 
-def run_tune(arguments: Tune) -> tuple[int, dict[str, Any]]:
+def run_tune(arguments: Tune) -> tuple[int, JsonObject]:
     """Searches; the exit status is 0, 1 if a trial could not be started, 130 after Ctrl-C, 143 after SIGTERM.
 
     It is 2 if no trial is complete or a training of the comparison failed.
@@ -51,7 +51,7 @@ def run_tune(arguments: Tune) -> tuple[int, dict[str, Any]]:
     return complete(tuning.open_study(plan, arguments.out), made, arguments.workers)
 
 
-def resume_study(arguments: Resume) -> tuple[int, dict[str, Any]]:
+def resume_study(arguments: Resume) -> tuple[int, JsonObject]:
     """Continues the study of a folder; returns the exit status and the result.
 
     Raises:
@@ -71,7 +71,7 @@ def read_search(assignments: Iterable[str], algorithm: str | None) -> dict[str, 
     return dict(space.parse(assignment, declared) for assignment in assignments)
 
 
-def complete(study: Study, made: Environment, workers: int | None) -> tuple[int, dict[str, Any]]:
+def complete(study: Study, made: Environment, workers: int | None) -> tuple[int, JsonObject]:
     """Runs a study to its end; returns the exit status and the result."""
     echo("\n".join(header(study, made)))
     with Interrupt() as stop:

@@ -11,7 +11,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from rejeu.agents import modules_of
 from rejeu.checkpoints.run_folder import dated
@@ -92,7 +91,7 @@ class SweepResult:
 
 
 def prepare(
-    plan: str | Path | Mapping[str, Any],
+    plan: str | Path | Mapping[str, object],
     folder: str | Path | None,
     workers: int | None,
     typed: RunConfig,
@@ -133,7 +132,7 @@ def make_launcher(folder: SweepFolder, workers: int | None, ray: str | None) -> 
 
 
 def sweep(
-    plan: str | Path | Mapping[str, Any],
+    plan: str | Path | Mapping[str, object],
     folder: str | Path | None = None,
     *,
     workers: int | None = None,

@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
 import msgspec
 import numpy as np
@@ -406,7 +406,7 @@ def coverage_notes(n_runs: Sequence[int]) -> list[str]:
 
 def strata(members: Sequence[Curve], values: Sequence[object]) -> tuple[np.ndarray, ...]:
     """Returns one value of each run as arrays, one for each environment."""
-    by_env: dict[str, list[Any]] = {}
+    by_env: dict[str, list[object]] = {}
     for curve, value in zip(members, values, strict=True):
         by_env.setdefault(curve.env, []).append(value)
     return tuple(np.array(by_env[env]) for env in sorted(by_env))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from msgspec import Meta
 
@@ -78,7 +78,7 @@ class Continued(RunOptions):
     """Pause after so many environment steps; the goal stays. Of a complete run, or beyond the goal: train for so many more."""
     minutes: Minutes = None
     """Pause after so many minutes; the goal stays. Of a complete run: train for so many more."""
-    hyperparameters: Annotated[dict[str, Any], Shown("NAME=VALUE ...", "set")] = field(default_factory=dict)
+    hyperparameters: Annotated[Settings, Shown("NAME=VALUE ...", "set")] = field(default_factory=dict)
     """Hyperparameters to change from here on, as for rejeu train; those that change shapes cannot be changed."""
     device: Annotated[str | None, Shown("NAME"), Topic.TRAINING] = None
     """As for rejeu train; by default cpu if the run was trained there on request, else auto."""
@@ -117,7 +117,7 @@ class Branch(Continued):
     """Run folder, as for rejeu train."""
 
 
-def of_task(task: Task) -> tuple[str, Any]:
+def of_task(task: Task) -> tuple[str, object]:
     """Returns the command that does what a process is asked to do, and its arguments."""
     run = vars(task.run)
     shared: Settings = {"no_report": task.no_report, "no_video": task.no_video}

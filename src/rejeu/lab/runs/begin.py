@@ -90,7 +90,7 @@ def describe_backend(env: VectorEnv, environment: Environment, preset: Preset | 
     return env.backend + (hint if is_slower and not is_envpool_installed() else "")
 
 
-def untuned(algorithm: str, env: VectorEnv) -> Mapping[str, Any]:
+def untuned(algorithm: str, env: VectorEnv) -> Mapping[str, object]:
     """Returns the hyperparameters of an algorithm in environments without a preset."""
     config = AGENTS[algorithm].algorithm.Config
     if env.n_envs >= MANY:

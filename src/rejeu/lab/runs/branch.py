@@ -6,10 +6,10 @@ import dataclasses
 import secrets
 import shutil
 from pathlib import Path
-from typing import Any
 
 from rejeu.agents import Agent
 from rejeu.checkpoints.run_folder import RunFolder, check_free, checkpoint_files, create, step_of
+from rejeu.core.types import JsonObject
 from rejeu.lab.runs.arguments import Branch
 from rejeu.lab.runs.config import DecidedRun, Origin, read_folder
 from rejeu.lab.runs.output import echo
@@ -46,7 +46,7 @@ def nearest(checkpoints: Path, step: int | None) -> Path:
     return checkpoint
 
 
-def branch(arguments: Branch, report: Report) -> tuple[int, dict[str, Any]]:
+def branch(arguments: Branch, report: Report) -> tuple[int, JsonObject]:
     """Trains as ``rejeu resume`` does, in a folder of its own, which is there once the checkpoint is read."""
     check_free(arguments.out)
     parent = RunFolder(arguments.run)

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from filelock import Timeout
@@ -90,7 +90,7 @@ class RunSummary:
         return next((text for text in self.warnings[-1:] if ERROR.match(text)), "")
 
     @cached_property
-    def changed(self) -> dict[str, tuple[Any, Any]]:
+    def changed(self) -> dict[str, tuple[object, object]]:
         """Value and default of each hyperparameter that differs from the algorithm's default, by dotted name.
 
         Empty if the algorithm is neither rejeu's nor registered.

@@ -7,7 +7,6 @@ import warnings
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 from rejeu.agents import Agent, agent_of_file
 from rejeu.algorithms import config as configs
@@ -15,7 +14,7 @@ from rejeu.checkpoints.run_folder import RunFolder
 from rejeu.core import devices
 from rejeu.core.errors import RunInUseError
 from rejeu.core.interrupt import Interrupt
-from rejeu.core.types import Settings
+from rejeu.core.types import JsonObject, Settings
 from rejeu.envs.make import WorkerOptions
 from rejeu.lab.runs import config as configs_of_runs, environment as environments
 from rejeu.lab.runs.arguments import Continued, Resume
@@ -28,7 +27,7 @@ from rejeu.logs.logging import require
 from rejeu.logs.tables import read_table
 
 
-def resume(arguments: Resume, report: Report) -> tuple[int, dict[str, Any]]:
+def resume(arguments: Resume, report: Report) -> tuple[int, JsonObject]:
     """Trains a run on from its newest checkpoint; the exit status and the result are those of :meth:`Session.run`.
 
     Raises:
@@ -47,7 +46,7 @@ def train_on(
     report: Report,
     begin: Callable[[Agent, DecidedRun], tuple[RunFolder, DecidedRun]],
     finish: bool = False,
-) -> tuple[int, dict[str, Any]]:
+) -> tuple[int, JsonObject]:
     """Trains; returns the exit status and the result.
 
     Args:

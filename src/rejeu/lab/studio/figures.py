@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from importlib import resources
-from typing import Any
 
 from nicegui import app, ui
 from nicegui.element import Element
@@ -34,7 +33,7 @@ class Figure(Element, component="chart.js"):
         if choose is not None:
             self.on("choose", lambda event: choose(int(event.args)))
 
-    def show(self, chart: Chart | None = None, **props: Any) -> None:
+    def show(self, chart: Chart | None = None, **props: object) -> None:
         """Draws another chart, or the same over another ``axis`` ("x" are steps, "t" minutes), or with a ``chosen`` bar."""
         changed = props if chart is None else {"chart": chart, **props}
         if any(self.props.get(name) != value for name, value in changed.items()):

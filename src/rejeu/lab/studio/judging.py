@@ -6,7 +6,6 @@ import threading
 import time
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 from rejeu.core.errors import one_line
 from rejeu.core.language import Language
@@ -38,7 +37,7 @@ class Judging:
         """Rises with each result."""
         self._env_id = ""
         self._results: dict[Path, Entrant | Unranked] = {}
-        self._stamps: dict[Path, tuple[Any, float]] = {}
+        self._stamps: dict[Path, tuple[object, float]] = {}
         self._until = 0.0
         self._thread: threading.Thread | None = None
 

@@ -11,7 +11,6 @@ from collections.abc import Callable
 from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -94,7 +93,7 @@ class LivePlayer:
         """From which its episodes begin; None for new ones."""
         self._changed, self._closed = threading.Event(), threading.Event()
         self._renew_at, self._step = 0.0, 0
-        self._stamp: Any = None
+        self._stamp: object = None
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 

@@ -120,7 +120,7 @@ def labels_of(rows: Sequence[Row], runs: Mapping[str, RunSummary], grouping: str
     return [f"{row['env']}: {labels[row['run']]}" if row["run"] in labels else "" for row in rows]
 
 
-def lines(rows: Sequence[Row], labels: Sequence[str], opened: set[str]) -> Iterable[dict[str, Any]]:
+def lines(rows: Sequence[Row], labels: Sequence[str], opened: set[str]) -> Iterable[JsonObject]:
     """Yields the lines of the table: of each group of several runs one, followed by its runs if it is open."""
     members: dict[str, list[Row]] = {}
     for row, label in zip(rows, labels, strict=True):

@@ -7,7 +7,6 @@ import io
 import secrets
 import weakref
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
 from fastapi import WebSocket, WebSocketDisconnect
@@ -15,6 +14,7 @@ from nicegui import app
 from nicegui.element import Element
 from PIL import Image
 
+from rejeu.core.types import JsonObject
 from rejeu.teaching.play.game import Event
 
 QUALITY = 85
@@ -54,7 +54,7 @@ class Screen(Element, component="screen.js"):
     def __init__(self, key: Callable[[Event], object] | None = None) -> None:
         super().__init__()
         self._key = key
-        self._newest: tuple[Sequence[bytes], dict[str, Any]] = (), {}
+        self._newest: tuple[Sequence[bytes], JsonObject] = (), {}
         self._changed, self._loop = asyncio.Event(), asyncio.get_running_loop()
         self.on_leave: Callable[[], object] = lambda: None
         """Called when the page is closed, or the element removed."""
@@ -62,7 +62,7 @@ class Screen(Element, component="screen.js"):
         self.props.update(channel=channel, keys=key is not None)
         _open[channel] = self
 
-    def show(self, pictures: Sequence[np.ndarray], captions: Sequence[dict[str, Any]], presses: int = 0) -> None:
+    def show(self, pictures: Sequence[np.ndarray], captions: Sequence[JsonObject], presses: int = 0) -> None:
         """Shows pictures, ``uint8 (height, width, 3)``.
 
         Captions are texts: ``name``, ``score``, ``about`` and ``message``; ``won`` colors the message. ``presses`` says how

@@ -269,7 +269,7 @@ def load_results(path: str | Path) -> np.recarray:
     return np.rec.fromarrays([*arrays.values()], names=list(arrays))  # type: ignore[call-overload]
 
 
-def _column(values: list[Any]) -> np.ndarray:
+def _column(values: Sequence[object]) -> np.ndarray:
     """Returns values as integers if possible, else as floats, else as strings."""
     for dtype in (np.int64, np.float64):
         try:

@@ -17,10 +17,11 @@ import sys
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from rejeu.core import interrupt
 from rejeu.core.language import Language, chosen, said
+from rejeu.core.types import Variables
 from rejeu.teaching.courses import checks
 from rejeu.teaching.courses.notebooks import jupytext
 
@@ -101,7 +102,7 @@ def main() -> None:
 
 def execute(cells: list[str]) -> None:
     """Executes the imports, definitions, constants and checks of cells. A statement that raises is left out."""
-    names: dict[str, Any] = {"__name__": "__main__"}
+    names: Variables = {"__name__": "__main__"}
     for cell in cells:
         for statement in _statements(cell):
             if _is_needed(statement):

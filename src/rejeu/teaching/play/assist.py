@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import gymnasium as gym
 import jax
@@ -50,7 +50,7 @@ class Expert:
         self.game = Game([self.player], 0, self.keys.names, phase="running")
         self.window = Window(said("{}: hold a key to take over", f"rejeu {id_of(env)}"))
 
-    def __call__(self, obs: Observation = None) -> Any:
+    def __call__(self, obs: Observation = None) -> Action:
         """Draws the environment, waits for its next step, and returns the action of the person; None where no key is held.
 
         After Ctrl-C, which ends the training or the clone, nobody is waited for.

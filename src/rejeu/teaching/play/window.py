@@ -12,6 +12,7 @@ import numpy as np
 from rejeu.core import hardware
 from rejeu.core.errors import requires
 from rejeu.core.language import said
+from rejeu.core.types import Action
 from rejeu.logs.formatting import counted
 from rejeu.teaching.play.game import Event, Game, Player
 from rejeu.teaching.play.keys import KeyMap, equivalent_keys
@@ -213,7 +214,7 @@ class Window:
 
 def legend(keys: KeyMap) -> list[LegendEntry]:
     """Returns the entries of the legend in the order of the bindings: all keys of each action, and its description."""
-    entries: dict[Any, LegendEntry] = {}
+    entries: dict[Action, LegendEntry] = {}
     for binding in keys.bindings:
         entry = entries.setdefault(binding.action, LegendEntry([], said(binding.label)))
         entry.keys.append(("+".join(sorted(binding.keys)), equivalent_keys(binding, keys.bindings)))

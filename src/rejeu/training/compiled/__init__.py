@@ -16,6 +16,7 @@ import numpy as np
 from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.algorithms.rollout_config import RolloutConfig
 from rejeu.core.errors import BadEnvironmentError
+from rejeu.core.types import AnyArray, PyTree
 from rejeu.core.xla import clock
 from rejeu.training.checks import check_state
 from rejeu.training.compiled.off_policy import OffPolicyProgram
@@ -40,7 +41,7 @@ class Stops(NamedTuple):
 
 
 def train_one(
-    run: Run, learner: Learner, config: Any, n_steps: int | None, progress: Callable[[Any], Any], stops: Stops
+    run: Run, learner: Learner, config: Any, n_steps: int | None, progress: Callable[[AnyArray], AnyArray], stops: Stops
 ) -> Iterator[Progress]:
     """Trains a run; the arguments are those of :func:`train`, which see."""
     for (turn,) in train([run], learner, config, n_steps, progress, stops, [0]):
@@ -53,7 +54,7 @@ def train(
     learner: Learner,
     config: OffPolicyConfig | RolloutConfig,
     n_steps: int | None,
-    progress: Callable[[Any], Any],
+    progress: Callable[[AnyArray], AnyArray],
     stops: Stops,
     active: Sequence[int],
     remake: Remake | None = None,
@@ -111,7 +112,7 @@ def take_chunks(
     trainer: DeviceTrainer,
     first: int,
     last: int | None,
-    progress: Callable[[Any], Any],
+    progress: Callable[[AnyArray], AnyArray],
     stops: Stops,
     active: Sequence[int],
 ) -> Iterator[list[Progress | None]]:
@@ -156,7 +157,7 @@ def take_chunks(
         yield turns
 
 
-def raise_fault(trainer: DeviceTrainer, run_number: int, first_step: int, before: tuple[Any, int]) -> NoReturn:
+def raise_fault(trainer: DeviceTrainer, run_number: int, first_step: int, before: tuple[PyTree, int]) -> NoReturn:
     """Raises the error of a run in a chunk after ``first_step``, before which its state and updates were ``before``.
 
     Its experience holds what is finite; a rollout is dropped.
@@ -177,7 +178,7 @@ def raise_fault(trainer: DeviceTrainer, run_number: int, first_step: int, before
     raise NonFiniteSteps(run_number, range(first_step + 1, run.step + 1), names, in_a_row)
 
 
-def held(runs: Sequence[Run]) -> list[Any]:
+def held(runs: Sequence[Run]) -> list[object]:
     """Returns the objects of the runs that others may replace between chunks."""
     return [content for run in runs for content in (run.state, run.obs, run.action, run.buffer, run.env)]
 
@@ -193,7 +194,9 @@ def turns_left(step: int, n_envs: int, last: int | None, stops: Stops) -> int:
     return -(-(nearest - step) // n_envs)
 
 
-def schedule(progress: Callable[[Any], Any], first_step: int, n_turns: int, n_envs: int, capacity: int) -> np.ndarray:
+def schedule(
+    progress: Callable[[AnyArray], AnyArray], first_step: int, n_turns: int, n_envs: int, capacity: int
+) -> np.ndarray:
     """Returns the progress after 0 to ``n_turns`` turns, ``float32 (capacity + 1,)``, padded."""
     steps = first_step + n_envs * np.arange(n_turns + 1)
     values = np.broadcast_to(np.asarray(progress(steps), np.float32), steps.shape)

@@ -72,7 +72,9 @@ class OffPolicyProgram(Program):
         capacity = min(capacity_of(replay.n_envs), (replay.rows - 1) // 2)
         return cls(config=config, replay=replay, capacity=capacity, **settings)
 
-    def batch(self, env: FunctionalEnv, carry: Carry, experience: DeviceRing, clock: Clock, number: Any) -> Transition:
+    def batch(
+        self, env: FunctionalEnv, carry: Carry, experience: DeviceRing, clock: Clock, number: Array | int
+    ) -> Transition:
         key = jax.random.fold_in(draws(carry.key, clock.step), number + 1)
         return self.draw(env, experience, key, clock.progress)[0]
 

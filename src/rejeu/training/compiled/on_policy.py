@@ -17,6 +17,7 @@ from jax import Array
 from rejeu.algorithms.rollout_config import RolloutConfig
 from rejeu.core.algorithm import Clock, Rollout
 from rejeu.core.prng import nth
+from rejeu.core.types import PyTree, Scalar
 from rejeu.envs.functional.protocol import FunctionalEnv
 from rejeu.training.compiled.program import Carry, Limits, Loop, Program, capacity_of, step_envs
 from rejeu.training.on_policy import begin_episodes
@@ -41,7 +42,9 @@ class OnPolicyProgram(Program):
         """Returns the program for runs like ``run``."""
         return cls(config=config, capacity=capacity_of(run.env.n_envs), **settings)
 
-    def batch(self, env: FunctionalEnv, carry: Carry, experience: Rollout, clock: Clock, number: Any) -> Rollout:
+    def batch(
+        self, env: FunctionalEnv, carry: Carry, experience: Rollout, clock: Clock, number: Array | int
+    ) -> Rollout:
         return rollout_of(experience, carry.counts.length)
 
     def turns(self, env: FunctionalEnv, loop: Loop, limits: Limits, may_go_on: Callable[[Array, Loop], Array]) -> Loop:
@@ -74,7 +77,7 @@ class OnPolicyProgram(Program):
         return None
 
     def uploaded(self, run: Run) -> Rollout:
-        steps: Any = jax.tree.map(jnp.array, run.replay.rollout())
+        steps: PyTree = jax.tree.map(jnp.array, run.replay.rollout())
         return steps if steps.carry != () else steps._replace(carry=jax.tree.map(jnp.array, run.carry))
 
     def download(self, run: Run, experience: Rollout, counts: RolloutCounts) -> None:
@@ -126,6 +129,6 @@ def end_of_rollout(program: OnPolicyProgram, loop: Loop, clock: Clock) -> Loop:
     return loop._replace(carry=carry._replace(counts=counts), experience=steps, learned=learned)
 
 
-def rollout_of(steps: Rollout, length: Any) -> Rollout:
+def rollout_of(steps: Rollout, length: Scalar) -> Rollout:
     """Returns the first ``length`` steps as the update takes them."""
     return steps._replace(valid=steps.valid & (jnp.arange(len(steps.valid)) < length)[:, None])

@@ -32,6 +32,7 @@ from rejeu.core.algorithm import (
     Transition,
 )
 from rejeu.core.prng import below
+from rejeu.core.types import AnyArray, Scalar
 from rejeu.envs.functional.protocol import FunctionalEnv
 from rejeu.envs.functional.vector import VectorState, reset_done, step_all
 from rejeu.envs.masks import FunctionalMask, masked
@@ -53,11 +54,11 @@ Remake = Callable[[Any], tuple[Algorithm, Explorer]]
 class Limits(NamedTuple):
     """The limits of a chunk."""
 
-    n_turns: Any
+    n_turns: AnyArray
     """Turns to take, ``int32[]``."""
-    progress: Any
+    progress: AnyArray
     """Progress of schedules after 0, 1, ... turns of the chunk, ``float32 (capacity + 1,)``."""
-    learn_from: Any
+    learn_from: AnyArray
     """The environment step after which off-policy updates begin, ``uint32[]``."""
 
 
@@ -128,7 +129,7 @@ class Carry(NamedTuple):
     action: Array | None
     """Chosen for the observations, not yet taken, in the algorithm's range; None if turns begin with choosing them."""
     episodes: EpisodeState
-    counts: Any
+    counts: PyTree
     """Counters, equal for all runs; ``counts.step`` is the number of environment steps, ``uint32[]``."""
     in_a_row: Array
     """How many of the newest updates were not finite, ``int32[]``."""
@@ -192,7 +193,7 @@ class Program(ABC):
         """Starts an episode in every environment of a run."""
 
     @abstractmethod
-    def counts_of(self, run: Run) -> Any:
+    def counts_of(self, run: Run) -> PyTree:
         """Returns the counters of a run."""
 
     @abstractmethod
@@ -200,7 +201,7 @@ class Program(ABC):
         """Returns :attr:`Carry.action`; where none was chosen yet, any of its shape."""
 
     @abstractmethod
-    def uploaded(self, run: Run) -> Any:
+    def uploaded(self, run: Run) -> PyTree:
         """Returns the experience of a run, on the device."""
 
     @abstractmethod
@@ -213,7 +214,7 @@ class Program(ABC):
 
     def chunk(
         self, env: FunctionalEnv, carry: Carry, experience: PyTree, limits: Limits
-    ) -> tuple[Carry, Any, ChunkReport]:
+    ) -> tuple[Carry, PyTree, ChunkReport]:
         """Returns carry, experience and report after a number of turns."""
         program = self.with_hyperparameters(carry.hyper)
         first_episode = carry.episodes.n_finished
@@ -375,7 +376,7 @@ class KeyGenerator:
     def __init__(self, key: Array) -> None:
         self.key = key
 
-    def integers(self, high: Any, size: Any = None, dtype: type[np.generic] = np.int32) -> Array:
+    def integers(self, high: Scalar, size: Any = None, dtype: type[np.generic] = np.int32) -> Array:
         """Returns whole numbers from 0 to ``high - 1``."""
         high = jnp.asarray(high, dtype)
         bits = jax.random.bits(self.key, high.shape if size is None else (size,) if isinstance(size, int) else size)

@@ -12,8 +12,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from rejeu.core.algorithm import Clock, PyTree
+from rejeu.core.types import Scalar
 from rejeu.core.xla import for_runs
 from rejeu.envs.base import success_by
 from rejeu.envs.functional.protocol import FunctionalEnv
@@ -46,11 +48,11 @@ class DeviceTrainer:
         """
         self.program, self.runs, self.learner, self.hyper = program, runs, learner, hyper
         self.env_arrays, self.env_static = split(vector_of(runs[0]).env)
-        self.carry: Any = None
+        self.carry: PyTree = None
         """On the device. If there are several runs, arrays have a leading axis, except ``SHARED``."""
-        self.experience: Any = None
+        self.experience: PyTree = None
         """The replay buffers or rollouts, on the device, likewise."""
-        self.report: Any = None
+        self.report: PyTree = None
         """Of the chunk under way, on the device; None if there is none."""
         self.carries: list[Carry] = []
         """The carry after the last chunk by run, on the host apart from large arrays of a single run."""
@@ -162,7 +164,7 @@ def with_env(function: Callable[..., Any], program: Any, static: PyTree, arrays:
 
 def take_chunk(
     program: Program, env: FunctionalEnv, carry: PyTree, limits: Limits, experience: PyTree
-) -> tuple[Any, Any, ChunkReport]:
+) -> tuple[PyTree, PyTree, ChunkReport]:
     """Returns carry, experience and report after a chunk, of several runs if there is an axis of them."""
     take = lambda carry, limits, experience: program.chunk(env, carry, experience, limits)  # noqa: E731
     if np.ndim(carry.in_a_row) == 0:
@@ -171,19 +173,19 @@ def take_chunk(
     return jax.vmap(for_runs(take, len(carry.in_a_row)), axes, (axes[0], axes[2], 0))(carry, limits, experience)
 
 
-def first_action(program: Program, env: FunctionalEnv, carry: Carry, progress: Any) -> jax.Array | None:
+def first_action(program: Program, env: FunctionalEnv, carry: Carry, progress: Scalar) -> jax.Array | None:
     """Returns the first actions of a run."""
     program = program.with_hyperparameters(carry.hyper)
     clock = Clock(carry.counts.step, carry.episodes.n_finished, progress)
     return program.choose(env, carry, program.packing.unpack(carry.state), clock).action  # type: ignore[attr-defined]
 
 
-def axes_of(tree: PyTree) -> Any:
+def axes_of(tree: PyTree) -> PyTree:
     """Returns for each field of a carry or of experience 0, or None if all runs share it."""
     return type(tree)(**{name: None if name in SHARED else 0 for name in tree._fields})
 
 
-def of_run(tree: PyTree, i: int) -> Any:
+def of_run(tree: PyTree, i: int) -> PyTree:
     """Returns the experience of one of several runs."""
     parts = {name: jax.tree.map(lambda leaf: leaf[i], getattr(tree, name)) for name in {*tree._fields} - {*SHARED}}
     return tree._replace(**parts)
@@ -214,7 +216,7 @@ def episodes_of(run: Run) -> EpisodeState:
     )
 
 
-def put_episodes(run: Run, episodes: Any) -> None:
+def put_episodes(run: Run, episodes: PyTree) -> None:
     """Puts environments and episodes into a run, as the host's loops leave them.
 
     Args:
@@ -250,7 +252,7 @@ def episodes_in(run: Run, log: EpisodeLog, first_step: int) -> list[Episode]:
 def stacked(trees: Sequence[PyTree]) -> PyTree:
     """Returns trees of equal structure as one on the device, whose leaves have a leading axis."""
 
-    def joined(*leaves: Any) -> jax.Array:
+    def joined(*leaves: Array) -> jax.Array:
         on_host = all(isinstance(leaf, np.ndarray) for leaf in leaves)
         return jnp.array(np.stack(leaves)) if on_host else jnp.stack(leaves)
 

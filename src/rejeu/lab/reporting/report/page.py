@@ -8,7 +8,7 @@ import zlib
 from functools import cache
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from rejeu.core.errors import MissingExtra, requires
 
@@ -27,7 +27,7 @@ class Entry(NamedTuple):
     note: str = ""
 
 
-def render(template: str, data: object, **context: Any) -> str:
+def render(template: str, data: object, **context: object) -> str:
     """Returns a page that extends ``base.html``.
 
     Args:

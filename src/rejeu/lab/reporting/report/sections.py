@@ -125,7 +125,7 @@ def build(runs: Sequence[RunSummary], folder: Path | None) -> Parts:
     return Parts(sections, {"charts": charts, "histograms": histograms})
 
 
-def charts_of(run: RunSummary, prefix: str) -> tuple[dict[str, Any], list[ChartGroup]]:
+def charts_of(run: RunSummary, prefix: str) -> tuple[dict[str, Chart], list[ChartGroup]]:
     """Returns the charts of a run by id, and groups of their ids and titles for the template."""
     curves: list[tuple[str, str, str, Any]] = [
         (CURVES, column, title, chart_data.episode_chart(run.episodes, run.evaluations, column))

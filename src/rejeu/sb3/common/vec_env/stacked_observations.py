@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -74,7 +73,7 @@ class StackedObservations:
         self._stack = {key: self._begun(key, newest) for key, newest in by_key(observation).items()}
         return self._stacked()
 
-    def update(self, observations: Observation, dones: np.ndarray, infos: list[Info]) -> tuple[Any, list[Any]]:
+    def update(self, observations: Observation, dones: np.ndarray, infos: list[Info]) -> tuple[Observation, list[Info]]:
         """Returns the stacks after a step, and the infos, whose ``terminal_observation`` become stacks too."""
         ended = np.flatnonzero(dones).tolist()
         last = {i: by_key(infos[i][TERMINAL_OBSERVATION]) for i in ended if TERMINAL_OBSERVATION in infos[i]}

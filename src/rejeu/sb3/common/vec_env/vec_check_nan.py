@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from typing import Any
 
 import numpy as np
 
@@ -34,7 +33,7 @@ class VecCheckNan(VecEnvWrapper):
         super().__init__(venv)
         self.raise_exception, self.warn_once, self.check_inf = raise_exception, warn_once, check_inf
         self._warned = False
-        self._last_actions: Any = None
+        self._last_actions: Action = None
         """Actions of the last step, None after a reset."""
 
     def step_async(self, actions: Action) -> None:

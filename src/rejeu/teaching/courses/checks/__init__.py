@@ -50,6 +50,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rejeu.core.language import SETTING, Language, chosen
+from rejeu.core.types import JsonObject
 
 NOT_STUDENTS = (Path(__file__).parents[3], Path(sysconfig.get_paths()["stdlib"]))
 """Folders whose code the student did not write, besides ``site-packages``."""
@@ -61,6 +62,10 @@ NOT_COMPILED = (
 """Errors of code that JAX cannot compile."""
 
 
+Student = Callable[..., Any]
+"""The function or class that a student wrote."""
+
+
 class Wrong(Exception):
     """The student's answer is not right.
 
@@ -69,7 +74,7 @@ class Wrong(Exception):
         values: what replaces the names in braces in the message.
     """
 
-    def __init__(self, key: str, **values: Any) -> None:
+    def __init__(self, key: str, **values: object) -> None:
         super().__init__(key)
         self.key = key
         self.values = values
@@ -89,7 +94,7 @@ class NotebookState:
         self.found: dict[str, str] = {}
         """Result of each check, by its name: nothing if the answer is right, else the message."""
 
-    def say(self, key: str, course: str = "base", exercise: str = "shared", **values: Any) -> str:
+    def say(self, key: str, course: str = "base", exercise: str = "shared", **values: object) -> str:
         """Returns a message in the language of the notebook.
 
         Args:
@@ -107,7 +112,7 @@ SESSION = NotebookState()
 
 
 @cache
-def messages(course: str) -> dict[str, dict[str, Any]]:
+def messages(course: str) -> dict[str, dict[str, JsonObject]]:
     """Returns the table of a course by exercise and name, from the file next to its module; messages are by language."""
     file = resources.files("rejeu.teaching.courses.checks") / f"{course}.toml"
     return tomllib.loads(file.read_text(encoding="utf-8"))
@@ -151,7 +156,7 @@ def exercise(check: Callable[..., None]) -> Callable[..., Verdict]:
     return checked
 
 
-def tabulated(module: str, **functions: Any) -> dict[str, Callable[..., Verdict]]:
+def tabulated(module: str, **functions: object) -> dict[str, Callable[..., Verdict]]:
     """Returns the checks that the table of a course describes, by name; see :mod:`rejeu.teaching.courses.checks`.
 
     ``functions`` are those that cases of the table name.
@@ -171,7 +176,7 @@ def of_table(
     cases = [{**case, **dict(zip(each, row, strict=True))} for row in rows] if each else [case]
     wrong = {key: entry["result"] for key, entry in section.items() if isinstance(entry, dict) and "result" in entry}
 
-    def check(student: Any) -> None:
+    def check(student: Student) -> None:
         convert = lambda value: jnp.asarray(value) if is_compiled and hasattr(value, "dtype") else value  # noqa: E731
         inputs = [[*map(convert, case.values())] for case in cases]
         right = np.asarray(section["right"])
@@ -190,7 +195,7 @@ def of_table(
     return exercise(check)
 
 
-def require(*names: str, **answers: Any) -> None:
+def require(*names: str, **answers: object) -> None:
     """Stops the notebook with one line unless these checks have been passed.
 
     Args:
@@ -206,7 +211,7 @@ def require(*names: str, **answers: Any) -> None:
         raise NotReady(SESSION.say("missing", names=", ".join(missing)))
 
 
-def call(student: Any, *args: object, may_return_none: bool = False, copies: bool = True) -> Any:
+def call(student: Student, *args: object, may_return_none: bool = False, copies: bool = True) -> Any:
     """Calls the student's function or class and returns the result.
 
     Args:
@@ -233,7 +238,7 @@ def call(student: Any, *args: object, may_return_none: bool = False, copies: boo
     return result
 
 
-def compiles(student: Any, *args: object) -> None:
+def compiles(student: Student, *args: object) -> None:
     """Checks that JAX can compile the student's function, as training does.
 
     Raises:
@@ -267,7 +272,7 @@ def numbers(result: object, shape: tuple[int, ...]) -> np.ndarray:
     return array
 
 
-def diagnose(result: np.ndarray, right: ArrayLike, /, **wrong: Any) -> None:
+def diagnose(result: np.ndarray, right: ArrayLike, /, **wrong: ArrayLike) -> None:
     """Raises :class:`Wrong` unless a result is right, with the message of the first mistake whose result it is.
 
     Args:
@@ -283,7 +288,7 @@ def diagnose(result: np.ndarray, right: ArrayLike, /, **wrong: Any) -> None:
     raise Wrong("by_hand", seen=_rounded(result), right=_rounded(right))
 
 
-def mistakes(**occurred: Any) -> None:
+def mistakes(**occurred: object) -> None:
     """Raises :class:`Wrong` with the message of the first mistake that was seen.
 
     Args:

@@ -3,26 +3,25 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 
-from rejeu.core.types import Action, PyTree
-from rejeu.teaching.courses.checks import call, close, diagnose, exercise, mistakes, numbers, tabulated
+from rejeu.core.types import Action, AnyArray, Observation, PyTree
+from rejeu.teaching.courses.checks import Student, call, close, diagnose, exercise, mistakes, numbers, tabulated
 
 
-def _value(state: Any, action: Action) -> Any:
+def _value(state: Observation, action: Action) -> AnyArray:
     return state[:, :1] + 2.0 * action
 
 
-def _action(state: Any) -> Any:
+def _action(state: Observation) -> AnyArray:
     return 0.5 * state[:, 1:]
 
 
 def _layers() -> dict[str, PyTree]:
     """Returns a small critic. Both branches have as many outputs, so that their order shows."""
     rng, shapes = np.random.default_rng(0), {"state": (2, 4), "action": (1, 4), "common": (8, 5)}
-    layers: dict[str, Any] = {
+    layers: dict[str, PyTree] = {
         key: [(rng.normal(size=shape), rng.normal(size=shape[1]))] for key, shape in shapes.items()
     }
     return layers | {"output": (rng.normal(size=(5, 1)), np.array([-1.0]))}
@@ -32,7 +31,7 @@ globals().update(tabulated(__name__, q=_value, mu=_action, layers=_layers()))
 
 
 @exercise
-def ball_step(student: Any) -> None:
+def ball_step(student: Student) -> None:
     """Checks ``ball_step(position, push, kick)``."""
     position = np.array([[1.0, -2.0], [9.5, 0.0], [0.0, -9.0], [11.0, 0.0]])
     push = np.array([[0.5, 1.0], [1.0, 0.0], [0.0, -2.0], [-2.0, 0.0]])
@@ -59,7 +58,7 @@ def ball_step(student: Any) -> None:
 
 
 @exercise
-def soft_update(student: Any) -> None:
+def soft_update(student: Student) -> None:
     """Checks ``soft_update(target, online, tau)``."""
     target, online, tau = np.array([1.0, -2.0]), np.array([3.0, 4.0]), 0.1
     result = call(student, {"weight": target, "bias": [target * 2]}, {"weight": online, "bias": [online * 2]}, tau)
@@ -75,7 +74,7 @@ def soft_update(student: Any) -> None:
 
 
 @exercise
-def repel(student: Any) -> None:
+def repel(student: Student) -> None:
     """Checks ``repel(action, x, strength, low, high)``."""
     action, x = np.array([2.6, 2.9, 2.0, -0.9]), np.array([1.0, 0.12, 0.9, -0.6])
     strength, low, high = 2e-3, -1.0, 3.0

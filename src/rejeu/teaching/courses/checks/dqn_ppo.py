@@ -10,10 +10,21 @@ import numpy as np
 
 from rejeu.core.algorithm import Transition
 from rejeu.core.types import Action, AnyArray, Info, Observation
-from rejeu.teaching.courses.checks import Wrong, call, close, compiles, diagnose, exercise, mistakes, numbers, tabulated
+from rejeu.teaching.courses.checks import (
+    Student,
+    Wrong,
+    call,
+    close,
+    compiles,
+    diagnose,
+    exercise,
+    mistakes,
+    numbers,
+    tabulated,
+)
 
 
-def _linear(weight: AnyArray, obs: Observation) -> Any:
+def _linear(weight: AnyArray, obs: Observation) -> AnyArray:
     return obs @ weight
 
 
@@ -32,7 +43,7 @@ globals().update(tabulated(__name__, **_NETWORKS, batch=_BATCH))
 
 
 @exercise
-def replay_memory(student: Any) -> None:
+def replay_memory(student: Student) -> None:
     """Checks the class ``ReplayMemory(capacity, obs_size)`` with ``push``, ``sample`` and ``len``."""
     memory = call(student, 4, 2)
     for i in range(1, 4):
@@ -77,7 +88,7 @@ def _sampled(memory: Any) -> set[int]:
 
 
 @exercise
-def choose(student: Any) -> None:
+def choose(student: Student) -> None:
     """Checks ``choose(q, epsilon, key)``, by counting the actions of many environments."""
     n, share = 30_000, 0.3
     q = jnp.tile(jnp.array([1.0, 5.0, 2.0]), (n, 1))
@@ -102,7 +113,7 @@ class _Corridor:
     def __init__(self) -> None:
         self.episode, self.time, self.n_steps = -1, 0, 0
         self.goes_on_after: set[str] = set()
-        self.actions: list[Any] = []
+        self.actions: list[Action] = []
 
     def reset(self, seed: int | None = None, options: object = None) -> tuple[np.ndarray, Info]:
         self.episode, self.time = self.episode + 1, 0
@@ -133,7 +144,7 @@ class _Notes(list):
 
 
 @exercise
-def loop(student: Any) -> None:
+def loop(student: Student) -> None:
     """Checks ``loop(env, memory, act, learn, n_episodes, batch_size, gamma, rng)`` with an environment that takes notes."""
     env, memory = _Corridor(), _Notes()
     calls: list[tuple[np.ndarray, float]] = []
@@ -176,7 +187,7 @@ def loop(student: Any) -> None:
 
 
 @exercise
-def normalized_advantages(student: Any) -> None:
+def normalized_advantages(student: Student) -> None:
     """Checks ``normalized_advantages(returns, values)``."""
     returns, values = jnp.array([5.0, -1.0, 2.0, 4.0]), jnp.array([1.0, 1.0, 0.0, 6.0])
     gain = returns - values

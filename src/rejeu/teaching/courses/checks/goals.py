@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,7 +13,7 @@ import numpy as np
 
 from rejeu.agents import SAC
 from rejeu.core.types import Action
-from rejeu.teaching.courses.checks import Wrong, call, close, diagnose, exercise, mistakes, numbers, tabulated
+from rejeu.teaching.courses.checks import Student, Wrong, call, close, diagnose, exercise, mistakes, numbers, tabulated
 
 N = 4_000
 """Draws of a strategy, enough that every time occurs."""
@@ -36,7 +35,7 @@ globals().update(tabulated(__name__))
 
 
 @exercise
-def compute_reward(student: Any) -> None:
+def compute_reward(student: Student) -> None:
     """Checks ``compute_reward(achieved_goal, desired_goal, info)`` for bits, one goal and a batch."""
     achieved = np.array([[0, 1, 1], [0, 1, 0], [1, 0, 0]], np.int8)
     desired = np.array([[0, 1, 1], [1, 0, 1], [1, 1, 0]], np.int8)
@@ -57,7 +56,7 @@ def compute_reward(student: Any) -> None:
 
 
 @exercise
-def relabel(student: Any) -> None:
+def relabel(student: Student) -> None:
     """Checks ``relabel(step, goal)`` with the reward of bits."""
     a, b, c = (np.array(bits, np.int8) for bits in ([0, 0, 1], [0, 1, 1], [1, 1, 1]))
     missed = GoalStep(_observe(a, c), 1, -1.0, _observe(b, c), False)
@@ -92,7 +91,7 @@ def _one_relabeling(result: Any, step: GoalStep, goal: np.ndarray, achieved: boo
 
 
 @exercise
-def hindsight(student: Any) -> None:
+def hindsight(student: Student) -> None:
     """Checks ``hindsight(episode, k, rng)``, the steps of an episode with ``k`` relabeled copies of each."""
     states = [np.array([(t >> bit) & 1 for bit in range(4)], np.int8) for t in range(7)]
     goal = np.array([1, 1, 1, 1], np.int8)
@@ -127,7 +126,7 @@ def _check_times(time: np.ndarray, drawn: np.ndarray, last: np.ndarray | int) ->
     )
 
 
-def _draw(student: Callable[..., Any]) -> tuple[np.ndarray, ...]:
+def _draw(student: Student) -> tuple[np.ndarray, ...]:
     """Returns ``time``, ``first``, ``last`` and the times that a strategy chose for steps of two episodes."""
     rng = np.random.default_rng(0)
     first = np.where(np.arange(N) % 2 == 0, 101, 1)
@@ -143,14 +142,14 @@ def _draw(student: Callable[..., Any]) -> tuple[np.ndarray, ...]:
 
 
 @exercise
-def future(student: Any) -> None:
+def future(student: Student) -> None:
     """Checks ``future(rng, time, first, last)``."""
     time, _, last, drawn = _draw(student)
     _check_times(time, drawn, last)
 
 
 @exercise
-def final(student: Any) -> None:
+def final(student: Student) -> None:
     """Checks ``final(rng, time, first, last)``."""
     time, first, last, drawn = _draw(student)
     diagnose(
@@ -163,7 +162,7 @@ def final(student: Any) -> None:
 
 
 @exercise
-def episode(student: Any) -> None:
+def episode(student: Student) -> None:
     """Checks ``episode(rng, time, first, last)``."""
     time, first, last, drawn = _draw(student)
     mistakes(
@@ -175,7 +174,7 @@ def episode(student: Any) -> None:
 
 
 @exercise
-def saving(save_all: Any, load_all: Any, agent: Any = None, env: Any = "Pendulum-v1") -> None:
+def saving(save_all: Student, load_all: Student, agent: Any = None, env: Any = "Pendulum-v1") -> None:
     """Checks ``save_all(agent, folder)`` and ``load_all(folder, env)`` with an agent, by default one of SAC."""
     if agent is None:
         agent = SAC("MlpPolicy", env, learning_starts=100, buffer_size=1_000, seed=0).learn(20)

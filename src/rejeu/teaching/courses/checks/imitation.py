@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
-from rejeu.teaching.courses.checks import Wrong, call, exercise, mistakes, numbers, tabulated
+from rejeu.teaching.courses.checks import Student, Wrong, call, exercise, mistakes, numbers, tabulated
 
 globals().update(tabulated(__name__))
 
 
 @exercise
-def aggregate(student: Any) -> None:
+def aggregate(student: Student) -> None:
     """Checks ``aggregate(known, visited, expert)`` with an expert that adds 10."""
     before, visited = [(0.0, 10.0), (1.0, 11.0)], [(2.0, -2.0), (3.0, -3.0), (4.0, -4.0)]
     asked: list[float] = []
@@ -38,7 +36,7 @@ def aggregate(student: Any) -> None:
 
 
 @exercise
-def symmetric(student: Any) -> None:
+def symmetric(student: Student) -> None:
     """Checks ``symmetric(own, shown, n, rng)``."""
     replayed, shown, n = np.arange(5000), 10_000 + np.arange(20), 1000
     drawn = numbers(call(student, replayed, shown, n, np.random.default_rng(0)), (n,))
