@@ -98,7 +98,7 @@ class Config(RolloutConfig):
 
 
 class Perturbation(eqx.Module):
-    """What choosing an action needs: the parameters, and what the perturbations are drawn from."""
+    """The policy of a rollout: its parameters, and the key from which their perturbations are drawn."""
 
     network: Network
     key: Array

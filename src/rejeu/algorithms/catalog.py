@@ -24,7 +24,7 @@ class Entry(NamedTuple):
     module: str
     """Its file or folder in ``rejeu.algorithms``, with ``Config`` and ``make``."""
     kind: Literal["replay", "rollout", "offline"]
-    """What it learns from: a replay buffer, rollouts of its policy, or recorded episodes."""
+    """The source of its batches: a replay buffer, rollouts of its policy, or recorded episodes."""
     summary: str
     """The first line of ``help(rejeu.NAME)``."""
     actor: str = ""

@@ -68,7 +68,7 @@ def _spread(positions: Array, probabilities: Array, n_atoms: int) -> Array:
 
 
 def _scattered(positions: Array, probabilities: Array, n_atoms: int) -> Array:
-    """Returns the same by adding each probability to two atoms: for 101 atoms, a hundred times as fast on a CPU."""
+    """Returns the result of :func:`_spread` by adding to two atoms: for 101 atoms, a hundred times as fast on a CPU."""
     shape, positions, probabilities = (
         positions.shape,
         positions.reshape(-1, positions.shape[-1]),

@@ -87,7 +87,7 @@ class AlgorithmConfig:
     """Normalize observations and rewards by running statistics: True, or a dict with ``norm_obs``, ``norm_reward``,
     ``clip_obs``, ``clip_reward``. The statistics are saved with the agent, which takes raw observations."""
     nonfinite: Literal["stop", "skip"] = "stop"
-    """What to do if an update results in a loss or a weight that is NaN or infinite: ``"stop"`` with an error that names
+    """Reaction to an update that results in a loss or a weight that is NaN or infinite: ``"stop"`` with an error that names
     it and saves what was learned from, or ``"skip"`` that update and count it."""
     action_masks: bool = False
     """Take masks of the allowed actions from the environment (``info["action_mask"]`` or ``action_masks()``) and choose
@@ -116,7 +116,7 @@ class AlgorithmConfig:
     hidden_layers: ClassVar[Widths] = Widths((256, 256), (256, 256))
     """Default widths of the networks."""
     hidden_layers_on_images: ClassVar[Widths] = hidden_layers
-    """The same where the observation is an image."""
+    """Default widths where the observation is an image."""
     for_many: ClassVar[Mapping[str, object]] = {}
     """Hyperparameters that ``rejeu train`` uses with 64 environments or more, without a preset."""
     search_space: ClassVar[SearchSpace] = {}
@@ -331,7 +331,7 @@ def with_widths(config: C, obs_leaves: tuple[Leaf, ...]) -> C:
 
 
 def network_inputs(config: Any, observation_space: spaces.Space) -> tuple[tuple[Leaf, ...], Any]:
-    """Returns what networks are made of: the leaves of observations, and the ``policy_kwargs`` with their widths.
+    """Returns the arguments of networks: the leaves of observations, and the ``policy_kwargs`` with their widths.
 
     Raises:
         TypeError: if the observation space holds something that is not an array.

@@ -97,7 +97,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
 
 
 class Equations(NamedTuple):
-    """What CrossQ, FlashSAC and XQC do each in their own way."""
+    """The equations and layers in which CrossQ, FlashSAC and XQC differ."""
 
     target: Callable[[PyTree, Transition, Array, Array], Array]
     """``target(target_critics, batch, next_action, next_entropy_cost)``: what the critics learn."""

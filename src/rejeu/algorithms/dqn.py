@@ -165,7 +165,7 @@ class Config(QLearningConfig):
     loss: Literal["huber", "squared"] = "huber"
     """Loss of the TD error: ``huber`` grows linearly beyond 1, ``squared`` is the square."""
     distribution: Literal["expected", "categorical"] = "expected"
-    """What is learned of the return: its mean, or the probabilities of ``n_atoms`` values (C51), whose loss is the
+    """Prediction of the return: its mean, or the probabilities of ``n_atoms`` values (C51), whose loss is the
     cross-entropy. For quantiles there are QRDQN and IQN."""
     v_min: float = -10.0
     """Lowest return that ``categorical`` can represent, with the discount; lower ones count as this one."""
@@ -188,7 +188,7 @@ class Config(QLearningConfig):
 
     @property
     def returns(self) -> Returns:
-        """What the network predicts, and how it learns it."""
+        """The prediction of the network, and its loss."""
         if self.distribution == "categorical":
             return categorical_returns(categorical.make_atoms(self.v_min, self.v_max, self.n_atoms))
         return LOSSES[self.loss]
@@ -218,7 +218,7 @@ class Munchausen(NamedTuple):
 
 
 class Returns(NamedTuple):
-    """What a network predicts of the return of every action, and how it learns it.
+    """A prediction of the return of every action by a network, and its loss.
 
     Keys are for what is drawn at random: noise on the weights, or the fractions of quantiles. None stands for no noise.
     """
@@ -422,7 +422,7 @@ def joined(value: Array, advantage: Array) -> Array:
 
 
 def expected(penalty: Callable[[Array], Array]) -> Returns:
-    """Returns what learns the mean of the return, with this function of the TD error as the loss."""
+    """Returns the prediction of the mean of the return, with this function of the TD error as the loss."""
 
     def loss(
         network: PyTree, obs: PyTree, action: Array, target: Array, key: Array | None
@@ -437,12 +437,12 @@ def expected(penalty: Callable[[Array], Array]) -> Returns:
 
 
 LOSSES: dict[str, Returns] = {"huber": expected(optax.huber_loss), "squared": expected(jnp.square)}
-"""What learns the mean of the return, by the name of the setting ``loss``."""
+"""Predictions of the mean of the return, by the name of the setting ``loss``."""
 MEAN, NO_KEYS = LOSSES["huber"], (None, None)
 
 
 def categorical_returns(atoms: Array) -> Returns:
-    """Returns what learns the probabilities of these atoms (C51). Priorities go by the divergence, as in Rainbow."""
+    """Returns the prediction of the probabilities of these atoms (C51). Priorities go by the divergence, as in Rainbow."""
     probabilities = lambda network, obs, key: jax.nn.softmax(network(obs), axis=-1)  # noqa: E731
 
     def target(reward: Array, discount: Array, following: Array) -> Array:
@@ -461,7 +461,7 @@ def categorical_returns(atoms: Array) -> Returns:
 
 
 def with_noise(returns: Returns) -> Returns:
-    """Returns the same with noise on the weights of the network, unless the key is None."""
+    """Returns a prediction by a network with noise on its weights, unless the key is None."""
     return returns._replace(
         values=lambda network, obs, key: returns.values(drawn(network, key), obs, key),
         describe=lambda network, obs, key: returns.describe(drawn(network, key), obs, key),

@@ -113,7 +113,7 @@ class ImplicitNetwork(eqx.Module):
 
 
 def implicit_returns(n_quantiles: int, n_target_quantiles: int, n_policy_quantiles: int, n_cosines: int) -> Returns:
-    """Returns what learns the quantiles of the return at random fractions."""
+    """Returns the prediction of the quantiles of the return at random fractions."""
 
     def values(network: PyTree, obs: PyTree, key: Array | None) -> Array:
         return jnp.mean(network(obs, quantile_fractions(n_policy_quantiles)[None]), axis=-1)

@@ -36,7 +36,7 @@ def acting_from_memory(algorithm: Algorithm, networks: Callable[[PyTree], tuple[
         return jnp.zeros((n_envs, sum(network.n_numbers for network in actor)), jnp.float32)
 
     def remember(memory: Array, actor: tuple[Recurrent, ...], obs: PyTree, ended: Array) -> tuple[PyTree, Array]:
-        """Returns what stands for observations, and the memory after them."""
+        """Returns the memory in place of observations, with their mask if they have one, and as the array to carry on."""
         obs, mask = unmasked(obs)
         memory = jnp.where(ended[:, None], 0.0, memory)
         memory = jnp.concatenate([network.after(memory, obs) for network in actor], axis=1)

@@ -218,7 +218,7 @@ def loss(network: ActorCritic, batch: Samples, config: Config, clock: Clock) -> 
 
 
 def loss_of(distribution: Any, value: Array, batch: Samples, config: Config, clock: Clock) -> tuple[Array, Losses]:
-    """Returns the same from the outputs of the network."""
+    """Returns the total loss of a minibatch and its parts from the outputs of the network."""
     log_prob = distribution.log_prob(batch.action)
     advantage = standardized(batch.advantage, batch.valid) if config.normalize_advantage else batch.advantage
     clip = at(config.clip_range, clock.progress)

@@ -63,7 +63,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
 
 
 def quantile_returns(n_quantiles: int) -> Returns:
-    """Returns what learns so many quantiles of the return. Priorities go by the difference of the two means."""
+    """Returns the prediction of so many quantiles of the return. Priorities go by the difference of the two means."""
 
     def loss(
         network: PyTree, obs: PyTree, action: Array, target: Array, key: Array | None

@@ -40,7 +40,7 @@ class Config(td3.Config):
     """Weight of the squared distance of the actor's actions from recorded ones. 0.001 where these are poor, 0.1 or more where
     they are few and good."""
     critic_bc: float = 0.01
-    """The same of the next actions, in the TD targets. 0 trusts the values of actions that were not recorded."""
+    """As ``actor_bc``, but of the next actions in the TD targets. 0 trusts the values of actions that were not recorded."""
     critic_layer_norm: bool = True
     """Normalize the hidden layers of critics, if these are plain layers."""
 

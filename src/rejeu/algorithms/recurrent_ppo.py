@@ -183,7 +183,7 @@ class RecurrentActorCritic(eqx.Module):
         return tuple(cell.unroll(before, read, started) for cell, before, read in each)
 
     def features(self, obs: PyTree) -> tuple[Array, ...]:
-        """Returns what each cell is given of observations ``(n, ...)``, ``(n, n_features)`` each."""
+        """Returns the features of observations ``(n, ...)`` for each cell, ``(n, n_features)`` each."""
         features = self.encoder(obs)
         if self.value_encoder is None:
             return (features,) * len(self.cells)

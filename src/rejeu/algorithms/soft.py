@@ -120,7 +120,7 @@ class State(eqx.Module):
 
 
 class SoftCritic(NamedTuple):
-    """What is an algorithm's own: its networks, and its equations for one update.
+    """The parts in which algorithms differ: their networks, and their equations for one update.
 
     Keys are for what is drawn at random, such as actions.
     """

@@ -21,7 +21,7 @@ HIDDEN = (
     "turns here; to be called after every step, set agent.on_device = False, or derive the callback from "
     "rejeu.callbacks.TrainingCallback with every_step = True"
 )
-"""What is added to the error of a callback that needs what a chunk hides."""
+"""Advice in the error of a callback that needs what a chunk hides."""
 
 
 class TrainingCallback(ABC):

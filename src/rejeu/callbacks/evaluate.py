@@ -157,6 +157,6 @@ def logged(evaluation: Evaluation) -> dict[str, float]:
 
 
 def merit(evaluation: Evaluation) -> tuple[float, float]:
-    """Returns what evaluations are compared by: success rate, -1 if it is unknown, and mean return, -inf if it is NaN."""
+    """Returns the key to compare evaluations by: success rate, -1 if it is unknown, and mean return, -inf if it is NaN."""
     rate, value = evaluation.success_rate, evaluation.mean_return
     return (-1.0 if math.isnan(rate) else rate), (-math.inf if math.isnan(value) else value)

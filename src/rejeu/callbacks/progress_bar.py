@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 REFRESH_SECONDS = 0.125
 """Least time between two refreshes of the progress bar on a terminal."""
 NOTEBOOK_SECONDS = 0.5
-"""The same in a notebook, where each is a message to the browser."""
+"""Least time between two refreshes in a notebook, where each is a message to the browser."""
 LINE_SECONDS = 10.0
 """Least time between two lines of progress if the output is not a terminal."""
 LONG_TRACE = 0.1

@@ -36,7 +36,7 @@ PerDimension = Any
 
 @runtime_checkable
 class NoiseProcess(Protocol):
-    """What ``action_noise`` needs: any object with these two methods.
+    """The interface of ``action_noise``: any object with these two methods.
 
     For example noise that alternates its sign from step to step::
 
@@ -93,7 +93,7 @@ class ActionNoise(ABC):
         """
 
     def perturb(self, state: Array, action: Array, key: Array) -> tuple[Array, Array]:
-        """Returns what :meth:`advance` does, with random numbers drawn from ``key``."""
+        """Returns the result of :meth:`advance` with random numbers drawn from ``key``."""
         return self.advance(state, action, jax.random.normal(key, action.shape))
 
     def __call__(self, action: ArrayLike = 0.0) -> np.ndarray:

@@ -17,13 +17,13 @@ PRIMITIVES = tomllib.loads((Path(__file__).parent / "primitives.toml").read_text
 
 
 class Format(NamedTuple):
-    """What differs between formats."""
+    """The properties of a format."""
 
     module: str
     """It writes the files: ``files(source)``, of an :class:`~rejeu.export.contract.Exportable`."""
     suffix: str
     runner: str
-    """What runs such a file, so that it can be compared with ``predict``."""
+    """The program that runs such a file, so that it can be compared with ``predict``."""
     takes: Literal["one", "any", "each"] = "each"
     """Observations at once: one, any number, or a fixed one too (``each``)."""
     noise: bool = True

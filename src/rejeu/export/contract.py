@@ -1,4 +1,4 @@
-"""What a policy takes and returns: its program with names, shapes, dtypes and bounds, and the card about it."""
+"""The inputs and outputs of a policy: its program with names, shapes, dtypes and bounds, and the card about it."""
 
 from __future__ import annotations
 
@@ -119,11 +119,11 @@ class Policy(NamedTuple):
 
 
 class Exportable(NamedTuple):
-    """What the files of a format are written from."""
+    """The source of the files of a format."""
 
     policy: Policy
     one: Policy
-    """The same for one observation at a time."""
+    """The policy for one observation at a time."""
     card: JsonObject
     """About it."""
     observation_space: gym.Space

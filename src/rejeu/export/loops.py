@@ -267,7 +267,7 @@ def placed(*groups: tuple[Sequence[int], Sequence[str]]) -> list[str]:
 
 
 def reshape(printer: Printer, operation: Operation) -> None:
-    """The same memory in another shape; a copy if it is not stored in order."""
+    """Gives memory another shape; copies it if it is not stored in order."""
     array, out = printer.view(operation.inputs[0]), operation.outputs[0]
     name = array.name or printer.stored(array).name
     printer.known[out] = memory(name, out.shape, array.dtype)

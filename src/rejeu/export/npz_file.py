@@ -62,7 +62,7 @@ def plain(param: Any) -> Any:
 
 
 def content_of(source: Exportable) -> tuple[dict[str, Any], list[np.ndarray]]:
-    """Returns what a file holds: JSON values and constants."""
+    """Returns the content of a file: JSON values and constants."""
     program, constants = described(source.policy.program)
     observations, actions = map(spaces.describe, (source.observation_space, source.action_space))
     content = {"card": source.card, "observation_space": observations, "action_space": actions, "program": program}

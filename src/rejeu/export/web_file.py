@@ -124,7 +124,7 @@ def node_run(policy: Policy, script: str) -> Run | None:
 
 
 def node(script: str, message: object) -> Any:
-    """Returns what a script writes as JSON, which reads JSON, both by standard input and output."""
+    """Returns the JSON value that a script writes to standard output, when it reads ``message`` from standard input."""
     with tempfile.TemporaryDirectory() as name:
         path = Path(name) / "main.js"
         path.write_text(script, encoding="utf-8")

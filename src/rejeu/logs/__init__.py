@@ -1,1 +1,1 @@
-"""What training came to: rows of statistics and where they go, history, evaluations, figures and videos."""
+"""The results of training: rows of statistics and where they go, history, evaluations, figures and videos."""

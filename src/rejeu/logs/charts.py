@@ -355,7 +355,7 @@ def goal_chart(episodes: Table) -> Chart | None:
 
 
 def value_chart(values: np.ndarray, to_go: np.ndarray) -> Chart:
-    """Returns what the critic expected along an episode, and the discounted return that followed; either may be empty."""
+    """Returns the chart of the critic's values along an episode and of the discounted returns; either may be empty."""
     lines = {"discounted return from here on": ("line", to_go), "what the critic expects": ("accent", values)}
     shown_series = []
     for name, (color, line) in lines.items():

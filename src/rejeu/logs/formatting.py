@@ -26,7 +26,7 @@ WIDE = 10_000
 """Columns of a table that is not written to a terminal, so that no cell is folded."""
 
 LOGS = ("csv", "json", "tensorboard", "wandb", "mlflow", "trackio")
-"""What the argument ``log`` takes."""
+"""Names of outputs that the argument ``log`` takes."""
 
 
 def counted(n: int, noun: str) -> str:

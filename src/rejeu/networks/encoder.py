@@ -82,7 +82,7 @@ class CNN(eqx.Module):
     norms: tuple[LayerNorm, ...]
     """Over the channels of each layer; empty without layer norm."""
     scale: float = eqx.field(static=True)
-    """What pixels are divided by."""
+    """Divisor of pixels."""
 
     def __init__(
         self,
@@ -200,7 +200,7 @@ class OwnEncoder(eqx.Module):
         return self.module(self.arrange(jax.tree.leaves(unmasked(obs)[0])))
 
     def arrange(self, arrays: list[PyTree]) -> Any:
-        """Returns what the module is called with: an array, or for a Dict or Tuple space a dict from path to array."""
+        """Returns the argument of the module: an array, or for a Dict or Tuple space a dict from path to array."""
         paths = [leaf.path for leaf in self.leaves]
         return arrays[0] if paths == [""] else dict(zip(paths, arrays, strict=True))
 

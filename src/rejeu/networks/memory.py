@@ -88,7 +88,7 @@ class Cell(eqx.Module):
         return tuple(jnp.zeros((n, self.size), jnp.float32) for _ in range(2 if self.kind == "lstm" else 1))
 
     def project(self, x: Array) -> Array:
-        """Returns what the inputs ``(..., n_inputs)`` bring to the gates; of many steps at once."""
+        """Returns the contribution of the inputs ``(..., n_inputs)`` to the gates; of many steps at once."""
         return x @ self.inputs + self.bias.reshape(*[1] * (x.ndim - 1), -1)
 
     def step(self, memory: tuple[Array, ...], projected: Array) -> tuple[Array, ...]:
@@ -136,7 +136,7 @@ class Recurrent(eqx.Module):
     burn_in: int = eqx.field(static=True)
 
     def __call__(self, obs: PyTree, *inputs: Array) -> Array:
-        """Returns what the network computes from observations and other inputs, ``(batch, ...)`` each."""
+        """Returns the outputs of the network for observations and other inputs, ``(batch, ...)`` each."""
         return self.reader(self.remembered(obs), *inputs)
 
     @property
@@ -154,7 +154,7 @@ class Recurrent(eqx.Module):
         return jnp.concatenate(self.cell.step(self.part(memory), self.cell.project(self.encoder(obs))), axis=1)
 
     def remembered(self, obs: PyTree) -> Array:
-        """Returns what is remembered with observations, ``(batch, size)``; plain ones are the first of their episodes."""
+        """Returns the output of the cell for observations, ``(batch, size)``; plain ones are the first of their episodes."""
         obs, _ = unmasked(obs)
         if isinstance(obs, Remembered):
             return self.part(obs.memory)[0]
@@ -164,7 +164,7 @@ class Recurrent(eqx.Module):
         return self.cell.step(self.cell.empty(features.shape[0]), self.cell.project(features))[0]
 
     def unrolled(self, sequences: Sequences) -> Array:
-        """Returns what is remembered with the rows that are read, ``(sequences * n_reads, size)``."""
+        """Returns the outputs of the cell at the rows that are read, ``(sequences * n_reads, size)``."""
         memory, burn_in = self.part(sequences.memory), self.burn_in
 
         def unroll(

@@ -207,7 +207,7 @@ def action_values(critics: PyTree, obs: PyTree, action: Array) -> Array:
 
 
 def values_by_critics(state: PyTree, obs: PyTree, action: Array) -> Array:
-    """Returns the same of the critics in the state of an algorithm; for ``Algorithm.action_values``."""
+    """Returns the values by the critics in the state of an algorithm; for ``Algorithm.action_values``."""
     return action_values(state.critics, obs, action)
 
 

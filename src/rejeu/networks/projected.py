@@ -27,7 +27,7 @@ Network = TypeVar("Network")
 EXPANSION = 4
 """How many times wider a block is inside."""
 FINE = 1e-5
-"""What FlashSAC adds to variances."""
+"""Number that FlashSAC adds to variances."""
 
 
 class UnitLinear(eqx.Module):

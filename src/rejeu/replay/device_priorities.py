@@ -135,7 +135,7 @@ def pick(row: Array, ends: Array, mass: Array) -> tuple[Array, Array]:
 
 
 def noted(pending: Pending, number: Array, position: Array, time: Array, td_error: Array) -> Pending:
-    """Returns what is pending with the ``number``-th gradient step of a turn, on steps ``(batch_size,)``."""
+    """Returns the pending priorities with those of the ``number``-th gradient step of a turn, on steps ``(batch_size,)``."""
     pairs = zip(pending, (position, time, td_error), strict=True)
     return Pending(*(rows.at[number].set(new.astype(rows.dtype)) for rows, new in pairs))
 

@@ -352,7 +352,7 @@ class HerReplayBuffer(BaseReplayBuffer):
     def draw(
         self, rng: np.random.Generator, shape: tuple[int, ...], progress: float = 1.0
     ) -> tuple[Transition, Draw | None]:
-        """Returns what :meth:`ReplayBuffer.draw` does; of each batch, the first ``k / (k + 1)`` are relabeled."""
+        """Returns batches as :meth:`ReplayBuffer.draw` does; of each batch, the first ``k / (k + 1)`` are relabeled."""
         ring = self.ring
         rows, weight, drawn = self.draw_rows(rng, math.prod(shape), progress)
         read = ring.read(rows.position)

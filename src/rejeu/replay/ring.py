@@ -25,7 +25,7 @@ from rejeu.core.types import Observation
 STEP, TERMINATED, LAST = 0, 1, 2
 """Kinds of row: an ordinary step, a step into a terminal state of the MDP, a final observation without a step."""
 COUNTERS = ("since_start", "until_end")
-"""What a ring can keep of every row beside what the environment said: see :func:`episode_counters`."""
+"""Counters that a ring can keep for every row beside what the environment said: see :func:`episode_counters`."""
 
 
 class Rows(NamedTuple):
@@ -90,7 +90,7 @@ class Ring:
         self.until_end = self.records["until_end"] if "until_end" in counter_names else None
         """Steps to the ``LAST`` row of the episode; 0 while it runs, and in that row itself; None if not kept."""
         self.memory = np.zeros((n, memory_size), np.float32)
-        """What was remembered before each row's observation, ``(n, memory_size)``."""
+        """The memory of networks before each row's observation, ``(n, memory_size)``."""
         self.kind = np.zeros(n, np.uint8)
         """Separate from the records, where it would take 4 bytes, because sampling reads nothing else."""
         self.head = np.full(n_envs, -1, np.int64)
@@ -276,7 +276,7 @@ class Ring:
                     )
 
     def stored(self) -> dict[str, np.ndarray]:
-        """Returns what files hold of every row, by its name there, ``(n, ...)``; counters follow from ``kind``."""
+        """Returns the arrays of all rows that files hold, by name, ``(n, ...)``; counters follow from ``kind``."""
         obs = {f"obs.{leaf.path or 'array'}": a for leaf, a in zip(self.obs_leaves, self.obs, strict=True)}
         memory = {"memory": self.memory} if self.memory.size else {}
         return {**obs, "action": self.action, "reward": self.reward, "kind": self.kind, **memory}

@@ -50,7 +50,7 @@ class RolloutBuffer:
         self.started = np.zeros(n_envs, bool)
         """Whether an episode started with the first step, ``bool (n_envs,)``."""
         self.previously_started = self.started
-        """The same of the rollout before."""
+        """``started`` of the rollout before."""
         self.carry: PyTree = ()
         """Recurrent state of the policy before the first step, with leaves ``(n_envs, ...)``."""
         self.length = 0

@@ -275,7 +275,7 @@ class NewGoals(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What transitions lead to."""
+    """The rewards and ends of the steps that transitions cover."""
 
     rewards: AnyArray
     """``(batch,)``; of n steps ``(batch, n)``, 0 after the last."""
@@ -288,7 +288,7 @@ class Outcome(NamedTuple):
 def outcome(
     xp: ModuleType, ring: Any, index: Callable[..., AnyArray], rows: PyTree, n_steps: int, goals: NewGoals | None = None
 ) -> Outcome:
-    """Returns what ``rows`` lead to in up to ``n_steps`` steps, with new goals if there are any."""
+    """Returns rewards and ends of up to ``n_steps`` steps from ``rows``, with new goals if there are any."""
     if goals is not None:
         new, times = goals.which, rows.time[goals.which, None] + 1 + xp.arange(n_steps)[None]
         position = index(rows.env[new, None], times).reshape(-1)

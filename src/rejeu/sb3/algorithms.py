@@ -69,7 +69,7 @@ FIXED = {
     "ent_coef_tensor": "ent_coef",
     "env": "set_env(...)",
 }
-"""What is computed from something else, and what to use in order to change it."""
+"""Attributes that are computed, and the way to change each."""
 PARTS = {
     "optimizer": "policy.optimizer",
     "actor_optimizer": "actor.optimizer",
@@ -114,11 +114,11 @@ class Original(Agent):
     """
 
     exploration_rate_set: float | None = None
-    """What was assigned to ``exploration_rate``."""
+    """The value that was assigned to ``exploration_rate``."""
     has_own_logger: bool = False
     """Whether :meth:`set_logger` was called."""
     policy_object: BasePolicy | None = None
-    """What ``policy`` returns."""
+    """The object that ``policy`` returns."""
     STORED: ClassVar[tuple[str, ...]] = ("replay_buffer", "policy", "exploration_rate", "num_timesteps", "lr_schedule")
     """Properties that can be set."""
 

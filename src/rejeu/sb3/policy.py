@@ -171,7 +171,7 @@ class BaseModel:
 
     @property
     def features_extractor(self) -> FeaturesExtractor:
-        """What maps observations to features: of PPO and A2C the policy's, of several critics the first one's."""
+        """The function from observations to features: of PPO and A2C the policy's, of several critics the first one's."""
         return FeaturesExtractor.of(self.model, self.fields)
 
     def extract_features(self, obs: Observation, features_extractor: Any = None) -> np.ndarray:
@@ -198,7 +198,7 @@ class BaseModel:
 
 
 class FeaturesExtractor(BaseModel):
-    """What maps observations to features, in one network of an agent or in several."""
+    """The function from observations to features, in one network of an agent or in several."""
 
     def state_dict(self) -> dict[str, Tensor]:
         """Returns a copy of the parameters as arrays by name."""
@@ -275,7 +275,7 @@ class BasePolicy(BaseModel):
         return self.predict(obs, deterministic=deterministic)[0]
 
     def forward(self, obs: Observation, deterministic: bool = False) -> Any:
-        """Returns what calling it does."""
+        """Returns the result of calling it."""
         return self(obs, deterministic)
 
     @property

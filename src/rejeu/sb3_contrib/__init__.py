@@ -112,7 +112,7 @@ class MaskableActorCriticPolicy(ActorCriticPolicy):
 
 
 def evaluate_policy(*args: Any, use_masking: bool = True, **kwargs: Any) -> Any:
-    """Returns what :func:`rejeu.sb3.common.evaluation.evaluate_policy` does, which gives a policy the masks.
+    """Returns the result of :func:`rejeu.sb3.common.evaluation.evaluate_policy`, which gives a policy the masks.
 
     Raises:
         ValueError: if the environment has no masks.

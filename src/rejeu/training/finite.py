@@ -199,7 +199,7 @@ def reported(agent: Any, broken: NonFiniteUpdate) -> NonFiniteError:
 
 
 def _what(names: list[str], in_a_row: int, cause: str = "") -> str:
-    """Returns what happened: what is not finite, or its ``cause``."""
+    """Returns a clause about the event: the names that are not finite, or its ``cause``."""
     more = len(names) - 3
     event = f"{', '.join(names[:3]) or 'an update'}{f' and {more} more' * (more > 0)} became NaN or infinite"
     event = cause or event

@@ -50,7 +50,7 @@ class Episode(NamedTuple):
 
 
 class Progress(NamedTuple):
-    """What one turn of the loop did."""
+    """The result of one turn of the loop."""
 
     step: int
     """Total number of environment steps taken."""
@@ -61,7 +61,7 @@ class Progress(NamedTuple):
     action: np.ndarray | None = None
     """The actions of this turn, in the environments' own range."""
     result: Step | None = None
-    """What the environments returned. Where episodes ended, its observations may already be those of the next ones."""
+    """The step of the environments. Where episodes ended, its observations may already be those of the next ones."""
     last_obs: PyTree = None
     """A copy of the observations before new episodes began, in turns that ended some; None in others."""
     rollout_ended: bool = False

@@ -1,4 +1,4 @@
-"""What the on-policy algorithms share: hyperparameters, the network of policy and value, GAE, exploration by gSDE.
+"""The common parts of the on-policy algorithms: hyperparameters, the network of policy and value, GAE, exploration by gSDE.
 
 An encoder maps an observation to features, and separate or shared hidden layers map these to the parameters of a
 distribution over actions and to a value. Actions may be Box (a normal distribution, optionally squashed), Discrete,

@@ -31,7 +31,7 @@ SDE_EPSILON = 1e-6
 
 
 class ActionKind(NamedTuple):
-    """What a policy must give for an action space; static and hashable."""
+    """The outputs that a policy must have for an action space; static and hashable."""
 
     kind: Literal["box", "categorical", "binary", "joint"]
     sizes: tuple[int, ...]

@@ -110,7 +110,7 @@ class Config(EntropyConfig):
 
     @property
     def judged_by(self) -> Callable[..., Array]:
-        """What the actor's loss makes of the values of all critics."""
+        """The function by which the actor's loss reduces the values of all critics to one."""
         return jnp.min if self.target_subset is None else jnp.mean
 
     def dropout_keys(self, key: Array) -> PyTree:
@@ -207,7 +207,7 @@ def algorithm_of(
 
 
 def drawn(parts: SoftCritic, config: Config) -> SoftCritic:
-    """Returns the same with ``target_subset`` (REDQ) and with dropout in the critics in every pass (DroQ)."""
+    """Returns the equations with ``target_subset`` (REDQ) and with dropout in the critics in every pass (DroQ)."""
 
     def target(actor: PyTree, target_critics: PyTree, alpha: Array, batch: Transition, key: Array) -> PyTree:
         return parts.target(actor, config.for_target(target_critics, key), alpha, batch, key)
@@ -298,7 +298,7 @@ def critics_loss(critics: QNetwork, batch: Transition, target: Array) -> tuple[A
 
 
 def squared_error(values: Array, target: Array, batch: Transition) -> tuple[Array, tuple[Array, Array]]:
-    """Returns the same of values ``(n_critics, batch)``, which come with it."""
+    """Returns half the squared TD error of values ``(n_critics, batch)``, the values and the TD errors."""
     error = values - target[None]
     return 0.5 * jnp.sum(weighted_mean(jnp.square(error), batch.weight)), (values, error)
 

@@ -1,4 +1,4 @@
-"""What a study searches: environment, algorithm, search space and limits, as ``study.json`` in the study folder."""
+"""The plan of a study: environment, algorithm, search space and limits, as ``study.json`` in the study folder."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class StudyPlan:
     """The settings of a study. Everything that a repetition needs, except for the number of workers."""
 
     default: Preset
-    """What the winner is compared with, and what every training shares: environment, algorithm, steps and evaluations.
+    """The preset that the winner is compared with and every training shares: environment, algorithm, steps and evaluations.
 
     Its hyperparameters are those of the given preset or of rejeu's; empty for the algorithm's defaults."""
     env_argument: str = ""
@@ -69,7 +69,7 @@ class StudyPlan:
     """Determines what is sampled and the seeds of all trainings."""
     pruner: Pruner = "median"
     measure: Measure = "return"
-    """What is maximized: the mean return of the last evaluation, or its success rate."""
+    """The objective: the mean return of the last evaluation, or its success rate."""
     checkpoint_minutes: Annotated[float, Meta(ge=0, le=1e6)] = 5.0
 
     def __post_init__(self) -> None:

@@ -52,7 +52,7 @@ class Result:
     signal: int | None
     """Number of the signal that stopped the study; None if none did."""
     notes: tuple[str, ...] = ()
-    """What could not be started or written."""
+    """Trials that could not be started, and files that could not be written."""
 
     @property
     def folder(self) -> Path:

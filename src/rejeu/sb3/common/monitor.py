@@ -132,7 +132,7 @@ class Monitor(gym.Wrapper, gym.utils.RecordConstructorArgs):
         return row
 
     def get_wrapper_state(self) -> JsonObject:
-        """Returns what the wrapper stores, for the checkpoint of a run."""
+        """Returns the state of the wrapper, for the checkpoint of a run."""
         return {name: vars(self)[name] for name in STATE}
 
     def set_wrapper_state(self, state: Mapping[str, object]) -> None:

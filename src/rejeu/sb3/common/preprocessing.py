@@ -1,4 +1,4 @@
-"""What observations and actions are, by their spaces, and how observations are prepared for networks."""
+"""Shapes of observations and actions by their spaces, and the preparation of observations for networks."""
 
 from __future__ import annotations
 

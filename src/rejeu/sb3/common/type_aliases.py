@@ -61,7 +61,7 @@ class DictReplayBufferSamples(ReplayBufferSamples):
 
 
 class RolloutReturn(NamedTuple):
-    """What one collection of experience did."""
+    """The result of one collection of experience."""
 
     episode_timesteps: int
     n_episodes: int
@@ -69,7 +69,7 @@ class RolloutReturn(NamedTuple):
 
 
 class TrainFrequencyUnit(Enum):
-    """What ``train_freq`` counts."""
+    """The unit of ``train_freq``."""
 
     STEP = "step"
     EPISODE = "episode"

@@ -64,7 +64,7 @@ def set_random_seed(seed: int, using_cuda: bool = False) -> None:
 
 @dataclass(frozen=True)
 class ConstantSchedule:
-    """The same value throughout the run."""
+    """A schedule that has one value throughout the run."""
 
     val: float
 
@@ -112,7 +112,7 @@ class LinearSchedule:
         return self.to_linear()(1.0 - progress_remaining)
 
     def to_linear(self) -> Linear:
-        """Returns the same line as a function of the progress."""
+        """Returns the line as a function of the progress."""
         return Linear(self.start, self.end, self.end_fraction)
 
 
@@ -222,7 +222,7 @@ class Tensor(np.ndarray):
     def __torch_function__(
         cls, function: Callable[..., Any], types: object, args: tuple[Any, ...] = (), kwargs: Settings | None = None
     ) -> Any:
-        """Returns what a function of PyTorch's does, which calls this where an argument is of this class."""
+        """Returns the result of a function of PyTorch's, which calls this where an argument is of this class."""
         torch = sys.modules["torch"]
         given = jax.tree.map(
             lambda x: torch.as_tensor(np.asarray(x)) if isinstance(x, cls) else x, (args, kwargs or {})

@@ -158,7 +158,7 @@ class OffPolicyProgram(Program):
 
 
 def take_turn(program: OffPolicyProgram, env: FunctionalEnv, loop: Loop, limits: Limits, i: Array) -> Loop:
-    """Returns what the ``i``-th turn of a chunk passes on."""
+    """Returns the loop after the ``i``-th turn of a chunk."""
     config, algorithm, replay, before = program.config, program.algorithm, program.replay, loop.carry
     assert before.action is not None
     loop, result = step_envs(program, env, loop, before.action, i)

@@ -96,7 +96,7 @@ class OnPolicyProgram(Program):
 
 
 def take_turn(program: OnPolicyProgram, env: FunctionalEnv, loop: Loop, limits: Limits, i: Array) -> Loop:
-    """Returns what the ``i``-th turn of a chunk passes on, apart from the update."""
+    """Returns the loop after the ``i``-th turn of a chunk, before the update."""
     config, carry, steps = program.config, loop.carry, loop.experience
     counts, before, t = carry.counts, carry.episodes, carry.counts.length
     clock = Clock(counts.step, before.n_finished, limits.progress[i])
@@ -121,7 +121,7 @@ def take_turn(program: OnPolicyProgram, env: FunctionalEnv, loop: Loop, limits: 
 
 
 def end_of_rollout(program: OnPolicyProgram, loop: Loop, clock: Clock) -> Loop:
-    """Returns what is passed on after learning from the rollout; the next one begins."""
+    """Returns the loop after learning from the rollout; the next one begins."""
     carry = loop.carry
     learned, _ = program.learn(loop.learned, rollout_of(loop.experience, carry.counts.length), clock)
     steps = loop.experience._replace(started=carry.episodes.ended, carry=carry.explorer)

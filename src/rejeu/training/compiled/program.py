@@ -1,4 +1,4 @@
-"""What the programs of all loops on the device share: chunks of turns, in which environments step and episodes are counted.
+"""The common part of the programs of all loops: chunks of turns, in which environments step and episodes are counted.
 
 A :class:`Program` also says how a run of the host becomes its arguments, and how experience comes back.
 """
@@ -103,7 +103,7 @@ class StepResult(NamedTuple):
 
 
 class Learned(NamedTuple):
-    """What updates change."""
+    """The values that updates change."""
 
     state: PyTree
     """The algorithm's state."""
@@ -118,7 +118,7 @@ class Learned(NamedTuple):
 
 
 class Carry(NamedTuple):
-    """What a chunk passes on, apart from the experience."""
+    """The values that a chunk passes on to the next, apart from the experience."""
 
     state: PyTree
     """The algorithm's state, packed between chunks; None within."""
@@ -138,7 +138,7 @@ class Carry(NamedTuple):
 
 
 class Loop(NamedTuple):
-    """What the turns of a chunk pass on."""
+    """The values that a turn of a chunk passes on to the next."""
 
     carry: Carry
     experience: PyTree
@@ -163,7 +163,7 @@ class ChunkReport(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Program(ABC):
-    """What a program is compiled for. Hashable. Abstract: there is one for each kind of learning."""
+    """The settings that a program is compiled for. Hashable. Abstract: there is a class for each kind of learning."""
 
     algorithm: Algorithm
     explorer: Explorer
@@ -186,7 +186,7 @@ class Program(ABC):
 
     @abstractmethod
     def turns(self, env: FunctionalEnv, loop: Loop, limits: Limits, may_go_on: Callable[[Array, Loop], Array]) -> Loop:
-        """Returns what turns pass on, which are taken while ``may_go_on(number of turns, loop)``."""
+        """Returns the loop after turns, which are taken while ``may_go_on(number of turns, loop)``."""
 
     @abstractmethod
     def begin_episodes(self, run: Run) -> None:
@@ -248,7 +248,7 @@ class Program(ABC):
         return dataclasses.replace(self, algorithm=algorithm, explorer=explorer, config=config)
 
     def nothing_learned(self, env: FunctionalEnv, state: PyTree, carry: Carry, experience: PyTree) -> Learned:
-        """Returns what is learned before the first update: metrics are 0. The update is only traced."""
+        """Returns the state and metrics before the first update: metrics are 0. The update is only traced."""
 
         def update(state: PyTree, carry: Carry, experience: PyTree) -> tuple[PyTree, Metrics]:
             clock = Clock(jnp.uint32(0), jnp.uint32(0), jnp.float32(0))
@@ -259,7 +259,7 @@ class Program(ABC):
         return Learned(state, metrics, jnp.int32(0), jnp.int32(0), carry.in_a_row)
 
     def learn(self, learned: Learned, batch: Transition | Rollout, clock: Clock) -> tuple[Learned, Array | None]:
-        """Returns what is learned from a batch, and the TD errors if the batch has importance weights.
+        """Returns the state and metrics after an update on a batch, and the TD errors if the batch has importance weights.
 
         With ``skips``, an update that leaves NaN is undone, and its TD errors are NaN.
         """
@@ -371,7 +371,7 @@ def random_action(space: gym.Space, n: int, key: Array, mask: Array | None = Non
 
 
 class KeyGenerator:
-    """What random actions take of NumPy's generator, from a key."""
+    """The methods of NumPy's generator that random actions use, with the random numbers of a key."""
 
     def __init__(self, key: Array) -> None:
         self.key = key

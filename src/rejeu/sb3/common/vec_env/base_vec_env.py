@@ -241,7 +241,7 @@ class SingleEnvs(VecEnv):
         return self._call(indices, is_wrapped, wrapper_class)
 
     def _stepped(self, answers: Iterable[object]) -> VecEnvStepReturn:
-        """Returns what :func:`rejeu.envs.workers.process.step_and_reset` returned for each environment as one result."""
+        """Returns the results of :func:`rejeu.envs.workers.process.step_and_reset` for each environment as one result."""
         obs, rewards, terminated, truncated, infos, finals, reset_infos = map(list, zip(*answers, strict=True))
         dones = np.logical_or(terminated, truncated)
         for i in range(self.num_envs):
