@@ -115,7 +115,8 @@ if not TYPE_CHECKING:  # type checkers find the names above, and report misspelt
         elif name.isidentifier() and not name.startswith("_") and importlib.util.find_spec(f"rejeu.{name}") is not None:
             value = importlib.import_module(f"rejeu.{name}")
         else:
-            raise AttributeError(f"module 'rejeu' has no attribute {name!r}")
+            hint = importlib.import_module("rejeu.core.validation").nearest(name, __all__, "dir(rejeu) lists them")
+            raise AttributeError(f"module 'rejeu' has no attribute {name!r}; {hint}")
         globals()[name] = value
         return value
 

@@ -7,7 +7,11 @@ import numpy as np
 import pytest
 
 import rejeu
+from rejeu import sb3
+from rejeu.agents.zip_files import load_zip
+from rejeu.callbacks import Checkpoint, RecordVideo
 from rejeu.core.errors import BadEnvironmentError
+from rejeu.logs.video import VideoFile
 from tests.environments import Counter, Reach, Sampled
 from tests.helpers import small_sac
 
@@ -147,3 +151,52 @@ def test_numbers_of_numpy_are_taken_as_those_of_python():
 def test_a_callback_that_cannot_be_called_is_named(callback):
     with pytest.raises(TypeError, match=r"callback=.* must be a function \(agent, progress\), or a list of such"):
         small_sac(Counter()).learn(5, callback=callback)
+
+
+def agent():
+    return small_sac(Counter())
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda path: rejeu.load(path),
+        lambda path: rejeu.SAC.load(path),
+        lambda path: rejeu.SAC.resume(path),
+        lambda path: rejeu.load_policy(path),
+        lambda path: rejeu.compare([path]),
+        lambda path: rejeu.compare(path),
+        lambda path: rejeu.write_report(path),
+        lambda path: rejeu.sweep(path),
+        lambda path: rejeu.show_videos(path),
+        lambda path: load_zip(path),
+        lambda path: sb3.SAC.load(path),
+        lambda path: agent().save(path),
+        lambda path: agent().export(path),
+        lambda path: agent().set_parameters(path),
+        lambda path: agent().save_replay_buffer(path),
+        lambda path: agent().history.write_csv(path),
+        lambda path: VideoFile(path, 30),
+        lambda path: Checkpoint(path, minutes=1),
+        lambda path: RecordVideo(path, 10),
+    ],
+    ids=lambda call: " ".join(name for name in call.__code__.co_names if name not in ("rejeu", "agent")),
+)
+def test_none_as_a_path_is_named(call):
+    with pytest.raises(TypeError, match="None is not a path; give that of a file or folder"):
+        call(None)
+
+
+@pytest.mark.parametrize("algorithm", ["SAC", None])
+def test_seeds_are_trained_of_a_class_and_not_of_its_name(algorithm):
+    with pytest.raises(TypeError, match=r"kind=.* must be the class of an algorithm, such as rejeu.SAC"):
+        rejeu.train_seeds(algorithm, "MlpPolicy", "Pendulum-v1", 10, seeds=2)
+
+
+@pytest.mark.parametrize(
+    ("module", "name", "hint"),
+    [(rejeu, "PPo", "PPO"), (rejeu, "make_vectr", "make_vector"), (sb3, "Ppo", "PPO"), (sb3, "DNQ", "DQN")],
+)
+def test_a_misspelt_public_name_is_named_with_the_right_one(module, name, hint):
+    with pytest.raises(AttributeError, match=f"has no attribute '{name}'; did you mean {hint}"):
+        getattr(module, name)

@@ -24,6 +24,20 @@ def test_seeds_are_checked_up_to_their_bounds():
             base.checked_seed(wrong, 2)
 
 
+@pytest.mark.parametrize(("env_id", "backend"), [("CartPole-v1", "gymnasium"), ("jax/CartPole-v1", "jax")])
+def test_a_reset_takes_seeds_of_numpy_and_names_one_that_is_none(env_id, backend):
+    vector = rejeu.make_vector(env_id, 2, backend)
+    expected = vector.reset(3).copy()
+    np.testing.assert_array_equal(vector.reset(np.int64(3)), expected)
+    expected = vector.reset([5, 1]).copy()
+    np.testing.assert_array_equal(vector.reset(np.array([5, 1])), expected)
+    for seed in (-1, 1.0, "3", [1, 2, 3]):
+        with pytest.raises(
+            ValueError, match=r"seed=.* must be a whole number from 0, or a sequence of 2, one for each"
+        ):
+            vector.reset(seed)
+
+
 def test_runs_have_seeds_of_their_own():
     seeds = [base.seed_of_run(seed) for seed in range(50)]
     assert len({*seeds}) == 50

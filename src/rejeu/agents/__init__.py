@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import sys
 import warnings
 from collections.abc import Iterable
@@ -25,6 +24,7 @@ from rejeu.checkpoints.run_folder import find_model
 from rejeu.core import checkpoint
 from rejeu.core.errors import CheckpointError
 from rejeu.core.records import shown
+from rejeu.core.validation import nearest
 
 A = TypeVar("A", bound=type[Agent])
 
@@ -89,8 +89,7 @@ def find_agent(name: str, is_typed: bool = True) -> type[Agent]:
             raise ValueError(f"{name} is not registered, and no file may name what is imported; {advice(entry)}")
         agent = entry.load()
         return agent if agent in AGENTS.values() else register(agent)
-    near = difflib.get_close_matches(name.lower(), names, n=1, cutoff=0.5)
-    hint = f"did you mean {names[near[0]]}?" if near else f"there are {', '.join(AGENTS)}"
+    hint = nearest(name, AGENTS)
     raise ValueError(f"no algorithm is called {name!r}; {hint}; --import MODULE imports one that registers others")
 
 

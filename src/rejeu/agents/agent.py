@@ -17,7 +17,7 @@ from rejeu.checkpoints.run_files import CheckpointFolder, folder_of
 from rejeu.checkpoints.run_folder import find_model
 from rejeu.core import algorithm as core, checkpoint, devices, spaces
 from rejeu.core.types import AnyArray, Observation, PyTree
-from rejeu.core.validation import number, whole
+from rejeu.core.validation import as_path, number, whole
 from rejeu.envs.base import seed_of_run
 from rejeu.envs.masks import split
 from rejeu.logs.evaluation import Evaluation, evaluate
@@ -285,11 +285,11 @@ class Agent(BaseAgent):
             FileNotFoundError: if there is no checkpoint.
             CheckpointError: if the checkpoints are damaged, or of another algorithm or environment.
         """
-        return resume.resume(cls, Path(folder), env, changes)
+        return resume.resume(cls, as_path(folder), env, changes)
 
     def checkpoint_folder(self, folder: str | Path) -> CheckpointFolder:
         """Returns a folder for the checkpoints of its run, which :class:`rejeu.callbacks.Checkpoint` writes."""
-        return folder_of(self, Path(folder))
+        return folder_of(self, as_path(folder))
 
     def get_env(self) -> Any:
         """Returns the training environments with the interface of Stable-Baselines3's ``VecEnv``; None if there are none.
@@ -363,7 +363,7 @@ class Agent(BaseAgent):
             CheckpointError: if a name, shape or dtype does not match; the agent is then unchanged.
         """
         source = load_path_or_dict
-        if isinstance(source, str | Path):
+        if not isinstance(source, Mapping):
             path = source
             with checkpoint.opened(path, "agent") as file:
                 shapes = self.learner.shapes

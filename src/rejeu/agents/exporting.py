@@ -18,6 +18,7 @@ from rejeu.agents.base import BaseAgent
 from rejeu.core import atomic, spaces, xla
 from rejeu.core.algorithm import Masked
 from rejeu.core.types import JsonObject, Observation
+from rejeu.core.validation import as_path
 from rejeu.envs.make import VectorEnv
 from rejeu.envs.masks import mask_leaf
 from rejeu.envs.registry import maker, register
@@ -71,7 +72,7 @@ def export(
     ``make_env`` makes an environment in which observations are recorded, None for that of the agent; ``source`` is the run
     or model that the policy is from, for the card.
     """
-    path = Path(path)
+    path = as_path(path)
     target = target_of(path, to)
     form = FORMATS[target]
     path = path if path.suffix else path.with_suffix(form.suffix)

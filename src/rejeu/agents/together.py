@@ -86,6 +86,8 @@ def train_seeds(
     >>> [(agent.seed, agent.config.learning_rate) for agent in agents]
     [(0, 0.0001), (1, 0.0001), (0, 0.001), (1, 0.001)]
     """
+    if not callable(kind):
+        raise TypeError(f"kind={kind!r} must be the class of an algorithm, such as rejeu.SAC")
     if not isinstance(env, str | FunctionalEnv):
         raise ValueError(
             f"env is a {type(env).__name__}, and every run needs environments of its own; give an id, such as 'Pendulum-v1', "

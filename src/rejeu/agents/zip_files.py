@@ -38,7 +38,7 @@ from rejeu.core import algorithm as core, checkpoint, normalization, spaces
 from rejeu.core.errors import CheckpointError
 from rejeu.core.records import Malformed, brief, shown, stored_size
 from rejeu.core.types import JsonObject, PyTree, Settings
-from rejeu.core.validation import build
+from rejeu.core.validation import as_path, build
 
 MOST_DATA = 16 * 2**20
 """Upper limit on the bytes of ``data``."""
@@ -480,7 +480,8 @@ def load_zip(
         CheckpointError: if the file is damaged, names code, or its policy cannot be expressed; the message says which part.
         TypeError, ValueError: for unknown or invalid ``changes``.
     """
-    path = zoo.model_in(Path(path), which) if Path(path).is_dir() else Path(path)
+    path = as_path(path)
+    path = zoo.model_in(path, which) if path.is_dir() else path
     path = path if path.suffix else path.with_name(f"{path.name}.zip")
     with explained(path):
         model = read(path)

@@ -10,7 +10,7 @@ import jax
 
 from rejeu.callbacks.base import TrainingCallback, crossed
 from rejeu.core.errors import NonFiniteError
-from rejeu.core.validation import number, whole
+from rejeu.core.validation import as_path, number, whole
 from rejeu.training.run import Progress
 
 MINUTES = 5.0
@@ -47,7 +47,7 @@ class Checkpoint(TrainingCallback):
         """
         if isinstance(folder, int):
             raise TypeError(f"folder={folder!r} must be a path: Checkpoint(folder, every={folder})")
-        self.folder = Path(folder)
+        self.folder = as_path(folder)
         self.every = None if every is None else whole("every", every, least=1)
         checked_minutes = None if minutes is None else number("minutes", minutes, above=0)
         self.minutes = MINUTES if checked_minutes is None and every is None else checked_minutes

@@ -11,7 +11,7 @@ import gymnasium as gym
 
 from rejeu.callbacks.base import crossed, step_before
 from rejeu.core.types import JsonObject
-from rejeu.core.validation import whole
+from rejeu.core.validation import as_path, whole
 from rejeu.logs.video import record_video
 from rejeu.training.run import Progress
 
@@ -56,7 +56,7 @@ class RecordVideo:
             raise ValueError(f"give one of every={every!r} (steps) and every_episodes={every_episodes!r}")
         self.every = None if every is None else whole("every", every, least=1)
         self.every_episodes = None if every_episodes is None else whole("every_episodes", every_episodes, least=1)
-        self.folder, self.env, self.seed = Path(folder), env, seed
+        self.folder, self.env, self.seed = as_path(folder), env, seed
         self.episodes = whole("episodes", episodes, least=1)
         self.max_steps = max_steps
         self.paths: list[Path] = []

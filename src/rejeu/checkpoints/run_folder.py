@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from rejeu.core import checkpoint
+from rejeu.core.validation import as_path
 from rejeu.logs.formatting import quoted
 
 RUN_FILE = re.compile(r"run_(\d{12})\.safetensors")
@@ -129,7 +130,7 @@ def find_model(run: str | Path, which: Literal["best", "last"] = "best") -> Path
     Raises:
         FileNotFoundError: if there is none.
     """
-    path = Path(run)
+    path = as_path(run)
     if os.path.isfile(path):  # unlike Path.is_file, False for a name that is too long
         return path
     if not os.path.isdir(path) or (path.name not in ("", "..") and os.path.isfile(checkpoint.resolve(path))):

@@ -31,6 +31,7 @@ from rejeu.core.errors import CheckpointError
 from rejeu.core.hardware import physical_memory
 from rejeu.core.records import Malformed, is_sparse, parse_json, shown, stored_size
 from rejeu.core.types import PyTree
+from rejeu.core.validation import as_path
 
 DTYPES = {"F32": "float32", "F64": "float64", "I64": "int64", "I32": "int32", "I16": "int16", "I8": "int8"}
 DTYPES |= {"U64": "uint64", "U32": "uint32", "U16": "uint16", "U8": "uint8", "BOOL": "bool", "F16": "float16"}
@@ -145,10 +146,11 @@ def resolve(path: str | Path, suffix: str = SUFFIX) -> Path:
 
     Raises:
         ValueError: if it does not name a file, as ``""``, ``"."`` and ``"/"`` do not.
+        TypeError: if it is no path.
     """
-    if Path(path).name in ("", ".."):
+    path = as_path(path)
+    if path.name in ("", ".."):
         raise ValueError(f"{str(path)!r} is not the path of a file; give one, such as 'model{SUFFIX}'")
-    path = Path(path)
     return path if path.suffix else path.with_name(path.name + suffix)
 
 

@@ -9,10 +9,12 @@ import inspect
 import itertools
 import math
 import numbers
+import os
 import sys
 import textwrap
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import cache
+from pathlib import Path
 from typing import Any, TypeVar
 
 from rejeu.core.types import Settings
@@ -203,9 +205,31 @@ def unknown_name(key: str, names: Iterable[str], owner: str, shape: Sequence[str
         return f"{owner} has no setting {key!r}; {ELSEWHERE[key]}"
     if key in shape:
         return f"{owner} takes {key} in policy_kwargs: policy_kwargs={{{key!r}: ...}}"
-    near = difflib.get_close_matches(key, list(names), n=1, cutoff=0.5)
-    hint = f"did you mean {near[0]}?" if near else f"known: {', '.join(names)}"
-    return f"{owner} has no setting {key!r}; {hint}"
+    return f"{owner} has no setting {key!r}; {nearest(key, names, 'known: ' + ', '.join(names))}"
+
+
+def nearest(name: str, names: Iterable[str], otherwise: str = "", n: int = 1) -> str:
+    """Returns the part of a message that names the ``n`` known names most like ``name``; if none is, ``otherwise``, or all.
+
+    >>> nearest("ppo", ["PPO", "SAC"]), nearest("x", ["PPO", "SAC"])
+    ('did you mean PPO?', 'there are PPO, SAC')
+    """
+    in_lower_case = {known_name.lower(): known_name for known_name in names}
+    near = difflib.get_close_matches(name.lower(), in_lower_case, n, cutoff=0.5)
+    if near:
+        return f"did you mean {' or '.join(in_lower_case[key] for key in near)}?"
+    return otherwise or f"there are {', '.join(in_lower_case.values())}"
+
+
+def as_path(value: Any) -> Path:
+    """Returns a path.
+
+    Raises:
+        TypeError: for what is none, such as None.
+    """
+    if not isinstance(value, str | os.PathLike):
+        raise TypeError(f"{value!r} is not a path; give that of a file or folder, as text or as a pathlib.Path")
+    return Path(value)
 
 
 def field_names(config_class: type) -> list[str]:

@@ -33,7 +33,7 @@ from rejeu.core import interrupt, spaces
 from rejeu.core.algorithm import Algorithm, Clock, Metrics, PyTree, averaged_fields, names
 from rejeu.core.errors import requires
 from rejeu.core.types import Action, Observation
-from rejeu.core.validation import number, whole
+from rejeu.core.validation import as_path, number, whole
 from rejeu.demonstrations import dataset
 from rejeu.envs.masks import for_agent, split
 from rejeu.envs.registry import make_env
@@ -113,7 +113,7 @@ def read(path: str | Path) -> Demonstrations:
     """
     with requires("reading demonstrations", "minari[hdf5]", "play"):
         import h5py  # noqa: F401
-    path = Path(path)
+    path = as_path(path)
     files = (file for pattern in (dataset.METADATA, "*.hdf5") for file in path.rglob(pattern))
     folders = sorted({file.parent for file in files if file.parent.name == "data"})
     if not folders:

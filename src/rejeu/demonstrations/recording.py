@@ -18,6 +18,7 @@ from rejeu.core import atomic
 from rejeu.core.errors import requires
 from rejeu.core.failed_writes import FailedWrites
 from rejeu.core.types import Action, Observation, PyTree
+from rejeu.core.validation import as_path
 from rejeu.demonstrations import dataset
 from rejeu.envs.validation import id_of
 from rejeu.logs.formatting import counted
@@ -53,7 +54,7 @@ class Recording:
             from minari.serialization import serialize_space
         if fps is not None:
             ffmpeg()
-        self.folder = Path(folder).absolute()
+        self.folder = as_path(folder).absolute()
         if self.folder.exists() and (not self.folder.is_dir() or any(self.folder.iterdir())):
             raise FileExistsError(f"{folder} exists and is not an empty folder; choose another one")
         self.dataset_id = re.sub(r"[^\w/-]", "-", id_of(env)) + f"/{by}-v0"

@@ -31,15 +31,18 @@ def checked_seed(seed: object, n_envs: int) -> Seed:
     """Validates a seed for ``n_envs`` environments and returns it, a sequence as a tuple of ints.
 
     Raises:
-        ValueError: if a sequence does not contain one integer from 0 to 2**31 - 2 for each environment.
+        ValueError: if a number is negative, or a sequence does not contain one integer from 0 to 2**31 - 2 for each
+            environment.
     """
     if seed is None:
         return None
-    if isinstance(seed, int | np.integer):
+    if isinstance(seed, int | np.integer) and seed >= 0:
         return int(seed)
     seeds = np.asarray(seed)
     if seeds.shape != (n_envs,):
-        raise ValueError(f"seed={seed!r} must be a number, or a sequence of {n_envs} numbers, one for each environment")
+        raise ValueError(
+            f"seed={seed!r} must be a whole number from 0, or a sequence of {n_envs}, one for each environment"
+        )
     if seeds.dtype.kind not in "iu" or seeds.min() < 0 or seeds.max() >= SEEDS_END:
         raise ValueError(f"seed={seed!r} must have whole numbers from 0 to 2**31 - 2")
     return tuple(seeds.tolist())

@@ -77,8 +77,7 @@ class EnvPool(VectorEnv):
         self._log.is_on = True
 
     def reset(self, seed: Seed = None) -> Observation:
-        if seed is None and self.must_reset:
-            seed = next_seed(self._seed)
+        seed = next_seed(self._seed) if seed is None and self.must_reset else checked_seed(seed, self.n_envs)
         if seed is not None:
             self._pool, self._log = self._make(seed), self._new_log(self._log.is_on)
         self._log.reset()

@@ -17,7 +17,7 @@ from rejeu.core.errors import BadEnvironmentError, WorkerError
 from rejeu.core.spaces import leaves, plain
 from rejeu.core.types import Info, Observation
 from rejeu.envs import base, goals as goals_module, validation
-from rejeu.envs.base import Seed, Step, VectorEnv, describe_spec, each_info, each_seed, step_whole
+from rejeu.envs.base import Seed, Step, VectorEnv, checked_seed, describe_spec, each_info, each_seed, step_whole
 from rejeu.envs.goals import GoalFunctions
 
 DISABLED = "make the vector with autoreset_mode=gymnasium.vector.AutoresetMode.DISABLED"
@@ -64,7 +64,7 @@ class GymnasiumVector(VectorEnv):
         """Number of steps of the vector."""
 
     def reset(self, seed: Seed = None) -> Observation:
-        seed = self._seed if seed is None else seed
+        seed = self._seed if seed is None else checked_seed(seed, self.n_envs)
         self._seed = None
         # Other classes of vector environments may not accept a list.
         seeds = seed if seed is None or isinstance(seed, int) else each_seed(seed, self.n_envs)

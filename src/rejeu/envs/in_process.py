@@ -13,7 +13,7 @@ from rejeu.core.errors import BadEnvironmentError
 from rejeu.core.spaces import leaves, rows, structure
 from rejeu.core.types import Info, Observation
 from rejeu.envs import goals as goals_module, snapshot, validation
-from rejeu.envs.base import Seed, Step, VectorEnv, describe_spec, each_seed, success_of
+from rejeu.envs.base import Seed, Step, VectorEnv, checked_seed, describe_spec, each_seed, success_of
 from rejeu.envs.goals import GoalFunctions
 from rejeu.envs.validation import convert_step
 
@@ -64,7 +64,7 @@ class InProcess(VectorEnv):
         return wrapped
 
     def reset(self, seed: Seed = None) -> Observation:
-        seed = self._seed if seed is None else seed
+        seed = self._seed if seed is None else checked_seed(seed, self.n_envs)
         self._seed = None
         for i, own_seed in enumerate(each_seed(seed, self.n_envs)):
             self._reset(i, own_seed)

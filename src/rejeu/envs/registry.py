@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import difflib
 import importlib
 import importlib.util
 import re
@@ -20,6 +19,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from rejeu.core.errors import MissingExtra, requires
 from rejeu.core.types import Settings
+from rejeu.core.validation import nearest
 
 PLAIN_ID = re.compile(r"(?=.{1,200}$)([\w-]+/)?[\w.-]*(?<!\.py)(?<!\.)", re.IGNORECASE)
 """Pattern of ids that are looked up: a name, after a namespace or none. An id with a colon makes Gymnasium import a module."""
@@ -207,8 +207,7 @@ def unknown_environment(env_id: str) -> str:
     if elsewhere:
         return f"Gymnasium has no {env_id}, so it cannot be drawn or stepped by Gymnasium; {elsewhere}"
     env_ids = {*gym.registry, "parking-v0", "FetchReach-v4", "FetchPush-v4"}
-    near = difflib.get_close_matches(env_id, env_ids, n=3, cutoff=0.5)
-    hint = f"did you mean {' or '.join(near)}?" if near else "rejeu list shows the environments that have presets"
+    hint = nearest(env_id, env_ids, "rejeu list shows the environments that have presets", n=3)
     return f"no environment is called {env_id!r}; {hint}"
 
 

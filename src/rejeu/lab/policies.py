@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from rejeu.core.errors import CheckpointError
+from rejeu.core.validation import as_path
 from rejeu.export import numpy_policy
 
 
@@ -29,7 +30,7 @@ def load_policy(path: str | Path) -> numpy_policy.NumpyPolicy:
     >>> action.shape
     (1,)
     """
-    if Path(path).suffix == ".npz":
+    if as_path(path).suffix == ".npz":
         return numpy_policy.read(Path(path))
     try:
         from rejeu.agents import exporting, load

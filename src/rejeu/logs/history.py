@@ -15,7 +15,7 @@ import numpy as np
 
 from rejeu.core import atomic
 from rejeu.core.types import JsonObject
-from rejeu.core.validation import whole
+from rejeu.core.validation import as_path, whole
 from rejeu.logs.evaluation import Evaluation
 from rejeu.logs.formatting import counted, html_table
 from rejeu.training.run import Episode
@@ -141,7 +141,7 @@ class History:
 
     def write_csv(self, path: str | Path) -> None:
         """Writes the table with a header line, atomically."""
-        atomic.write(Path(path), csv_lines([COLUMNS, *self.episodes]))
+        atomic.write(as_path(path), csv_lines([COLUMNS, *self.episodes]))
 
     def plot(self, path: str | Path | None = None, against: str = "step", window: int | None = None) -> Picture:
         """Returns a matplotlib figure of returns and, if known, success; notebooks display it.

@@ -25,6 +25,7 @@ import numpy as np
 from rejeu.core import atomic
 from rejeu.core.errors import requires
 from rejeu.core.failed_writes import FailedWrites
+from rejeu.core.validation import as_path
 from rejeu.logs import trackers
 from rejeu.logs.formatting import LOGS, Display
 from rejeu.logs.history import csv_lines
@@ -124,7 +125,7 @@ class CsvFile:
     """
 
     def __init__(self, path: str | Path, up_to: int | None = None) -> None:
-        self.path = Path(path)
+        self.path = as_path(path)
         self._columns: list[str] = []
         restart(self.path, [] if up_to is None or not self.path.exists() else self._lines_up_to(up_to), up_to)
 
@@ -181,7 +182,7 @@ class JsonLines:
     """
 
     def __init__(self, path: str | Path, up_to: int | None = None) -> None:
-        self.path = Path(path)
+        self.path = as_path(path)
         lines = [] if up_to is None or not self.path.exists() else read_log(self.path).splitlines(keepends=True)
         restart(self.path, [line for line in lines if up_to is not None and _has_step(line, up_to)], up_to)
 

@@ -22,7 +22,7 @@ import numpy as np
 from rejeu.core import atomic
 from rejeu.core.errors import requires
 from rejeu.core.interrupt import Interrupt
-from rejeu.core.validation import number, whole
+from rejeu.core.validation import as_path, number, whole
 from rejeu.envs.make import InProcess
 from rejeu.envs.masks import for_agent
 from rejeu.envs.registry import make_env, provider, register
@@ -56,7 +56,7 @@ class VideoFile:
     """
 
     def __init__(self, path: str | Path, fps: float) -> None:
-        path = Path(path)
+        path = as_path(path)
         if path.suffix not in ("", ".mp4"):
             raise ValueError(f"path={str(path)!r} must end in .mp4, the only supported format")
         self.path = (path if path.suffix else path.with_name(path.name + ".mp4")).absolute()
@@ -295,7 +295,7 @@ def show_videos(folder: str | Path = "videos", prefix: str = "") -> Html:
     >>> show_videos("no-such-folder").data
     '<p>No mp4 file in no-such-folder.</p>'
     """
-    files = [path for path in Path(folder).glob("*.mp4") if path.name.startswith(prefix) and path.name[0] != "."]
+    files = [path for path in as_path(folder).glob("*.mp4") if path.name.startswith(prefix) and path.name[0] != "."]
     files.sort(key=lambda path: by_number(path.name))
     text = "\n".join(_player(path) for path in files)
     if not files:

@@ -13,6 +13,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from rejeu.algorithms.catalog import CATALOG
+from rejeu.core.validation import nearest
 from rejeu.sb3.modules import alias, define
 
 if TYPE_CHECKING:
@@ -43,7 +44,7 @@ class HER:
 def __getattr__(name: str) -> Any:
     """Imports an algorithm when it is first used, so that worker processes need not."""
     if name not in __all__:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}; {nearest(name, __all__)}")
     elsewhere = {
         "HerReplayBuffer": "rejeu.sb3.common.buffers",
         "get_system_info": "rejeu.sb3.common.utils",

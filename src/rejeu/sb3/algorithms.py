@@ -699,14 +699,15 @@ def written(write: Callable[[Path], Path], path: Any, suffix: str) -> Any:
         with tempfile.TemporaryDirectory() as folder:
             path.write(write(Path(folder) / f"file{suffix}").read_bytes())
         return None
-    return write(checkpoint.resolve(path, suffix))
+    return write(checkpoint.resolve(validation.as_path(path), suffix))
 
 
 @contextmanager
 def readable(path: Any, suffix: str) -> Iterator[Path]:
     """Yields a path that can be opened: the given one, or with ``suffix``; the content of a file object as a file."""
-    if isinstance(path, str | Path):
-        exact_path, with_suffix = Path(path), checkpoint.resolve(path, suffix)
+    if path is None or isinstance(path, str | Path):
+        exact_path = validation.as_path(path)
+        with_suffix = checkpoint.resolve(exact_path, suffix)
         is_there = exact_path.exists() or (not with_suffix.is_file() and checkpoint.resolve(exact_path).is_file())
         yield exact_path if is_there else with_suffix
         return

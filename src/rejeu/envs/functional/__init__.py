@@ -9,12 +9,13 @@
 
 from __future__ import annotations
 
-import difflib
 import pkgutil
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import gymnasium as gym
+
+from rejeu.core.validation import nearest
 
 if TYPE_CHECKING:
     from rejeu.envs.canvas import Drawing
@@ -72,9 +73,7 @@ def make(env_id: str, **kwargs: Any) -> FunctionalEnv:
         ValueError: if there is none, with the nearest.
     """
     if env_id not in REGISTRY:
-        near = difflib.get_close_matches(env_id, REGISTRY, n=2, cutoff=0.4)
-        hint = f"did you mean {' or '.join(near)}?" if near else f"there are {', '.join(REGISTRY)}"
-        raise ValueError(f"no environment in JAX is called {env_id!r}; {hint}")
+        raise ValueError(f"no environment in JAX is called {env_id!r}; {nearest(env_id, REGISTRY, n=2)}")
     entry_point = imported(REGISTRY[env_id].entry_point)
     return entry_point(**kwargs)
 

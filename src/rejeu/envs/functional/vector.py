@@ -20,7 +20,7 @@ from rejeu.core import prng
 from rejeu.core.spaces import cast, leaves
 from rejeu.core.types import Action, Observation, PyTree
 from rejeu.core.validation import whole
-from rejeu.envs.base import Seed, Step, VectorEnv, success_of
+from rejeu.envs.base import Seed, Step, VectorEnv, checked_seed, success_of
 from rejeu.envs.functional.protocol import FunctionalEnv, GoalEnv, of_two_goals
 from rejeu.envs.functional.validation import check
 from rejeu.envs.goals import GoalFunctions
@@ -183,7 +183,7 @@ class JaxVector(VectorEnv):
         self._seed = seed
 
     def reset(self, seed: Seed = None) -> Observation:
-        seed = self._seed if seed is None else seed
+        seed = self._seed if seed is None else checked_seed(seed, self.n_envs)
         self._seed = None
         if seed is None and self.state is not None:
             return self.reset_done(np.ones(self.n_envs, bool))

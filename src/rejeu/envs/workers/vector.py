@@ -15,7 +15,7 @@ from rejeu.core.errors import BadEnvironmentError, DivergedError, WorkerError
 from rejeu.core.spaces import leaves, rows, structure
 from rejeu.core.types import Info, Observation
 from rejeu.envs import goals as goals_module, snapshot, validation
-from rejeu.envs.base import Seed, Step, VectorEnv, describe_spec, each_seed, success_of
+from rejeu.envs.base import Seed, Step, VectorEnv, checked_seed, describe_spec, each_seed, success_of
 from rejeu.envs.goals import GoalFunctions
 from rejeu.envs.workers import process
 from rejeu.envs.workers.pool import RESTARTED, TIMEOUT, Processes, Restarted, Starter, Workers
@@ -93,7 +93,7 @@ class InWorkers(VectorEnv):
         )  # without the vector, which may be let go
 
     def reset(self, seed: Seed = None) -> Observation:
-        seed = self._seed if seed is None else seed
+        seed = self._seed if seed is None else checked_seed(seed, self.n_envs)
         self._seed = None
         return self._reset(dict(enumerate(each_seed(seed, self.n_envs))))
 

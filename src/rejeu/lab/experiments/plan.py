@@ -20,7 +20,7 @@ from msgspec import Meta
 from rejeu.agents import AGENTS, choose_algorithm, find_agent, find_preset, presets
 from rejeu.core import devices, spaces
 from rejeu.core.records import MAX_DEPTH, Seed, convert, is_deep, shown
-from rejeu.core.validation import build, check_names, choice, field_names
+from rejeu.core.validation import as_path, build, check_names, choice, field_names
 from rejeu.envs.make import BACKENDS, make_vector
 from rejeu.envs.registry import are_plain, is_plain_id, maker, register
 from rejeu.lab.experiments.folder import MAX_JOBS, Plan, Resources
@@ -113,7 +113,7 @@ def read_plan(plan: str | Path | Mapping[str, Any]) -> tuple[Plan, str | None]:
     """
     if isinstance(plan, Mapping):
         return parse(plan, "plan"), None
-    path = Path(plan)
+    path = as_path(plan)
     if not path.is_file():
         raise FileNotFoundError(f"there is no plan {path}")
     with at(path):

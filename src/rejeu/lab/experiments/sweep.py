@@ -16,6 +16,7 @@ from rejeu.agents import modules_of
 from rejeu.checkpoints.run_folder import dated
 from rejeu.core.interrupt import Interrupt
 from rejeu.core.types import JsonObject
+from rejeu.core.validation import as_path
 from rejeu.lab.experiments import display
 from rejeu.lab.experiments.folder import SweepFolder, open_folder, read_folder
 from rejeu.lab.experiments.plan import read_plan
@@ -165,7 +166,7 @@ def sweep(
         print(rejeu.compare(result.path))
     """
     typed = RunConfig(env="", imports=tuple(imports))
-    is_folder = not isinstance(plan, Mapping) and Path(plan).is_dir()
+    is_folder = not isinstance(plan, Mapping) and as_path(plan).is_dir()
     prepared = read_folder(Path(plan), typed) if is_folder else prepare(plan, folder, workers, typed, ray)  # type: ignore[arg-type]
     with Interrupt() as stop:
         imports = imports_of(prepared, typed)

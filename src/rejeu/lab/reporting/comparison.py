@@ -234,7 +234,7 @@ class Comparison:
             ValueError: for another suffix.
             MissingExtra: if a package for the format is not installed.
         """
-        path = Path(path)
+        path = validation.as_path(path)
         suffix = path.suffix.lower().removeprefix(".")
         if path.is_dir() or not suffix:
             paths = [saved for suffix in FORMATS for saved in self.save(path / f"compare.{suffix}")]

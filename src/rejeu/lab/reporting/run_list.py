@@ -13,6 +13,7 @@ from typing import Any
 from rejeu.checkpoints.run_folder import RunFolder
 from rejeu.core.errors import MissingExtra
 from rejeu.core.records import shown
+from rejeu.core.validation import as_path
 from rejeu.lab.reporting.other_programs import EVENTS, FILES, MONITOR, files, read_monitor, read_tensorboard
 from rejeu.lab.runs.read import MAX_NAME, RunSummary, is_file, read_run
 
@@ -33,7 +34,7 @@ def read(path: str | Path, table_only: bool = False) -> RunSummary:
         FileNotFoundError: if there is no run.
         ValueError: if a file is not what its name says.
     """
-    path = Path(path)
+    path = as_path(path)
     if os.path.isdir(path):
         os.lstat(os.path.join(path, "."))  # raises an error that says why nothing in it can be read
     if path.is_file() and MONITOR.fullmatch(path.name):
@@ -56,11 +57,11 @@ def read_all(paths: str | Path | RunSummary | Iterable[str | Path | RunSummary])
         FileNotFoundError: if a path does not exist, or holds no run.
     """
     sources: dict[Any, Path | RunSummary] = {}
-    for source in [paths] if isinstance(paths, str | Path | RunSummary) else paths:
+    for source in [paths] if isinstance(paths, str | RunSummary) or not isinstance(paths, Iterable) else paths:
         if isinstance(source, RunSummary):
             sources[source] = source
             continue
-        inside = find(Path(source))
+        inside = find(as_path(source))
         if not inside:
             raise FileNotFoundError(
                 f"{shown(source, 300)} holds no run; expected a run folder of rejeu train, a monitor.csv or TensorBoard files"

@@ -6,7 +6,6 @@ A mistake gives one line that names the fix.
 from __future__ import annotations
 
 import argparse
-import difflib
 import inspect
 import shutil
 import textwrap
@@ -17,7 +16,7 @@ from pathlib import Path
 from typing import Any, Literal, NoReturn, get_args, get_origin
 
 from rejeu.core.types import Settings
-from rejeu.core.validation import field_docs, number, whole
+from rejeu.core.validation import field_docs, nearest, number, whole
 from rejeu.lab.runs.config import Option, Topic, assigned, options
 
 ELSEWHERE = {
@@ -244,9 +243,3 @@ def replacement(name: str, command: str, options: Collection[str]) -> str:
     if hyperparameter in PARTS and "--set" in options:
         return f"hyperparameters are given as --set policy_kwargs.{hyperparameter}={PARTS[hyperparameter]}"
     return nearest(name if name.startswith("--") else f"-{name}", options)
-
-
-def nearest(name: str, names: Collection[str]) -> str:
-    """Returns the part of a message that names the nearest known name, or all of them."""
-    near = difflib.get_close_matches(name, names, n=1, cutoff=0.6)
-    return f"did you mean {near[0]}?" if near else f"there are {', '.join(names)}"

@@ -20,6 +20,7 @@ import gymnasium as gym
 import numpy as np
 
 from rejeu.core.types import Action
+from rejeu.core.validation import nearest
 
 ARROWS = {"left": "a", "right": "d", "up": "w", "down": "s"}
 """The key that an arrow key is equivalent to, unless it is bound."""
@@ -188,12 +189,7 @@ def _keys(name: str) -> frozenset[str]:
     keys = [key.strip().lower() for key in name.split("+")]
     for key in keys:
         if key not in NAMES:
-            near = difflib.get_close_matches(key, sorted(NAMES), n=1, cutoff=0.6)
-            hint = (
-                f"did you mean {near[0]}?"
-                if near
-                else "valid keys are letters, digits, left, right, up, down, space, ..."
-            )
+            hint = nearest(key, sorted(NAMES), "valid keys are letters, digits, left, right, up, down, space, ...")
             raise ValueError(f"unknown key {key!r}; {hint}")
         if key in CONTROLS and key != "space":
             raise ValueError(f"the key {key!r} cannot be bound: it is reserved for the window ({CONTROLS[key]})")

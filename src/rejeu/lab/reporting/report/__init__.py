@@ -15,6 +15,7 @@ from rejeu.agents.agent import Agent
 from rejeu.algorithms import config as configs
 from rejeu.checkpoints.run_folder import RunFolder
 from rejeu.core import atomic
+from rejeu.core.validation import as_path
 from rejeu.lab.reporting.report import page, sections
 from rejeu.lab.runs.config import RunConfig
 from rejeu.lab.runs.read import RunSummary, read_run
@@ -46,7 +47,7 @@ def write_report(
         out = Path("report.html" if out is None else out)
         read = [record(runs, out, [*evaluations])]
     else:
-        paths = [Path(runs)] if isinstance(runs, str | Path) else [Path(run) for run in runs]
+        paths = [as_path(run) for run in (runs if isinstance(runs, Iterable) and not isinstance(runs, str) else [runs])]
         if not 1 <= len(paths) <= MAX_RUNS:
             raise ValueError(f"a report shows 1 to {MAX_RUNS} runs, got {len(paths)}")
         read = [read_run(path) for path in paths]
