@@ -6,16 +6,18 @@
 100
 """
 
+from rejeu.core import interrupt
+
+if interrupt.is_command():  # which ends with one line until it listens, so that this is before all other imports
+    interrupt.install(lambda number, frame: interrupt.leave(number))
+
 import importlib
 import importlib.util
 from typing import TYPE_CHECKING, Any
 
 from rejeu.algorithms.catalog import CATALOG
-from rejeu.core import interrupt
 
-if interrupt.is_command():  # which imports them when it makes an environment, and ends with one line until then
-    interrupt.install(lambda number, frame: interrupt.leave(number))
-else:
+if not interrupt.is_command():  # which imports them when it makes an environment
     importlib.import_module("rejeu.envs")  # registers rejeu's environments
 
 if TYPE_CHECKING:

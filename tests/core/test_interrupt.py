@@ -120,9 +120,24 @@ def test_a_signal_while_a_file_is_written_leaves_the_old_file_and_no_other(tmp_p
     assert (tmp_path / "page.html").read_text() == "old"
 
 
+def test_a_stop_within_an_action_that_ends_at_once_has_its_line():
+    script = """if True:
+        import os, signal
+        from rejeu.core import interrupt
+        with interrupt.leaving("the models are saved"), interrupt.Interrupt() as stop:  # as while a video is recorded
+            os.kill(os.getpid(), signal.SIGINT)
+            stop.check()
+    """
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "rejeu: the models are saved\n")
+
+
+@pytest.mark.parametrize("module", ["jax", "tomllib"])  # the second is the first that rejeu imports
 @pytest.mark.parametrize(("number", "status"), [("SIGINT", 130), ("SIGTERM", 143)])
-def test_a_signal_during_imports_is_one_line(number, status, tmp_path):
-    (tmp_path / "jax.py").write_text(f"import os, signal\nos.kill(os.getpid(), signal.{number})\nprint('went on')\n")
+def test_a_signal_during_imports_is_one_line(number, status, module, tmp_path):
+    (tmp_path / f"{module}.py").write_text(
+        f"import os, signal\nos.kill(os.getpid(), signal.{number})\nprint('went on')\n"
+    )
     path = os.pathsep.join([str(tmp_path), str(SOURCE.parents[2])])
     command = [sys.executable, "-m", "rejeu", "evaluate", "run"]
     done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": path}, cwd=tmp_path)

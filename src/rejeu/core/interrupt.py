@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import _thread
 import errno
-import multiprocessing
 import os
 import signal
 import sys
@@ -130,10 +129,12 @@ def restore(previous: dict[int, Any]) -> None:
 
 @contextmanager
 def leaving(text: str = "interrupted") -> Iterator[None]:
-    """Context in which these signals end the process immediately and print ``text``; see :func:`leave`."""
+    """Context in which these signals, and :class:`Stopped`, end the process at once and print ``text``; see :func:`leave`."""
     previous = install(lambda number, frame: leave(number, text))
     try:
         yield
+    except Stopped as error:
+        leave(error.signal, text)
     finally:
         restore(previous)
 
@@ -165,7 +166,10 @@ def ignore() -> None:
 
 def is_command() -> bool:
     """Returns whether this process is the command ``rejeu`` or ``python -m rejeu``, and not its worker process."""
-    if multiprocessing.parent_process() is not None or not sys.argv:
+    processes = sys.modules.get(
+        "multiprocessing.process"
+    )  # which takes longer to import than all that is imported here
+    if not sys.argv or (processes is not None and processes.parent_process() is not None):
         return False
     if sys.argv[0] == "-m":  # Python has not found the module yet; its name is the word before the arguments
         return sys.orig_argv[-len(sys.argv)].removeprefix("-m") == "rejeu"
