@@ -166,6 +166,8 @@ def test_stop_on_success_counts_the_last_episodes():
     stop = stop_on_success(0.75, episodes=4)
     assert stop(*finished([0] * 5, [0, 1, 1, 1, 0])) is False
     assert stop(*finished([0] * 5, [1, 1, 1, 0, 0])) is True
+    assert stop(*finished([0] * 5, [1, 1, math.nan, 0, 1])) is True
+    assert stop(*finished([0] * 5, [1, 1, math.nan, 1, 1])) is False  # of the three where it is known
     assert stop_on_success(0.0, episodes=1)(*finished([0])) is True  # unknown
 
 

@@ -7,6 +7,7 @@ are in environment steps, over all environments.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -63,7 +64,8 @@ def _stop_on_mean(least: float, episodes: int, value: Callable[[Episode], float]
 
     def stop(agent: Any, progress: Progress) -> bool:
         last = agent.history.last(episodes) if progress.episodes else []
-        return not (len(last) == episodes and np.mean([value(episode) for episode in last]) >= least)
+        values = [number for number in map(value, last) if not math.isnan(number)]  # success may be unknown of some
+        return not (len(last) == episodes and values and np.mean(values) >= least)
 
     return stop
 

@@ -57,10 +57,10 @@ class History:
         n = min(len(self), LAST_EPISODES)
         if not n:
             return "<History: no episodes>"
-        means = {column: float(np.mean(self[column][-n:])) for column in ("return", "length", "success")}
-        text = f"return {means['return']:,.2f}, length {means['length']:,.1f}"
-        if math.isfinite(means["success"]):
-            text += f", success {means['success']:.0%}"
+        means = self.summary(LAST_EPISODES).last
+        text = f"return {means.mean_return:,.2f}, length {means.mean_length:,.1f}"
+        if math.isfinite(means.success_rate):
+            text += f", success {means.success_rate:.0%}"
         steps = int(self["step"][-1])
         return f"<History: {counted(len(self), 'episode')} in {counted(steps, 'step')}; mean of the last {n}: {text}>"
 

@@ -136,6 +136,8 @@ def test_a_history_shows_a_summary():
         "<History: 1 episode in 9 steps; mean of the last 1: return -1.00, length 9.0>"
     )
     assert repr(History()) == "<History: no episodes>"
+    mixed = [Episode(9, 0, -1.0, 9, success, 0.5) for success in (1.0, NAN, 0.0, 1.0)]
+    assert "success 67%" in repr(History(mixed))  # of those where it is known
 
 
 def test_vector_environments_show_what_they_step():
