@@ -362,6 +362,12 @@ def test_a_damaged_journal_is_one_line_and_is_not_changed(journal, place):
     assert journal.read_bytes() == content
 
 
+def test_a_journal_larger_than_any_is_refused_before_it_is_read(journal, monkeypatch):
+    monkeypatch.setattr(studies, "MAX_BYTES", 100)
+    with pytest.raises(CheckpointError, match=r"journal\.log is damaged: Malformed: it has more than 100 bytes"):
+        studies.open_study(StudyFolder(journal.parent))
+
+
 def test_a_journal_that_is_nested_too_deeply_or_a_link_is_refused(journal, tmp_path):
     with journal.open("ab") as file:
         file.write(b"[" * 100_000 + b"]" * 100_000 + b"\n")

@@ -30,7 +30,7 @@ from rejeu.logs.formatting import quoted
 
 SWEEP, PLAN = "sweep.json", "plan.toml"
 MAX_BYTES = 2**26
-"""Upper limit on the size of a ``sweep.json``."""
+"""Upper limit on the size of a ``sweep.json``, and of the journal of a study."""
 PATIENCE = 60.0
 """Seconds to wait while another process creates the folder."""
 

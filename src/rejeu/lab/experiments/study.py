@@ -29,10 +29,10 @@ from rejeu.checkpoints.model_files import WRONG
 from rejeu.checkpoints.run_folder import File
 from rejeu.core import atomic
 from rejeu.core.errors import CheckpointError, requires
-from rejeu.core.records import brief, json_text
+from rejeu.core.records import brief, json_text, read_bytes
 from rejeu.core.types import JsonObject
 from rejeu.lab.experiments import space as spaces, study_plan as plans
-from rejeu.lab.experiments.folder import begin
+from rejeu.lab.experiments.folder import MAX_BYTES, begin
 from rejeu.lab.experiments.study_plan import StudyPlan
 from rejeu.lab.experiments.work import HIDDEN, Job, Work
 from rejeu.lab.runs.config import RunConfig
@@ -283,10 +283,11 @@ def cut_last_line(journal: Path) -> None:
 
     Raises:
         CheckpointError: if it is a symbolic link.
+        Malformed: if it has more than ``MAX_BYTES`` bytes, of which Optuna would make far more.
     """
     if journal.is_symlink():
         raise CheckpointError(f"{journal} is a link and no file; it is from another program")
-    content = journal.read_bytes() if journal.is_file() else b""
+    content = read_bytes(journal, MAX_BYTES) if journal.is_file() else b""
     if content and not content.endswith(b"\n"):
         with atomic.open_file(journal, "r+b") as file:
             file.truncate(content.rfind(b"\n") + 1)
