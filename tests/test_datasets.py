@@ -430,6 +430,25 @@ def test_an_episode_whose_parts_differ_in_length_is_left_out(name: str, tmp_path
         assert len(demonstrations.read(data).episodes) == whole - 1
 
 
+@pytest.mark.parametrize(
+    ("name", "rows", "message"),
+    [
+        ("observations", np.zeros((STEPS + 1, 7)), r"observations has rows of the shape \(7,\), expected \(\d+,\)"),
+        ("observations", np.zeros(STEPS + 1), r"observations has rows of the shape \(\), expected \(\d+,\)"),
+        ("rewards", np.zeros((STEPS, 1)), r"rewards has rows of the shape \(1,\), expected \(\)"),
+        ("actions", np.full(STEPS, 0.5), r"actions has the dtype float64, expected whole numbers for Discrete\(2\)"),
+        ("rewards", np.full(STEPS, b"a"), "rewards has the dtype .*, expected numbers"),
+    ],
+)
+def test_wrong_contents_are_named_with_their_episode(name: str, rows: Any, message: str, tmp_path: Path) -> None:
+    data = plain(tmp_path)
+    with h5py.File(data / dataset.MAIN, "r+") as file:
+        del file["episode_1"][name]
+        file["episode_1"][name] = rows
+    with pytest.raises(ValueError, match=rf"of another kind \(episode_1/{message}"):
+        demonstrations.read(data)
+
+
 def test_a_dataset_without_spaces_runs_no_code_to_find_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Minari makes the environment of the spec, whose code the file names."""
     (tmp_path / "rejeu_test_evil.py").write_text("raise SystemExit('code of a file was run')")

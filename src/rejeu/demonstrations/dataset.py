@@ -73,6 +73,10 @@ class ArrayReader:
             return np.fromiter(pictures, np.dtype((np.uint8, shape)), len(group))
         if group.dtype.kind not in "biuf":
             raise ValueError(f"{shown(path)} has the dtype {group.dtype}, expected numbers")
+        if group.shape[1:] != shape:
+            raise ValueError(f"{shown(path)} has rows of the shape {shown(group.shape[1:])}, expected {shape}")
+        if group.dtype.kind == "f" and space is not None and space.dtype.kind != "f":  # type: ignore[union-attr]
+            raise ValueError(f"{shown(path)} has the dtype {group.dtype}, expected whole numbers for {shown(space)}")
         plist = group.id.get_create_plist()
         filters = [plist.get_filter(i)[0] for i in range(plist.get_nfilters())]
         if unknown := {*filters} - FILTERS.keys():
