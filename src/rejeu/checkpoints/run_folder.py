@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -102,10 +103,12 @@ def create(out: Path | None, env_id: str, algorithm: str, seed: int) -> RunFolde
     Raises:
         FileExistsError: if ``out`` is a file or holds something.
     """
-    if out is not None:
+    while out is not None:
         check_free(out)
         out.mkdir(parents=True, exist_ok=True)
-        return RunFolder(out)
+        with suppress(FileExistsError):  # another process was faster; what it holds is named by the check
+            RunFolder(out).config.touch(exist_ok=False)
+            return RunFolder(out)
     first, n = dated(env_id, algorithm, f"seed{seed}"), 1
     while True:
         path = first if n == 1 else first.with_name(f"{first.name}-{n}")
