@@ -53,6 +53,10 @@ MOST_IN_ONE_LIST = 12
 """Number of options above which the help of a command lists them in groups."""
 
 
+class Refused(Exception):
+    """A value is not one of its option; not a ``ValueError``, which ``argparse`` would put into a sentence of its own."""
+
+
 class Parser(argparse.ArgumentParser):
     """Raises an error where ``argparse`` prints one and exits."""
 
@@ -87,8 +91,10 @@ def parse(
     parser = make_parser(command, commands[command], declared.values(), {"-h", "--help"} & {*words})
     try:
         typed, leftover = parser.parse_known_intermixed_args([normalized(word) for word in words])
+    except Refused as error:
+        raise ValueError(str(error)) from None
     except argparse.ArgumentError as error:
-        raise ValueError(problem(error, command, words)) from None
+        raise ValueError(problem(declared[error.argument_name or ""], words)) from None
     if unknown := next((word for word in leftover if word.startswith("-")), ""):
         name = unknown.partition("=")[0]
         flags = {key: option for key, option in declared.items() if not option.shown.is_positional}
@@ -96,7 +102,14 @@ def parse(
     if leftover:
         raise ValueError(f"rejeu {command} does not expect {leftover[0]!r}; rejeu {command} --help shows what it takes")
     fields = {option.field: option for option in declared.values()}
-    values = {name: collected(fields[name], value) for name, value in vars(typed).items() if value is not None}
+    present = {name: value for name, value in vars(typed).items() if value not in (None, [])}
+    if missing := [
+        option.name.removesuffix(" ...")
+        for name, option in fields.items()
+        if option.is_required and name not in present
+    ]:
+        raise ValueError(f"rejeu {command} needs {' and '.join(missing)}; rejeu {command} --help shows what it takes")
+    values = {name: collected(fields[name], value) for name, value in present.items()}
     return command, commands[command](**values)
 
 
@@ -141,8 +154,8 @@ def make_parser(command: str, schema: type, declared: Iterable[Option], with_hel
         metavar = option.shown.metavar.removesuffix(" ...")
         settings: Settings = {"metavar": metavar, "help": text, "type": reader(option)}
         if option.takes_many:
-            settings["nargs"] = "+" if option.is_required or not option.shown.is_positional else "*"
-        elif option.shown.is_positional and not option.is_required:
+            settings["nargs"] = "*" if option.shown.is_positional else "+"
+        elif option.shown.is_positional:
             settings |= {"nargs": "?", "default": None}
         if option.shown.is_positional:
             parser.add_argument(option.field, **settings)
@@ -173,16 +186,12 @@ def normalized(word: str) -> str:
     return word
 
 
-def problem(error: argparse.ArgumentError, command: str, words: Sequence[str]) -> str:
-    """Returns the line about what ``argparse`` found wrong."""
-    text, name = error.message, error.argument_name
-    if name is None:
-        missing = text.partition(": ")[2].replace(", ", " and ")
-        return f"rejeu {command} needs {missing}; rejeu {command} --help shows what it takes"
-    if text.startswith("ignored explicit argument"):
-        return f"{name} takes no value, got {text.partition(' argument ')[2]}; leave it out or write {name} alone"
-    if not text.startswith("expected"):
-        return text
+def problem(option: Option, words: Sequence[str]) -> str:
+    """Returns the line about an option that has a value and takes none, or has none and needs one."""
+    name = option.name
+    if option.type is bool:
+        value = next(word.partition("=")[2] for word in map(normalized, words) if word.startswith(f"{name}="))
+        return f"{name} takes no value, got {value!r}; leave it out or write {name} alone"
     position = next((i for i, word in enumerate(words) if normalized(word) == name), len(words))
     following = next(iter(words[position + 1 :]), "--")
     if following.startswith("--"):
@@ -197,7 +206,7 @@ def reader(option: Option) -> Callable[[str], Any]:
         try:
             return read(option, text)
         except ValueError as error:
-            raise argparse.ArgumentTypeError(str(error)) from None
+            raise Refused(str(error)) from None
 
     return convert
 
