@@ -143,9 +143,8 @@ class BaseReplayBuffer(ABC):
     ) -> Transition:
         """Returns transitions in ``shape``, from observations and actions ``(n, ...)`` and what they lead to."""
         rewards, steps, terminated = result
-        reward, each, discount = rewards, None, self.discounts[2:4].take(terminated)
+        reward, each, discount = rewards, None, self.discounts.take(2 * steps + terminated)
         if self.n_steps > 1:
-            discount = self.discounts.take(2 * steps + terminated)
             powers = self.gamma ** np.arange(self.n_steps)
             reward = (rewards @ powers).astype(np.float32)
             each = (rewards * powers).astype(np.float32) if self.each_reward else None

@@ -648,7 +648,7 @@ class Original(Agent):
                 header = checkpoint.read_header(file, "agent")
                 shape = header.get("config", {}).get("policy_kwargs")
                 register_again(shape.get("encoder") if isinstance(shape, dict) else None)
-                agent = load_agent(cls, file, env, changes)
+                agent = super().load(file, env, **changes)
                 attributes = header["attributes"] if isinstance(header.get("attributes"), dict) else {}
                 restore_windows(agent, attributes.get)
                 for name in attributes.keys() - {*OUTPUTS}:
@@ -688,14 +688,9 @@ def scaled(buffer: Any, agent: Original) -> Any:
     return buffer
 
 
-def load_agent(agent_class: type[Original], path: Path, env: Any, changes: Mapping[str, Any]) -> Any:
-    """Returns the agent of a file by :meth:`Agent.load`."""
-    return Agent.__dict__["load"].method.__get__(None, agent_class)(path, env, **changes)
-
-
 def written(write: Callable[[Path], Path], path: Any, suffix: str) -> Any:
     """Writes to a path, to which ``suffix`` is added if it has none, or to a file object; returns the path."""
-    if not isinstance(path, str | Path):
+    if path is not None and not isinstance(path, str | Path):
         with tempfile.TemporaryDirectory() as folder:
             path.write(write(Path(folder) / f"file{suffix}").read_bytes())
         return None
