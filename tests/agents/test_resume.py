@@ -190,6 +190,15 @@ def test_two_checkpoints_are_kept_and_only_the_rows_they_need(tmp_path):
     assert_same(facts(rejeu.SAC.resume(tmp_path)), facts(agent))
 
 
+def test_all_rows_are_written_again_if_a_file_of_some_is_gone(tmp_path):
+    def remove(agent, turn):
+        if turn.step == 25:
+            min(tmp_path.glob("rows_*")).unlink()
+
+    agent = cut_run(tmp_path, callbacks=[remove])
+    assert_same(facts(rejeu.SAC.resume(tmp_path)), facts(agent))
+
+
 def test_a_damaged_checkpoint_is_passed_over_for_the_one_before_it(tmp_path):
     cut_run(tmp_path)
     newest = checkpoint_files(tmp_path)[0]

@@ -247,6 +247,25 @@ def test_acting_step_by_step_gives_the_memories_that_learning_unrolls():
     assert sum(b.any() for b in begun) >= 3
 
 
+def test_a_rollout_begins_with_the_memory_of_the_turn_before_it_and_where_that_ended_episodes():
+    agent = small(InProcess([Spy(), Spy()]), learning_rate=0.0, n_steps=4)
+    carries, starts = [], []
+
+    def note(agent, progress):
+        carries.append(jax.tree.map(np.array, agent.run.carry))
+        starts.append(progress.result.terminated | progress.result.truncated)
+        if progress.rollout_ended:
+            next_rollout = agent.run.replay
+            jax.tree.map(np.testing.assert_array_equal, next_rollout.carry, carries[-1])
+            np.testing.assert_array_equal(next_rollout.started, starts[-1])
+
+    agent.learn(64, note)
+    begins = np.stack(starts[3::4])
+    assert begins.any()
+    assert not begins.all()
+    assert np.any(carries[-1][0][0])
+
+
 # Gradients and minibatches.
 
 

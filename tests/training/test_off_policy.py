@@ -9,9 +9,12 @@ import jax
 import numpy as np
 import pytest
 
+import rejeu
 from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.training import off_policy
 from rejeu.training.compiled import off_policy as on_device
+from tests.environments import Counter
+from tests.helpers import small_sac
 
 
 def host_turns(config, learn_from):
@@ -74,3 +77,53 @@ def test_periods_end_where_a_multiple_of_their_length_is_crossed():
             crossed = any(one % every == 0 for one in range(step - n_envs + 1, step + 1))
             run = SimpleNamespace(step=step, env=SimpleNamespace(n_envs=n_envs))
             assert off_policy.reaches(run, config, 0) == crossed
+
+
+def test_the_turn_that_reaches_learning_starts_ends_a_period_without_gradient_steps():
+    ends = []
+    agent = small_sac(Counter(), learning_starts=8, train_freq=4)
+    agent.learn(8, lambda agent, progress: ends.append(progress.rollout_ended))
+    assert ends == [False, False, False, True] * 2
+    assert agent.n_updates == 0
+
+
+@pytest.mark.parametrize("make", ["off policy", "on policy"])
+def test_a_learning_rate_that_falls_to_zero_is_zero_in_the_last_update_and_not_before(make):
+    shape = {"learning_rate": rejeu.Linear(0.1, 0.0), "policy_kwargs": {"net_arch": [4]}, "seed": 0}
+    if make == "on policy":
+        agent = rejeu.PPO("MlpPolicy", Counter(), n_steps=4, batch_size=4, n_epochs=1, **shape)
+    else:
+        agent = small_sac(Counter(), learning_starts=0, train_freq=4, batch_size=2, **shape)
+    weights = []
+
+    def note(agent, progress):
+        if progress.rollout_ended:
+            arrays = agent.get_parameters()
+            weights.append(
+                [array for name, array in arrays.items() if name.startswith(("actor.", "critics.", "network."))]
+            )
+
+    agent.learn(12, note)
+    first, second, last = ([np.array(array) for array in arrays] for arrays in weights)
+    assert first
+    assert not all(map(np.array_equal, first, second))
+    for before, after in zip(second, last, strict=True):
+        np.testing.assert_array_equal(before, after)
+
+
+def test_the_actor_waits_for_updates_and_not_for_the_steps_of_several_environments():
+    env = rejeu.make_vector(Counter, 3)
+    shape = {"policy_kwargs": {"net_arch": [4]}, "batch_size": 3, "seed": 0, "learning_starts": 3, "train_freq": 3}
+    agent, moved, before = rejeu.TD3("MlpPolicy", env, policy_delay=2, **shape), [], None
+
+    def note(agent, progress):
+        nonlocal before
+        arrays = agent.get_parameters()
+        actor = np.concatenate([array.ravel() for name, array in arrays.items() if name.startswith("actor.")])
+        if before is not None:
+            moved.append(not np.array_equal(before, actor))
+        before = actor
+
+    agent.learn(3 * 7, note)
+    assert agent.n_updates == 6
+    assert moved == [False, True] * 3  # the first turn is the warm-up

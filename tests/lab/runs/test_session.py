@@ -94,3 +94,13 @@ def test_a_run_in_use_is_not_resumed_and_its_files_stay(tmp_path, capsys):
         assert main(["resume", str(tmp_path)]) == 2
     assert "another process is training in" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["checkpoints"]
+
+
+@pytest.mark.parametrize(("steps", "is_due"), [([], True), ([100], True), ([100, 200], False)])
+def test_a_step_is_evaluated_once(steps, is_due):
+    ran = []
+    evaluate = SimpleNamespace(
+        results=[SimpleNamespace(step=step) for step in steps], run=lambda agent, step: ran.append(step)
+    )
+    session.evaluate_now(evaluate, SimpleNamespace(num_timesteps=200))
+    assert ran == [200] * is_due
