@@ -7,6 +7,7 @@ sampled goal tells where it was taken from.
 from __future__ import annotations
 
 import dataclasses
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
@@ -431,3 +432,15 @@ def test_rewards_come_from_one_call_a_sample():
 def test_a_strategy_is_given_by_string_or_enum(strategy):
     chosen = HindsightConfig(goal_selection_strategy=strategy).goal_selection_strategy
     assert chosen in STRATEGIES or (strategy == "desired" and dict(chosen.shares) == {"desired": 1})
+
+
+def test_after_the_end_of_an_episode_a_reward_gets_the_info_of_the_step():
+    infos = np.array([{"x": 1}, None, {"x": 2}, {"x": 3}], object)
+    replay = SimpleNamespace(
+        ring=SimpleNamespace(index=lambda env, time: time),
+        n_steps=2,
+        infos=infos,
+        goals=GoalFunctions(lambda infos: [info["x"] for info in infos], None),
+    )
+    reward, _ = HerReplayBuffer.functions_of(replay, np.array([0, 0]), np.array([0, 2]))
+    assert reward() == [1, 1, 2, 3]
