@@ -4,6 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from rejeu.teaching.courses.checks import dqn_ppo
+from tests.teaching.courses.solutions import solution
+
+right = solution(1, dqn_ppo)
+
 
 class ReplayMemory:
     def __init__(self, capacity, obs_size):
@@ -95,37 +100,6 @@ class Silent(ReplayMemory):
     def sample(self, batch_size, rng): ...
 
 
-def discounts(terminated, truncated, gamma):
-    return gamma * (1.0 - terminated)
-
-
-def td_targets(reward, discount, next_q):
-    return reward + discount * next_q.max(axis=1)
-
-
-def td_errors(q, action, target):
-    return target - jnp.take_along_axis(q, action[:, None], axis=1)[:, 0]
-
-
-def td_loss(network, target_network, batch):
-    target = td_targets(batch.reward, batch.discount, target_network(batch.next_obs))
-    return jnp.mean(td_errors(network(batch.obs), batch.action, target) ** 2)
-
-
-def next_target(target, weight, n_updates, interval):
-    return jnp.where(n_updates % interval == 0, weight, target)
-
-
-def epsilon(progress, start, end):
-    return start * (end / start) ** progress
-
-
-def choose(q, epsilon, key):
-    whether, which = jax.random.split(key)
-    random = jax.random.randint(which, (len(q),), 0, q.shape[1])
-    return jnp.where(jax.random.uniform(whether, (len(q),)) < epsilon, random, q.argmax(axis=1))
-
-
 def loop(env, memory, act, learn, n_episodes, batch_size, gamma, rng, **mistake):
     """The loop of the course, with mistakes by name."""
     wrong = {
@@ -162,51 +136,7 @@ def with_mistake(**mistake):
     return lambda *given: loop(*given, **mistake)
 
 
-def draw_action(mean, log_std, noise):
-    return mean + jnp.exp(log_std) * noise
-
-
-def normalized_advantages(returns, values):
-    gain = returns - values
-    return (gain - gain.mean()) / (gain.std() + 1e-8)
-
-
-def success_rate(returns, threshold):
-    return np.mean(returns > threshold)
-
-
-def log_prob(mean, log_std, action):
-    z = (action - mean) / jnp.exp(log_std)
-    return jnp.sum(-0.5 * z**2 - log_std - 0.5 * jnp.log(2 * jnp.pi), axis=1)
-
-
-def returns_to_go(rewards, gamma):
-    result, following = np.zeros(len(rewards)), 0.0
-    for t in reversed(range(len(rewards))):
-        result[t] = following = rewards[t] + gamma * following
-    return result
-
-
-def advantage(reward, value, next_value, discount, ended, following, gae_lambda):
-    return reward + discount * next_value - value + jnp.where(ended, 0.0, discount * gae_lambda * following)
-
-
-def ratio(new, old):
-    return jnp.exp(new - old)
-
-
-def policy_loss(ratio, advantage, clip):
-    return -jnp.mean(jnp.minimum(ratio * advantage, jnp.clip(ratio, 1 - clip, 1 + clip) * advantage))
-
-
-def value_loss(value, target):
-    return jnp.mean((value[:, 0] - target) ** 2)
-
-
-RIGHT = [
-    ReplayMemory, discounts, td_targets, td_errors, td_loss, next_target, epsilon, choose, loop, success_rate, log_prob,
-    draw_action, returns_to_go, normalized_advantages, advantage, ratio, policy_loss, value_loss,
-]  # fmt: skip
+RIGHT = [ReplayMemory, *vars(right).values()]
 
 
 def one_draw(q, epsilon, key):
@@ -216,7 +146,7 @@ def one_draw(q, epsilon, key):
 
 
 def swapped(q, epsilon, key):
-    return choose(q, 1 - epsilon, key)
+    return right.choose(q, 1 - epsilon, key)
 
 
 def loss_of(target=0, network=0, stop=False, reduce=jnp.mean, power=2):
@@ -225,14 +155,14 @@ def loss_of(target=0, network=0, stop=False, reduce=jnp.mean, power=2):
     def loss(*given):
         networks, batch = given[:2], given[2]
         values = networks[target](batch.next_obs)
-        y = td_targets(batch.reward, batch.discount, jax.lax.stop_gradient(values) if stop else values)
-        return reduce(td_errors(networks[network](batch.obs), batch.action, y) ** power)
+        y = right.td_targets(batch.reward, batch.discount, jax.lax.stop_gradient(values) if stop else values)
+        return reduce(right.td_errors(networks[network](batch.obs), batch.action, y) ** power)
 
     return loss
 
 
 def no_gradient(*given):
-    return jax.lax.stop_gradient(td_loss(*given))
+    return jax.lax.stop_gradient(right.td_loss(*given))
 
 
 def forwards(rewards, gamma):
@@ -287,12 +217,12 @@ WRONG = [
     ("td_targets", lambda r, d, q: r - d * q.max(axis=1), "sign of the future"),
     ("td_targets", lambda r, d, q: r + d * q.max(axis=1, keepdims=True), "the shape is (3, 3), expected (3,)"),
     ("td_targets", lambda r, d, q: r + 0.99 * d * q.max(axis=1), "by hand one finds"),
-    ("td_errors", lambda q, a, y: td_errors(q, a, y) * -1, "the sign is reversed"),
+    ("td_errors", lambda q, a, y: right.td_errors(q, a, y) * -1, "the sign is reversed"),
     ("td_errors", lambda q, a, y: y - q.max(axis=1), "compare with the best action"),
     ("td_errors", lambda q, a, y: y - q[:, 0], "first action's value"),
     ("td_errors", lambda q, a, y: y - q[:, a], "the shape is (3, 3)"),
-    ("td_errors", lambda q, a, y: td_errors(q, a, y) ** 2, "squared already"),
-    ("td_errors", lambda q, a, y: abs(td_errors(q, a, y)), "absolute value"),
+    ("td_errors", lambda q, a, y: right.td_errors(q, a, y) ** 2, "squared already"),
+    ("td_errors", lambda q, a, y: abs(right.td_errors(q, a, y)), "absolute value"),
     ("td_loss", loss_of(target=0), "the network that is being trained"),
     ("td_loss", loss_of(target=0, stop=True), "the network that is being trained"),
     ("td_loss", loss_of(target=0, network=1), "the two networks are exchanged"),
@@ -312,9 +242,9 @@ WRONG = [
     ("epsilon", lambda p, a, b: a * b**p, "does not end at end"),
     ("epsilon", lambda p, a, b: a, "does not depend on progress"),
     ("choose", swapped, "70% of the actions are random"),
-    ("choose", lambda q, e, k: choose(-q, e, k), "the worst one"),
+    ("choose", lambda q, e, k: right.choose(-q, e, k), "the worst one"),
     ("choose", one_draw, "all environments take the same action"),
-    ("choose", lambda q, e, k: choose(q, e / 2, k), "the shares of the actions are"),
+    ("choose", lambda q, e, k: right.choose(q, e / 2, k), "the shares of the actions are"),
     ("choose", lambda q, e, k: q.max(axis=1), "must be 0, 1 or 2, not 5"),
     ("loop", lambda *given: np.zeros(4), "never makes a step"),
     ("loop", with_mistake(ends="none"), "break when it terminated or was truncated"),
@@ -341,8 +271,8 @@ WRONG = [
     ("normalized_advantages", lambda r, v: r - v, "returns minus values"),
     ("normalized_advantages", lambda r, v: r - v - (r - v).mean(), "standard deviation is not 1"),
     ("normalized_advantages", lambda r, v: (r - v) / (r - v).std(), "the mean is not 0"),
-    ("normalized_advantages", lambda r, v: normalized_advantages(v, r), "the sign is reversed"),
-    ("normalized_advantages", lambda r, v: normalized_advantages(r, 0), "values of the critic are missing"),
+    ("normalized_advantages", lambda r, v: right.normalized_advantages(v, r), "the sign is reversed"),
+    ("normalized_advantages", lambda r, v: right.normalized_advantages(r, 0), "values of the critic are missing"),
     ("normalized_advantages", lambda r, v: (r - v - (r - v).mean()) / (r - v).var(), "by the variance"),
     ("normalized_advantages", lambda r, v: (r - v - (r - v).mean()) / (r - v).std(), "you divide by 0"),
     ("success_rate", lambda r, t: np.sum(r > t), "number of successes"),
@@ -350,39 +280,39 @@ WRONG = [
     ("success_rate", lambda r, t: 100 * np.mean(r > t), "in percent"),
     ("success_rate", lambda r, t: np.mean(r < t), "which episodes are above"),
     ("log_prob", lambda m, s, a: -0.5 * z_of(m, s, a) ** 2 - s - 0.5 * LOG_2PI, "one number for each component"),
-    ("log_prob", lambda m, s, a: jnp.exp(log_prob(m, s, a)), "this is the density"),
-    ("log_prob", lambda m, s, a: -log_prob(m, s, a), "the sign is reversed"),
-    ("log_prob", lambda m, s, a: log_prob(m, s, a) / 2, "mean over the components"),
-    ("log_prob", lambda m, s, a: log_prob(m, s, a) + s.sum(), "the term of the standard deviation"),
-    ("log_prob", lambda m, s, a: log_prob(m, s, a) + LOG_2PI, "constant with 2 pi"),
-    ("log_prob", lambda m, s, a: log_prob(m, s, a) - (z_of(m, s, a) ** 2).sum(1) / 2, "factor 1/2"),
+    ("log_prob", lambda m, s, a: jnp.exp(right.log_prob(m, s, a)), "this is the density"),
+    ("log_prob", lambda m, s, a: -right.log_prob(m, s, a), "the sign is reversed"),
+    ("log_prob", lambda m, s, a: right.log_prob(m, s, a) / 2, "mean over the components"),
+    ("log_prob", lambda m, s, a: right.log_prob(m, s, a) + s.sum(), "the term of the standard deviation"),
+    ("log_prob", lambda m, s, a: right.log_prob(m, s, a) + LOG_2PI, "constant with 2 pi"),
+    ("log_prob", lambda m, s, a: right.log_prob(m, s, a) - (z_of(m, s, a) ** 2).sum(1) / 2, "factor 1/2"),
     ("log_prob", lambda m, s, a: (-0.5 * ((a - m) / s) ** 2 - s - 0.5 * LOG_2PI).sum(1), "you divide by log_std"),
-    ("returns_to_go", lambda r, g: returns_to_go(r, 1.0), "gamma has no effect"),
+    ("returns_to_go", lambda r, g: right.returns_to_go(r, 1.0), "gamma has no effect"),
     ("returns_to_go", forwards, "you add the past"),
     ("returns_to_go", lambda r, g: np.cumsum((r * g ** np.arange(4))[::-1])[::-1], "from the beginning"),
-    ("returns_to_go", lambda r, g: returns_to_go(r, g)[::-1], "in reverse order"),
-    ("returns_to_go", lambda r, g: returns_to_go(r, g) - r, "the reward of the step itself"),
+    ("returns_to_go", lambda r, g: right.returns_to_go(r, g)[::-1], "in reverse order"),
+    ("returns_to_go", lambda r, g: right.returns_to_go(r, g) - r, "the reward of the step itself"),
     ("returns_to_go", changes_its_input, "changes the arrays"),
-    ("advantage", lambda r, v, n, d, e, f, g: advantage(-r, -v, -n, d, e, f, g), "sign of the TD error"),
-    ("advantage", lambda r, v, n, d, e, f, g: advantage(r, v, n, d, False, f, g), "next episode's first step"),
+    ("advantage", lambda r, v, n, d, e, f, g: right.advantage(-r, -v, -n, d, e, f, g), "sign of the TD error"),
+    ("advantage", lambda r, v, n, d, e, f, g: right.advantage(r, v, n, d, False, f, g), "next episode's first step"),
     (
         "advantage",
-        lambda r, v, n, d, e, f, g: advantage(r, v, jnp.where(e, 0, n), d, e, f, g),
+        lambda r, v, n, d, e, f, g: right.advantage(r, v, jnp.where(e, 0, n), d, e, f, g),
         "truncated has no future any more",
     ),
-    ("advantage", lambda r, v, n, d, e, f, g: advantage(r, v, n, d, e, f, g) + (1 - d) * n, "is not discounted"),
-    ("advantage", lambda r, v, n, d, e, f, g: advantage(r, n, v, d, e, f, g), "exchanged"),
+    ("advantage", lambda r, v, n, d, e, f, g: right.advantage(r, v, n, d, e, f, g) + (1 - d) * n, "is not discounted"),
+    ("advantage", lambda r, v, n, d, e, f, g: right.advantage(r, n, v, d, e, f, g), "exchanged"),
     (
         "advantage",
         lambda r, v, n, d, e, f, g: r + d * n - v + jnp.where(e, 0, g * f),
         "the advantage of the next step is not discounted",
     ),
-    ("advantage", lambda r, v, n, d, e, f, g: advantage(r, v, n, d, e, f, 1.0), "where is lambda"),
+    ("advantage", lambda r, v, n, d, e, f, g: right.advantage(r, v, n, d, e, f, 1.0), "where is lambda"),
     ("advantage", lambda r, v, n, d, e, f, g: r + d * n - v, "the TD error alone"),
     ("ratio", lambda new, old: jnp.exp(old - new), "the ratio is inverted"),
     ("ratio", lambda new, old: new - old, "the logarithm of the ratio"),
     ("ratio", lambda new, old: new / old, "you divide the logarithms"),
-    ("policy_loss", lambda r, a, c: -policy_loss(r, a, c), "the sign is reversed"),
+    ("policy_loss", lambda r, a, c: -right.policy_loss(r, a, c), "the sign is reversed"),
     ("policy_loss", lambda r, a, c: -jnp.mean(jnp.maximum(r * a, clipped(r, c) * a)), "the larger of the two"),
     ("policy_loss", lambda r, a, c: -jnp.mean(r * a), "nothing is clipped"),
     ("policy_loss", lambda r, a, c: -jnp.mean(clipped(r, c) * a), "only the clipped term"),
@@ -390,10 +320,10 @@ WRONG = [
     ("policy_loss", lambda r, a, c: -jnp.mean(jnp.minimum(r * a, jnp.clip(r, -c, c) * a)), "around 0"),
     ("policy_loss", lambda r, a, c: -jnp.mean(jnp.minimum(r * a, jnp.minimum(r, 1 + c) * a)), "from above only"),
     ("policy_loss", lambda r, a, c: -jnp.mean(jnp.minimum(r * a, jnp.maximum(r, 1 - c) * a)), "from below only"),
-    ("policy_loss", lambda r, a, c: 6 * policy_loss(r, a, c), "the sum, not the mean"),
+    ("policy_loss", lambda r, a, c: 6 * right.policy_loss(r, a, c), "the sum, not the mean"),
     ("value_loss", lambda v, y: jnp.mean((v - y) ** 2), "have the shape (n, n)"),
-    ("value_loss", lambda v, y: -value_loss(v, y), "the sign is reversed"),
+    ("value_loss", lambda v, y: -right.value_loss(v, y), "the sign is reversed"),
     ("value_loss", lambda v, y: jnp.mean(v[:, 0] - y), "without a square"),
-    ("value_loss", lambda v, y: 3 * value_loss(v, y), "the sum, not the mean"),
-    ("value_loss", lambda v, y: jnp.log(-value_loss(v, y)), "not finite"),
+    ("value_loss", lambda v, y: 3 * right.value_loss(v, y), "the sum, not the mean"),
+    ("value_loss", lambda v, y: jnp.log(-right.value_loss(v, y)), "not finite"),
 ]

@@ -2,6 +2,11 @@
 
 import numpy as np
 
+from rejeu.teaching.courses.checks import goals
+from tests.teaching.courses.solutions import solution
+
+right = solution(3, goals)
+
 
 def compute_reward(achieved, desired, info):
     return np.where(np.all(achieved == desired, axis=-1), 0.0, -1.0)
@@ -23,23 +28,7 @@ def hindsight(episode, k, rng, draw=lambda rng, t, n, k: rng.integers(t, n, size
     return result
 
 
-def future(rng, time, first, last):
-    return rng.integers(time + 1, last + 1)
-
-
-def final(rng, time, first, last):
-    return last
-
-
-def episode(rng, time, first, last):
-    return rng.integers(first, last + 1)
-
-
-def parking_reward(achieved, desired, weights):
-    return -np.sqrt(abs(achieved - desired) @ weights)
-
-
-RIGHT = [compute_reward, relabel, hindsight, future, final, episode, parking_reward]
+RIGHT = [*vars(right).values()]
 
 
 def changes_the_step(step, goal):
@@ -89,11 +78,11 @@ WRONG = [
     ("final", lambda rng, t, first, last: last - 1, "last time but one"),
     ("final", lambda rng, t, first, last: first, "the first time"),
     ("final", lambda rng, t, first, last: t, "time of the step itself"),
-    ("episode", future, "strategy future"),
+    ("episode", right.future, "strategy future"),
     ("episode", lambda rng, t, first, last: rng.integers(first, last), "excludes high"),
     ("episode", lambda rng, t, first, last: rng.integers(0, last + 1), "outside of the episode"),
     ("episode", lambda rng, t, first, last: rng.integers(first + 1, last + 1), "first is never drawn"),
-    ("parking_reward", lambda a, d, w: -parking_reward(a, d, w), "a distance is a cost"),
+    ("parking_reward", lambda a, d, w: -right.parking_reward(a, d, w), "a distance is a cost"),
     ("parking_reward", lambda a, d, w: -abs(a - d) @ w, "square root is missing"),
     ("parking_reward", lambda a, d, w: -np.sqrt((a - d) ** 2 @ w), "another norm"),
     ("parking_reward", lambda a, d, w: -np.sqrt(abs(a - d).sum(axis=1)), "weights are missing"),

@@ -102,7 +102,7 @@ def test_other_right_answers_pass():
 
 def test_a_cell_that_lacks_an_answer_stops_with_one_line():
     dqn_ppo.ratio(lambda new, old: new - old)
-    dqn_ppo.epsilon(dqn_ppo_answers.epsilon)
+    dqn_ppo.epsilon(dqn_ppo_answers.right.epsilon)
     checks.require("epsilon", number=3)
     with pytest.raises(Exception, match="needs your ratio, choose, agent") as raised:
         checks.require("epsilon", "ratio", "choose", agent=...)
@@ -110,7 +110,7 @@ def test_a_cell_that_lacks_an_answer_stops_with_one_line():
 
 
 def test_a_wrong_answer_after_a_right_one_counts():
-    dqn_ppo.ratio(dqn_ppo_answers.ratio)
+    dqn_ppo.ratio(dqn_ppo_answers.right.ratio)
     dqn_ppo.ratio(None)
     with pytest.raises(Exception, match="needs your ratio"):
         checks.require("ratio")
@@ -154,5 +154,5 @@ def test_the_reward_of_parking_is_that_of_the_environment():
     obs, _ = env.reset(seed=0)
     given = obs["achieved_goal"], obs["desired_goal"]
     weights = np.array([1.0, 0.3, 0.0, 0.0, 0.02, 0.02])
-    ours = goals_answers.parking_reward(*(goal[None] for goal in given), weights)
+    ours = goals_answers.right.parking_reward(*(goal[None] for goal in given), weights)
     assert ours[0] == pytest.approx(float(env.compute_reward(*given, {})))
