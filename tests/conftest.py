@@ -119,6 +119,14 @@ def learners_are_shared() -> Iterator[None]:
 
 
 @pytest.fixture
+def untrained(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ends commands before they train."""
+    from rejeu.lab.runs.session import Session
+
+    monkeypatch.setattr(Session, "run", lambda self, stop, stopwatch: (0, {}))
+
+
+@pytest.fixture
 def short(monkeypatch: pytest.MonkeyPatch) -> None:
     """Shortens the training and the evaluations of an example."""
     from rejeu.agents import Agent

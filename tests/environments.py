@@ -9,6 +9,47 @@ import numpy as np
 from gymnasium import spaces
 
 
+class Timed(gym.Env):
+    """Episodes of ``length`` steps (None: without end); subclasses say what is observed and earned.
+
+    ``begin`` is called at every reset, ``reward`` before ``time`` moves on, and ``observe`` and ``info`` after it.
+    """
+
+    observation_space: spaces.Space = spaces.Box(-1.0, 1.0, (1,), np.float32)
+    action_space: spaces.Space = spaces.Box(-1.0, 1.0, (1,), np.float32)
+    length: int | None = 10
+    ends = "truncated"
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict]:
+        super().reset(seed=seed)
+        self.time = 0
+        self.begin(seed)
+        return self.observe(), self.info()
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict]:
+        reward = self.reward(action)
+        self.time += 1
+        over = self.time == self.length
+        return (
+            self.observe(),
+            reward,
+            over and self.ends == "terminated",
+            over and self.ends == "truncated",
+            self.info(),
+        )
+
+    def begin(self, seed: int | None) -> None: ...
+
+    def reward(self, action: Any) -> float:
+        return 0.0
+
+    def observe(self) -> Any:
+        return np.zeros(self.observation_space.shape or (), np.float32)
+
+    def info(self) -> dict:
+        return {}
+
+
 class Counter(gym.Env):
     """Observes its own state: (episode, time in the episode, a number sampled at reset).
 
@@ -82,21 +123,18 @@ class Reach(gym.Env):
         return {"observation": self.position, "achieved_goal": self.position, "desired_goal": self.goal}
 
 
-class Sampled(gym.Env):
+class Sampled(Timed):
     """Samples observations from any space. Rewards are 0 and episodes have 5 steps."""
+
+    length = 5
 
     def __init__(self, observation_space: spaces.Space, action_space: spaces.Space | None = None) -> None:
         self.observation_space = observation_space
-        self.action_space = spaces.Box(-1.0, 1.0, (1,), np.float32) if action_space is None else action_space
-        self.reward = 0.0
+        self.action_space = Timed.action_space if action_space is None else action_space
 
-    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict]:
-        super().reset(seed=seed)
+    def begin(self, seed: int | None) -> None:
         if seed is not None:
             self.observation_space.seed(seed)
-        self.time = 0
-        return self.observation_space.sample(), {}
 
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict]:
-        self.time += 1
-        return self.observation_space.sample(), self.reward, False, self.time == 5, {}
+    def observe(self) -> Any:
+        return self.observation_space.sample()

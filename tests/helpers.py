@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import pytest
 
 import rejeu
 from rejeu.agents import Agent
+from rejeu.lab.cli import main
 from rejeu.training.learner import Readings
 from tests.sharing import shared_learners
 
@@ -56,3 +59,11 @@ def same_parameters(one: rejeu.SAC, two: rejeu.SAC) -> bool:
     """Returns whether all parameters are equal, bit for bit."""
     first, second = Agent.get_parameters(one), Agent.get_parameters(two)  # those of rejeu.sb3 are nested
     return all(np.array_equal(value, second[name]) for name, value in first.items())
+
+
+def error_of(capsys: pytest.CaptureFixture[str], *argv: str) -> str:
+    """Returns the line that a command prints when it fails."""
+    assert main([*argv]) == 2
+    text = capsys.readouterr().err
+    assert re.fullmatch(r"rejeu: error: [^\n]+\n", text)
+    return text

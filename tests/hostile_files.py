@@ -16,6 +16,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from rejeu.core.errors import CheckpointError
+
 NAMES = {"float32": "F32", "float64": "F64", "int64": "I64", "int32": "I32", "int16": "I16", "int8": "I8"}
 NAMES |= {"uint64": "U64", "uint32": "U32", "uint16": "U16", "uint8": "U8", "bool": "BOOL", "float16": "F16"}
 DTYPES = {name: dtype for dtype, name in NAMES.items()}
@@ -38,6 +40,18 @@ class Variant(NamedTuple):
     """What is invalid, in one or two words."""
     name: str
     content: bytes
+
+
+def outcome_of(read: Callable[..., Any], *arguments: Any) -> str:
+    """Returns what became of a file: ``refused`` with our own error on one line, ``read``, or what else was raised."""
+    try:
+        read(*arguments)
+    except CheckpointError as error:
+        text = str(error)
+        return "refused" if "\n" not in text and len(text) < 1000 else f"refused at length: {text[:300]}"
+    except Exception as error:
+        return f"{type(error).__name__}: {str(error)[:300]}"
+    return "read"
 
 
 def take_apart(content: bytes) -> Parts:

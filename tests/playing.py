@@ -2,45 +2,40 @@
 
 from __future__ import annotations
 
-import re
-
 import gymnasium as gym
 import numpy as np
 import pytest
 
-from rejeu.lab.cli import main
 from rejeu.teaching import play as play_package
 from rejeu.teaching.play.window import Window
+from tests.environments import Timed
 
 pygame = pytest.importorskip("pygame")
 
 
-class Lever(gym.Env):
+class Lever(Timed):
     """Episodes of 5 steps. The reward is the action; a return of 5 is a success. The frame of step t is gray 40 t."""
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 20}
     observation_space = gym.spaces.Box(0, 255, (40, 40, 3), np.uint8)
     action_space = gym.spaces.Discrete(3)
+    length, ends = 5, "terminated"
 
     def __init__(self, render_mode=None):
-        self.render_mode = render_mode
-        self.actions, self.seeds, self.frames = [], [], 0
+        self.render_mode, self.actions, self.seeds = render_mode, [], []
 
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
+    def begin(self, seed):
         self.seeds.append(seed)
-        self.time, self.gain = 0, 0
-        return self.observe(), {}
 
-    def step(self, action):
+    def reward(self, action):
         self.actions.append(int(action))
-        self.time += 1
-        self.gain += int(action)
-        done = self.time == 5
-        return self.observe(), float(action), done, False, {"is_success": self.gain >= 5} if done else {}
+        return float(action)
 
     def observe(self):
         return self.np_random.integers(0, 256, (40, 40, 3), np.uint8)
+
+    def info(self):
+        return {"is_success": sum(self.actions[-5:]) >= 5} if self.time == 5 else {}
 
     def render(self):
         return np.full((300, 400, 3), 40 * self.time, np.uint8)
@@ -117,11 +112,3 @@ class Pull:
     def predict(self, obs, state=None, episode_start=None, deterministic=False):
         assert deterministic
         return np.int64(2), None
-
-
-def error_of(capsys, *argv):
-    """Returns the line that a command prints when it fails."""
-    assert main([*argv]) == 2
-    text = capsys.readouterr().err
-    assert re.fullmatch(r"rejeu: error: [^\n]+\n", text)
-    return text

@@ -107,6 +107,13 @@ GOAL_OBSERVATION = gym.spaces.Dict(
 )
 
 
+@st.composite
+def histories(draw: Any) -> tuple[int, int, list[Turn]]:
+    """Numbers of environments and of rows of each, and what happens in them."""
+    n_envs, rows = draw(st.integers(1, 4)), draw(st.integers(2, 14))
+    return n_envs, rows, draw(turns(n_envs))
+
+
 def observe(n_envs: int, places: list[int]) -> Any:
     """Observations that contain environment and index in every leaf."""
     where = np.array([[env, place] for env, place in enumerate(places)], np.float32)

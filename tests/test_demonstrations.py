@@ -18,7 +18,7 @@ from rejeu.algorithms import iql
 from rejeu.callbacks import Checkpoint
 from rejeu.demonstrations import Demonstrations, Episode, clone, dagger, learn_offline, read, record
 from rejeu.networks import action_values
-from tests.environments import Reach
+from tests.environments import Reach, Timed
 from tests.sharing import shared_learners
 from tests.tiers import exhaustive, only, only_tuples
 
@@ -33,17 +33,14 @@ ACTIONS: dict[str, gym.Space] = {
 }
 
 
-class Target(gym.Env):
+class Target(Timed):
     """Episodes of 5 steps, in which the best action depends on the observation alone."""
 
-    def __init__(self, kind: str = "Box") -> None:
-        self.observation_space, self.action_space = gym.spaces.Box(-1.0, 1.0, (2,)), ACTIONS[kind]
+    observation_space = gym.spaces.Box(-1.0, 1.0, (2,))
+    length = 5
 
-    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[np.ndarray, dict[str, Any]]:
-        super().reset(seed=seed)
-        self.steps = 0
-        self.obs = self.np_random.uniform(-1, 1, 2).astype(np.float32)
-        return self.obs, {}
+    def __init__(self, kind: str = "Box") -> None:
+        self.action_space = ACTIONS[kind]
 
     def best(self, obs: np.ndarray) -> Any:
         space = self.action_space
@@ -53,11 +50,12 @@ class Target(gym.Env):
             return int(np.digitize(obs[0], [-0.3, 0.3])) - 1
         return (obs > 0).astype(space.dtype)
 
-    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        reward = -float(np.abs(np.asarray(action) - self.best(self.obs)).sum())
-        self.steps += 1
+    def reward(self, action: Any) -> float:
+        return -float(np.abs(np.asarray(action) - self.best(self.obs)).sum())
+
+    def observe(self) -> np.ndarray:
         self.obs = self.np_random.uniform(-1, 1, 2).astype(np.float32)
-        return self.obs, reward, False, self.steps == 5, {}
+        return self.obs
 
 
 class Expert:
@@ -485,7 +483,7 @@ class OneAllowed(Target):
     """Allows the actions in turn."""
 
     def action_masks(self) -> np.ndarray:
-        return np.arange(3) == self.steps % 3
+        return np.arange(3) == self.time % 3
 
 
 def test_an_agent_with_masks_is_recorded_with_them() -> None:

@@ -109,12 +109,12 @@ def test_a_mistake_is_one_line_that_names_the_way_out(name):
 def test_a_reward_that_is_no_number_ends_training_with_its_place(value):
     env = Sampled(gym.spaces.Box(-1.0, 1.0, (3,)))
     agent = small_sac(env, learning_starts=99).learn(7)
-    env.reward = value
+    env.reward = lambda action: value
     with pytest.raises(BadEnvironmentError, match=rf"Sampled returned the reward {value} .* after 7 steps; .* finite"):
         agent.learn(5)
     assert agent.replay_buffer.size() == 7
     assert np.isfinite(agent.replay_buffer.arrays()["reward"]).all()
-    env.reward = 0.0  # and the agent can be trained on
+    del env.reward  # and the agent can be trained on
     agent.learn(3, reset_num_timesteps=False)
     assert agent.replay_buffer.size() == 10
 

@@ -13,7 +13,7 @@ from rejeu.envs.make import InProcess, make_vector
 from rejeu.sb3.common.callbacks import BaseCallback, EvalCallback
 from rejeu.sb3.common.evaluation import evaluate_policy
 from rejeu.sb3.common.vec_env import DummyVecEnv
-from tests.environments import Counter
+from tests.environments import Counter, Timed
 from tests.helpers import assert_same_parameters, small_sac
 from tests.tiers import crossed, only
 
@@ -205,31 +205,21 @@ def test_playing_in_other_environments_leaves_running_episodes_alone():
 # Action masks.
 
 
-class One(gym.Env):
+class One(Timed):
     """Allows one of ten actions at a time and counts the others; episodes of 6 steps."""
 
-    observation_space = gym.spaces.Box(0.0, 1.0, (1,), np.float32)
     action_space = gym.spaces.Discrete(10)
+    length = 6
+    taken = illegal = 0
 
-    def __init__(self):
-        self.taken = self.illegal = 0
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.time = 0
-        return self._see()
-
-    def step(self, action):
+    def reward(self, action):
         self.taken += 1
-        legal = action == self.allowed
-        self.illegal += not legal
-        self.time += 1
-        obs, info = self._see()
-        return obs, float(legal), False, self.time == 6, info
+        self.illegal += action != self.allowed
+        return float(action == self.allowed)
 
-    def _see(self):
+    def info(self):
         self.allowed = int(self.np_random.integers(10))
-        return np.zeros(1, np.float32), {"action_mask": np.arange(10) == self.allowed}
+        return {"action_mask": np.arange(10) == self.allowed}
 
 
 @pytest.fixture(scope="module")
@@ -275,21 +265,15 @@ def test_training_does_not_go_on_from_the_seed_of_an_evaluation():
     assert len({*after}) == 3
 
 
-class Starts(gym.Env):
+class Starts(Timed):
     """Episodes of five steps that begin at random; remembers where, and by what seeds it was reset."""
 
-    observation_space, action_space = gym.spaces.Box(0.0, 1.0, (1,)), gym.spaces.Discrete(2)
+    action_space = gym.spaces.Discrete(2)
+    length = 5
 
     def __init__(self):
         self.seeds, self.starts = [], []
 
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.n = 0
+    def begin(self, seed):
         self.seeds.append(seed)
         self.starts.append(float(self.np_random.random()))
-        return np.full(1, self.starts[-1], np.float32), {}
-
-    def step(self, action):
-        self.n += 1
-        return np.zeros(1, np.float32), 0.0, False, self.n == 5, {}

@@ -22,7 +22,7 @@ from rejeu.logs.logging import Console, CsvFile
 from rejeu.replay.ring import Ring
 from rejeu.replay.uniform import ReplayBuffer
 from tests.algorithms.probes.environments import Probe
-from tests.environments import Counter, Sampled
+from tests.environments import Counter, Sampled, Timed
 from tests.every_agent import env_of, every_kind
 from tests.helpers import small_sac
 from tests.tiers import exhaustive
@@ -33,10 +33,9 @@ NEVER = 10**6
 # Hindsight.
 
 
-class Pilgrim(gym.Env):
+class Pilgrim(Timed):
     """Episodes of 10 steps that each have a number of their own; what is achieved is (that number, the time)."""
 
-    action_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
     observation_space = gym.spaces.Dict(
         {key: gym.spaces.Box(-np.inf, np.inf, (2,)) for key in ("observation", "achieved_goal", "desired_goal")}
     )
@@ -44,16 +43,10 @@ class Pilgrim(gym.Env):
     def __init__(self, first: int) -> None:
         self.number = first - 1
 
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.number, self.time = self.number + 1, 0
-        return self.see(), {}
+    def begin(self, seed):
+        self.number += 1
 
-    def step(self, action):
-        self.time += 1
-        return self.see(), 0.0, False, self.time == 10, {}
-
-    def see(self):
+    def observe(self):
         where = np.float32([self.number, self.time])
         return {"observation": where, "achieved_goal": where, "desired_goal": np.full(2, -1.0, np.float32)}
 
@@ -187,12 +180,8 @@ def test_every_part_of_a_dict_observation_keeps_its_dtype_and_value():
     }
 
     class Exhibition(Sampled):
-        def reset(self, *, seed=None, options=None):
-            super().reset()
-            return shown, {}
-
-        def step(self, action):
-            return shown, *super().step(action)[1:]
+        def observe(self):
+            return shown
 
     vector = InProcess([Exhibition(space), Exhibition(space)])
     replay = ReplayBuffer(Ring(20, 2, spaces.leaves(space), spaces.structure(space), (1,), np.float32), 0.9)

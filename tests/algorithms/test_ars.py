@@ -11,6 +11,7 @@ import pytest
 import rejeu
 from rejeu.algorithms import ars
 from rejeu.core.algorithm import Clock, Rollout
+from tests.environments import Timed
 
 pytestmark = pytest.mark.usefixtures("learners_are_shared")
 
@@ -72,22 +73,16 @@ def test_returns_leave_out_padding_and_add_the_offset_of_every_step():
     np.testing.assert_allclose(ars.episode_returns(rollout_of([[[1.0] * 5]]), 1, -1.0), [0.0])
 
 
-class Lasting(gym.Env):
+class Lasting(Timed):
     """Rewards -1 at every step; no time limit is declared. Truncates itself after ``length`` steps, None for never."""
 
     observation_space, action_space = OBS, BOX
 
     def __init__(self, length):
-        self.length, self.n_taken = length, 0
+        self.length = length
 
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.n_taken = 0
-        return np.zeros(3, np.float32), {}
-
-    def step(self, action):
-        self.n_taken += 1
-        return np.zeros(3, np.float32), -1.0, False, self.n_taken == self.length, {}
+    def reward(self, action):
+        return -1.0
 
 
 @pytest.fixture

@@ -60,10 +60,9 @@ class Echo(Sampled):
     def __init__(self):
         super().__init__(OBS_SPACE, DISCRETE)
 
-    def step(self, action):
+    def reward(self, action):
         assert self.action_space.contains(action), action
-        self.reward = float(action)
-        return super().step(action)
+        return float(action)
 
 
 @every_agent

@@ -16,6 +16,7 @@ from rejeu.algorithms import dqn
 from rejeu.core.algorithm import TD_ERROR, Clock, Transition, clip
 from rejeu.core.schedules import at
 from tests.bit_flipping import BitFlipping
+from tests.environments import Timed
 from tests.tiers import only
 
 pytestmark = pytest.mark.usefixtures("learners_are_shared")
@@ -266,21 +267,14 @@ def test_values_of_a_chain_are_learnt(settings):
     np.testing.assert_allclose(state.network(np.arange(5, dtype=np.int32)), Chain().values(), atol=0.02)
 
 
-class Bandit(gym.Env):
+class Bandit(Timed):
     """One state, actions 5, 6 and 7; 6 pays 1, the others nothing. Ten steps an episode; refuses any other action."""
 
-    observation_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
     action_space = gym.spaces.Discrete(3, start=5)
 
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.time = 0
-        return np.zeros(1, np.float32), {}
-
-    def step(self, action):
+    def reward(self, action):
         assert self.action_space.contains(action), action
-        self.time += 1
-        return np.zeros(1, np.float32), float(action == 6), False, self.time == 10, {}
+        return float(action == 6)
 
 
 @pytest.mark.parametrize("n_envs", only([3], [1, 3, 8]))

@@ -42,7 +42,7 @@ class Wanderer(Probe):
     length = 5
     ends = "truncated"
 
-    def see(self):
+    def observe(self):
         return self.np_random.uniform(-1.0, 1.0, 1).astype(np.float32)
 
     def earn(self, action):

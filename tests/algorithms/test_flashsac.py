@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import gymnasium as gym
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,7 +17,7 @@ from rejeu.core.normalization import NormalizationConfig, normalizer_of
 from rejeu.networks.layers import RMSNorm
 from rejeu.networks.projected import UnitLinear
 from tests.algorithms.batches import BOX, CLOCK, DISCRETE, OBS_SPACE, box_batch, noise_of
-from tests.environments import Reach
+from tests.environments import Reach, Timed
 from tests.networks.test_projected import numpy_torso
 from tests.tiers import exhaustive, only
 
@@ -203,20 +202,13 @@ def test_what_it_has_not_is_refused():
 # Rewards that are scaled so that returns fit.
 
 
-class Rewarding(gym.Env):
+class Rewarding(Timed):
     """Rewards of 3, and in the last step of an episode of 40 one of -500."""
 
-    observation_space = gym.spaces.Box(-1, 1, (1,), np.float32)
-    action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+    length, ends = 40, "terminated"
 
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.time = 0
-        return np.zeros(1, np.float32), {}
-
-    def step(self, action):
-        self.time += 1
-        return np.zeros(1, np.float32), -500.0 if self.time == 40 else 3.0, self.time == 40, False, {}
+    def reward(self, action):
+        return -500.0 if self.time == 39 else 3.0
 
 
 @pytest.mark.parametrize("kind", only([rejeu.PPO], [rejeu.FlashSAC, rejeu.PPO]))

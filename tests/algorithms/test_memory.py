@@ -21,6 +21,7 @@ from rejeu.envs.make import InProcess
 from rejeu.replay.ring import Ring
 from rejeu.replay.uniform import ReplayBuffer
 from tests.algorithms.test_recurrent_ppo import Recall, dense, numpy_empty, numpy_step
+from tests.environments import Timed
 from tests.tiers import exhaustive, only, only_tuples
 
 SIZE = 4
@@ -30,7 +31,7 @@ MEMORY = {"lstm_hidden_size": SIZE, "sequence_length": 4, "burn_in": 3, "net_arc
 RUN = {"learning_starts": 10_000, "batch_size": 64, "seed": 0}
 
 
-class Drawn(gym.Env):
+class Drawn(Timed):
     """Shows random numbers, which identify each step; episodes have 1 to 9 steps, and every other one is truncated."""
 
     observation_space = OBS_SPACE
@@ -38,24 +39,15 @@ class Drawn(gym.Env):
     def __init__(self, action_space=BOX):
         self.action_space, self.episode = action_space, 0
 
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.left, self.episode = int(self.np_random.integers(1, 10)), self.episode + 1
-        return self.see(), {}
+    def begin(self, seed):
+        self.length, self.episode = int(self.np_random.integers(1, 10)), self.episode + 1
+        self.ends = "truncated" if self.episode % 2 else "terminated"
 
-    def see(self):
+    def observe(self):
         return self.np_random.normal(size=3).astype(np.float32)
 
-    def step(self, action):
-        self.left -= 1
-        over = self.left == 0
-        return (
-            self.see(),
-            float(self.np_random.normal()),
-            over and self.episode % 2 == 0,
-            over and self.episode % 2 == 1,
-            {},
-        )
+    def reward(self, action):
+        return float(self.np_random.normal())
 
 
 class Recorded(InProcess):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 
-import gymnasium as gym
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,6 +19,7 @@ from rejeu.core.algorithm import Clock, Transition
 from rejeu.core.distributions import Bernoulli, Categorical, Joint, MultiCategorical, Normal, TanhNormal
 from rejeu.core.spaces import action_width, random_action, rows, scale_action
 from rejeu.envs.functional import FunctionalEnv
+from tests.environments import Timed
 from tests.helpers import assert_same_parameters
 from tests.tiers import exhaustive, only, only_tuples
 
@@ -49,25 +49,20 @@ KINDS = {
 }
 
 
-class Strict(gym.Env):
+class Strict(Timed):
     """Takes only what is in its space, and rewards the choice 2 of a Discrete part."""
 
     observation_space = spaces.Box(-1.0, 1.0, (2,))
+    length = 8
 
     def __init__(self, kind="nested"):
         self.action_space, self.taken = SPACES[kind], []
 
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.time = 0
-        return np.zeros(2, np.float32), {}
-
-    def step(self, action):
+    def reward(self, action):
         assert self.action_space.contains(action), action
         self.taken.append(action)
-        self.time += 1
         chosen = action["gear"] if isinstance(action, dict) else action[0]
-        return np.zeros(2, np.float32), float(chosen == 2), False, self.time == 8, {}
+        return float(chosen == 2)
 
 
 @pytest.mark.parametrize(

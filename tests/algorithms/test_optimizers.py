@@ -18,7 +18,6 @@ from rejeu.core.algorithm import descend
 from rejeu.core.errors import CheckpointError
 from tests.tiers import exhaustive
 
-SETTINGS = {"learning_starts": 8, "batch_size": 4, "buffer_size": 100, "seed": 0}
 OWN = [optax.lamb, partial(optax.adamw, weight_decay=1e-2), optax.chain(optax.clip(1.0), optax.adabelief(1.0))]
 
 

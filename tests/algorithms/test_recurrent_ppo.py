@@ -108,7 +108,6 @@ def made(kind="lstm", shared=False, **settings):
 KINDS = pytest.mark.parametrize("kind", ["lstm", "gru"])
 LSTM = pytest.mark.parametrize("kind", only(["lstm"], ["lstm", "gru"]))
 """For tests that compile much."""
-RNG = np.random.default_rng(0)
 
 
 @KINDS
@@ -388,15 +387,13 @@ class Recall(Probe):
     length = 3
     action_space = gym.spaces.Discrete(2)
 
-    def see(self):
+    def observe(self):
         return np.float32([self.sign if self.time == 0 else 0.0])
 
-    def step(self, action):
-        reward = 0.0
-        if self.time == self.length - 1:
-            reward = 1.0 if (int(action) == 1) == (self.sign > 0) else -1.0
-        self.time += 1
-        return self.see(), reward, self.time == self.length, False, {}
+    def reward(self, action):
+        if self.time < self.length - 1:
+            return 0.0
+        return 1.0 if (int(action) == 1) == (self.sign > 0) else -1.0
 
 
 RECALL = {"n_steps": 24, "batch_size": 96, "n_epochs": 6, "gamma": 0.9, "learning_rate": 1e-2, "seed": 0}

@@ -20,6 +20,7 @@ from tests import hostile_files
 from tests.core.test_schemas import FILES as RECORDED
 from tests.environments import Counter
 from tests.golden import record_files
+from tests.hostile_files import outcome_of
 from tests.tiers import only
 
 SECONDS = 2.0
@@ -73,18 +74,6 @@ def test_the_parts_put_together_are_a_valid_file(kind, loaders, tmp_path):
     loaders[0][kind](path)
 
 
-def attempt(load, path):
-    """What became of a file: ``refused`` with our own error on one line, ``read``, or what else was raised."""
-    try:
-        load(path)
-    except CheckpointError as error:
-        text = str(error)
-        return "refused" if "\n" not in text and len(text) < 1000 else f"refused at length: {text[:300]}"
-    except Exception as error:
-        return f"{type(error).__name__}: {str(error)[:300]}"
-    return "read"
-
-
 @pytest.mark.parametrize("each", only([4], [4, 1]))
 @pytest.mark.parametrize("kind", FILES)
 def test_a_hostile_file_is_refused_soon_and_changes_nothing(kind, each, loaders, tmp_path):
@@ -94,7 +83,7 @@ def test_a_hostile_file_is_refused_soon_and_changes_nothing(kind, each, loaders,
     for variant in variants[::each]:
         path.write_bytes(variant.content)
         began = time.perf_counter()
-        outcome = attempt(load, path)
+        outcome = outcome_of(load, path)
         seconds = time.perf_counter() - began
         if outcome != "refused" or seconds > SECONDS:
             wrong.append((variant.kind, variant.name, outcome, round(seconds, 1)))
@@ -116,7 +105,7 @@ def test_a_hostile_file_takes_little_memory(kind, loaders, tmp_path):
             path.write_bytes(variant.content)
             tracemalloc.reset_peak()
             before = tracemalloc.get_traced_memory()[0]
-            attempt(loaders[0][kind], path)
+            outcome_of(loaders[0][kind], path)
             taken = tracemalloc.get_traced_memory()[1] - before
             assert taken < MEGABYTES * 2**20, f"{variant.kind}, {variant.name}: {taken / 2**20:.0f} MB"
     finally:
@@ -129,7 +118,7 @@ def test_a_refused_file_leaves_the_parameters_as_they_were(tmp_path):
     before, path = agent.get_parameters(), tmp_path / "hostile.safetensors"
     for variant in hostile_files.bad_arrays(CONTENTS["agent"]):
         path.write_bytes(variant.content)
-        assert attempt(agent.set_parameters, path) == "refused", variant.name
+        assert outcome_of(agent.set_parameters, path) == "refused", variant.name
         assert same(before, agent.get_parameters())
 
 
@@ -139,7 +128,7 @@ def test_a_file_cut_short_at_any_byte_is_refused(kind, tmp_path):
     path.write_bytes(content)
     for length in reversed(range(0, len(content), 3)):
         os.truncate(path, length)
-        assert attempt(lambda p: checkpoint.read(p, kind.split()[0]), path) == "refused", length
+        assert outcome_of(lambda p: checkpoint.read(p, kind.split()[0]), path) == "refused", length
 
 
 def test_a_damaged_array_is_named(tmp_path):
@@ -213,7 +202,7 @@ def test_no_array_is_read_that_the_model_does_not_have(kind, loaders, tmp_path, 
         path.write_bytes(one.content)
         os.truncate(path, one.size)
         began = time.perf_counter()
-        assert attempt(load, path) == "refused", one.name
+        assert outcome_of(load, path) == "refused", one.name
         assert time.perf_counter() - began < SECONDS, one.name
     assert not names
 

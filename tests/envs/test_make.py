@@ -19,7 +19,7 @@ from rejeu.envs.registry import import_envpool, make_env
 from rejeu.sb3.common.env_util import make_vec_env
 from rejeu.sb3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 from rejeu.training.run import restart
-from tests.environments import Counter, Reach, Sampled
+from tests.environments import Counter, Reach, Sampled, Timed
 from tests.helpers import small_sac
 
 LENGTHS = (2, 4), (3, 1)
@@ -137,20 +137,14 @@ def test_advice_for_gymnasiums_own_vector_of_cart_poles_can_be_typed():
 # Observations of Dict spaces.
 
 
-class Unordered(gym.Env):
+class Unordered(Timed):
     """Returns its observation as highway-env does: an OrderedDict, the keys not sorted."""
 
     observation_space = gym.spaces.Dict({k: gym.spaces.Box(0, 9, (1,), np.float64) for k in "zab"})
-    action_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
+    length, ends = 1, "terminated"
 
     def observe(self):
         return OrderedDict([("z", np.array([3.0])), ("a", np.array([1.0])), ("b", np.array([2.0]))])
-
-    def reset(self, *, seed=None, options=None):
-        return self.observe(), {}
-
-    def step(self, action):
-        return self.observe(), 0.0, True, False, {}
 
 
 @pytest.mark.parametrize(

@@ -28,6 +28,7 @@ from rejeu.export.numpy_policy import NumpyProgram
 from rejeu.export.program import trace
 from rejeu.lab.cli import main
 from rejeu.lab.policies import load_policy
+from tests.environments import Sampled, Timed
 from tests.export.policies import KINDS, agent_of, made, observations
 from tests.tiers import crossed, exhaustive, only
 
@@ -150,26 +151,18 @@ def test_memory_and_masks_are_inputs_that_matter(tmp_path):
     assert action.tolist() == [1, 2, 3]
 
 
-class Counting(gym.Env):
+class Counting(Timed):
     """Images, or vectors, that hold the number of the step; episodes of 7 steps."""
+
+    action_space = gym.spaces.Box(-2, 2, (2,), np.float32)
+    length, ends = 7, "terminated"
 
     def __init__(self, shape=(3, 40)):
         self.observation_space = gym.spaces.Box(0, 255, shape, np.uint8)
-        self.action_space = gym.spaces.Box(-2, 2, (2,), np.float32)
 
-    def observation(self):
-        return np.full(self.observation_space.shape, 20 * self.n + 5, np.uint8) + self.np_random.integers(
-            0, 5, self.observation_space.shape, np.uint8
-        )
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.n = 0
-        return self.observation(), {}
-
-    def step(self, action):
-        self.n += 1
-        return self.observation(), 0.0, self.n == 7, False, {}
+    def observe(self):
+        noise = self.np_random.integers(0, 5, self.observation_space.shape, np.uint8)
+        return np.full(self.observation_space.shape, 20 * self.time + 5, np.uint8) + noise
 
 
 @pytest.mark.parametrize(("padding", "target"), crossed(["reset", "zero"], ["onnx", "c"]))
@@ -388,18 +381,8 @@ WORDS = ("int", "double", "for", "static", "tanhf", "INFINITY", "v0", "c1", "int
 @pytest.mark.parametrize("name", only(["-o.c"], ["main.c", "-o.c", "int.c", "model.onnx", "model.stablehlo"]))
 def test_keys_may_be_words_of_c_and_names_of_outputs(name, tmp_path):
     space = gym.spaces.Dict({word: gym.spaces.Box(-1, 1, (1 + i % 3,)) for i, word in enumerate(WORDS)})
-
-    class Words(gym.Env):
-        observation_space, action_space = space, gym.spaces.Discrete(2)
-
-        def reset(self, *, seed=None, options=None):
-            super().reset(seed=seed)
-            return space.sample(), {}
-
-        def step(self, action):
-            return space.sample(), 0.0, True, False, {}
-
-    agent = made("PPO", "MultiInputPolicy", Words(), policy_kwargs={"net_arch": [4], "activation_fn": "tanh"})
+    env = Sampled(space, gym.spaces.Discrete(2))
+    agent = made("PPO", "MultiInputPolicy", env, policy_kwargs={"net_arch": [4], "activation_fn": "tanh"})
     found = agent.export(tmp_path / name)
     assert found.check.n == check.OBSERVATIONS
 

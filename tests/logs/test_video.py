@@ -23,29 +23,26 @@ import rejeu
 from rejeu.envs import rendering
 from rejeu.logs import video as video_file
 from rejeu.logs.video import VideoFile, record_video, rendering_env, show_videos
+from tests.environments import Timed
 from tests.tiers import exhaustive
 
 
-class Lamp(gym.Env):
+class Lamp(Timed):
     """Episodes of 4 steps; the picture of step t has the grey value 40 t. Odd sizes, 8 frames per second."""
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 8}
     observation_space = gym.spaces.Box(0, 10, (1,), np.float32)
-    action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+    length, ends = 4, "terminated"
+    closed = False
 
     def __init__(self, render_mode=None):
-        self.render_mode = render_mode
-        self.closed = False
-        self.seeds = []
+        self.render_mode, self.seeds = render_mode, []
 
-    def reset(self, *, seed=None, options=None):
+    def begin(self, seed):
         self.seeds.append(seed)
-        self.time = 0
-        return np.zeros(1, np.float32), {}
 
-    def step(self, action):
-        self.time += 1
-        return np.full(1, self.time, np.float32), 0.0, self.time == 4, False, {}
+    def observe(self):
+        return np.full(1, self.time, np.float32)
 
     def render(self):
         return np.full((33, 51, 3), 40 * self.time, np.uint8)

@@ -19,6 +19,7 @@ from rejeu.replay.hindsight import HerReplayBuffer, HindsightConfig
 from rejeu.replay.prioritized import Priorities, PriorityConfig
 from rejeu.replay.ring import Ring, check_memory
 from rejeu.replay.uniform import ReplayBuffer
+from tests.environments import Timed
 
 SIZE = (2, 3)
 
@@ -35,28 +36,18 @@ SMALL = {
 """An agent that compiles quickly and does not learn."""
 
 
-class Film(gym.Env):
+class Film(Timed):
     """Every frame is a new image that says its number; episodes last ``length`` steps."""
 
-    action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
+    number = 0
 
     def __init__(self, length=4, shape=SIZE):
         self.observation_space = spaces.Box(0, 255, shape, np.uint8)
         self.length = length
-        self.number = 0
 
-    def _frame(self):
+    def observe(self):
         self.number += 1
         return np.full(self.observation_space.shape, self.number % 256, np.uint8)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.time = 0
-        return self._frame(), {}
-
-    def step(self, action):
-        self.time += 1
-        return self._frame(), 0.0, False, self.time == self.length, {}
 
 
 def make_ring(capacity, n_envs, stack, shape=SIZE):

@@ -25,7 +25,7 @@ from rejeu.replay.hindsight import (
 )
 from rejeu.replay.prioritized import Priorities, PriorityConfig
 from rejeu.replay.uniform import ReplayBuffer
-from tests.replay_model import GOAL_OBSERVATION, Model, Turn, make_ring, observe_goal, play, turns
+from tests.replay_model import GOAL_OBSERVATION, Model, Turn, histories, make_ring, observe_goal, play
 
 GAMMA = 0.9
 OWN_GOAL = np.array([-1.0, -1.0], np.float32)
@@ -104,13 +104,6 @@ def relabelled_return(model, env, place, goal, n_steps, ends):
         if frame.step[2]:
             break
     return total, place, weight
-
-
-@st.composite
-def histories(draw):
-    n_envs = draw(st.integers(1, 4))
-    rows = draw(st.integers(2, 14))
-    return n_envs, rows, draw(turns(n_envs))
 
 
 @settings(max_examples=60)

@@ -11,7 +11,6 @@ from tests.environments import Reach
 
 LINE = gym.spaces.Box(-9.0, 9.0, (1,), np.float32)
 CHOICES = gym.spaces.Discrete(3, start=5)
-GAMMA = np.float32(0.5)
 
 
 def memory(capacity=4, action_space=CHOICES, **settings):

@@ -13,16 +13,9 @@ from rejeu.replay import ring_io
 from rejeu.replay.prioritized import Priorities, PriorityConfig
 from rejeu.replay.ring import COUNTERS
 from rejeu.replay.uniform import ReplayBuffer
-from tests.replay_model import Model, Turn, make_ring, observe, play, turns
+from tests.replay_model import Model, Turn, histories, make_ring, observe, play, turns
 
 GAMMA = 0.9
-
-
-@st.composite
-def histories(draw):
-    n_envs = draw(st.integers(1, 4))
-    rows = draw(st.integers(2, 12))
-    return n_envs, rows, draw(turns(n_envs))
 
 
 def filled(n_envs, rows, history, n_steps=1, priorities=False, counters=()):

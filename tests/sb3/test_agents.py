@@ -18,22 +18,20 @@ from rejeu.sb3.common.evaluation import evaluate_policy
 from rejeu.sb3.common.monitor import Monitor
 from rejeu.sb3.common.torch_layers import BaseFeaturesExtractor
 from rejeu.sb3.common.vec_env import DummyVecEnv, VecNormalize
+from tests.environments import Timed
 
 pytestmark = pytest.mark.usefixtures("learners_are_shared")
 
 TINY = {"policy_kwargs": {"net_arch": [4]}}
 
 
-class Endless(gym.Env):
+class Endless(Timed):
     observation_space = gym.spaces.Box(-1, 1, (2,), np.float32)
     action_space = gym.spaces.Discrete(2)
+    length = None
 
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        return np.zeros(2, np.float32), {}
-
-    def step(self, action):
-        return np.zeros(2, np.float32), 1.0, False, False, {}
+    def reward(self, action):
+        return 1.0
 
 
 def test_the_environments_of_an_id_have_the_methods_of_the_original():

@@ -14,6 +14,7 @@ import rejeu
 from rejeu import sb3
 from rejeu.core.schedules import at
 from rejeu.sb3 import algorithms
+from tests.environments import Timed
 from tests.golden.vec_env_script import Walk
 from tests.tiers import only
 
@@ -174,22 +175,20 @@ def test_every_function_given_as_a_schedule_takes_the_remaining_progress(schedul
             assert [float(at(given, progress)) for progress in (0.0, 0.5, 1.0)] == pytest.approx([1e-3, 5e-4, 0.0])
 
 
-class Counting(gym.Env):
+class Counting(Timed):
     """Has four steps in an episode and rewards large actions."""
 
     observation_space = gym.spaces.Box(-1, 1, (2,), np.float32)
+    length = 4
 
     def __init__(self, action_space):
         self.action_space = action_space
 
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.time = 0
-        return np.zeros(2, np.float32), {}
+    def observe(self):
+        return np.full(2, self.time / 4, np.float32)
 
-    def step(self, action):
-        self.time += 1
-        return np.full(2, self.time / 4, np.float32), float(np.sum(action)) + self.time, False, self.time == 4, {}
+    def reward(self, action):
+        return float(np.sum(action)) + self.time + 1
 
     def action_masks(self):
         return np.ones(2, bool)

@@ -10,7 +10,6 @@ import rejeu
 from rejeu.agents import exporting, find_preset, presets
 from rejeu.core.errors import CheckpointError
 from rejeu.lab import cli, hub
-from rejeu.lab.runs.session import Session
 from tests import hostile_files
 from tests.core.test_schemas import FILES
 
@@ -68,12 +67,6 @@ def test_a_file_that_is_no_preset_is_one_line(tmp_path, content, message):
     with pytest.raises(CheckpointError, match=r"preset\.json is no preset: .*") as error:
         presets.read(path)
     assert message in str(error.value)
-
-
-@pytest.fixture
-def untrained(monkeypatch):
-    """Ends commands before they train."""
-    monkeypatch.setattr(Session, "run", lambda self, stop, stopwatch: (0, {}))
 
 
 @pytest.mark.usefixtures("untrained")

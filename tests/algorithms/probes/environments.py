@@ -11,29 +11,21 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from tests.environments import Timed
 
-class Probe(gym.Env):
+
+class Probe(Timed):
     """Episodes of ``length`` steps; subclasses say what is seen and what is earned."""
 
-    observation_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
     action_space = gym.spaces.Box(0.0, 2.0, (1,), np.float32)
     length = 1
     ends = "terminated"
 
-    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[np.ndarray, dict]:
-        super().reset(seed=seed)
-        self.time = 0
+    def begin(self, seed: int | None) -> None:
         self.sign = float(self.np_random.choice([-1.0, 1.0]))
-        return self.see(), {}
 
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
-        reward = self.earn(float(action[0]))
-        self.time += 1
-        over = self.time >= self.length
-        return self.see(), reward, over and self.ends == "terminated", over and self.ends == "truncated", {}
-
-    def see(self) -> np.ndarray:
-        return np.zeros(1, np.float32)
+    def reward(self, action: np.ndarray) -> float:
+        return self.earn(float(action[0]))
 
     def earn(self, action: float) -> float:
         return 1.0
@@ -49,22 +41,12 @@ class Endless(Probe):
     ends = "truncated"
 
 
-class BySight(Probe):
-    """Earns what is seen, 1 or -1: the critic must use the observation."""
-
-    def see(self) -> np.ndarray:
-        return np.float32([self.sign])
-
-    def earn(self, action: float) -> float:
-        return self.sign
-
-
 class Later(Probe):
     """Two steps, and only the second earns 1: the value of the first is gamma."""
 
     length = 2
 
-    def see(self) -> np.ndarray:
+    def observe(self) -> np.ndarray:
         return np.float32([min(self.time, 1)])
 
     def earn(self, action: float) -> float:
@@ -81,7 +63,7 @@ class ByAction(Probe):
 class BySightAndAction(Probe):
     """The best action is 1.5 where 1 is seen and 0.5 where -1 is: actor and critic must both use what is seen."""
 
-    def see(self) -> np.ndarray:
+    def observe(self) -> np.ndarray:
         return np.float32([self.sign])
 
     def earn(self, action: float) -> float:
@@ -95,14 +77,14 @@ class Cut(Probe):
     episodes begin in either place, so that what follows a time limit is not what is seen after it.
     """
 
-    def see(self) -> np.ndarray:
+    def observe(self) -> np.ndarray:
         return np.float32([self.sign])
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
         if self.sign > 0:
-            return self.see(), 1.0, True, False, {}
+            return self.observe(), 1.0, True, False, {}
         self.sign = 1.0
-        return self.see(), 0.0, self.ends == "terminated", self.ends == "truncated", {}
+        return self.observe(), 0.0, self.ends == "terminated", self.ends == "truncated", {}
 
 
 class CutByLimit(Cut):

@@ -11,7 +11,8 @@ import pytest
 import rejeu
 from rejeu.lab.cli import main
 from rejeu.lab.runs.read import read_run
-from tests.lab.cli.test_cli import FEWER_FILES, TINY, error_of, table
+from tests.helpers import error_of
+from tests.lab.cli.test_cli import FEWER_FILES, TINY, table
 
 pytestmark = pytest.mark.usefixtures("learners_are_shared")
 STEPS = 300

@@ -25,12 +25,11 @@ from rejeu.lab.cli.report import goal_of
 from rejeu.lab.reporting.report.page import plotly_script
 from rejeu.lab.runs import config
 from rejeu.lab.runs.begin import untuned
-from rejeu.lab.runs.session import Session
 from rejeu.logs.logging import CsvFile
 from tests.bad_environments import RewardReadsInfo
 from tests.environments import Counter, Reach
 from tests.full_disk import FullDisk
-from tests.helpers import assert_same_parameters
+from tests.helpers import assert_same_parameters, error_of
 from tests.tiers import exhaustive
 
 FILES = {
@@ -97,14 +96,6 @@ def train(out, *more, env="Pendulum-v1", steps=850):
     )
 
 
-def error_of(capsys, *argv):
-    """The line that a command prints when it fails."""
-    assert main([*argv]) == 2
-    text = capsys.readouterr().err
-    assert re.fullmatch(r"rejeu: error: [^\n]+\n", text)
-    return text
-
-
 def rows(path):
     with path.open(newline="") as file:
         return list(csv.DictReader(file))
@@ -156,12 +147,6 @@ def test_train_says_what_it_does_and_what_came_of_it(tmp_path, capsys):
     assert "60/60 steps" in text
     assert "95 % CI" in text
     assert re.search(r"[\d.]+ s in all, [\d.]+ s of them compiling", text)
-
-
-@pytest.fixture
-def untrained(monkeypatch):
-    """Ends commands before they train."""
-    monkeypatch.setattr(Session, "run", lambda self, stop, stopwatch: (0, {}))
 
 
 @pytest.mark.usefixtures("untrained")

@@ -13,7 +13,7 @@ import rejeu
 from rejeu.demonstrations import record
 from rejeu.lab.cli import main
 from rejeu.logs.tables import read_table
-from tests.playing import error_of
+from tests.helpers import error_of
 from tests.tiers import exhaustive
 
 pytest.importorskip("minari")

@@ -24,7 +24,8 @@ from rejeu.lab.runs.arguments import Train
 from rejeu.lab.runs.config import RunConfig
 from rejeu.lab.runs.environment import Environment
 from rejeu.logs.formatting import quoted
-from tests.lab.cli.test_cli import FEWER_FILES, TINY, error_of
+from tests.helpers import error_of
+from tests.lab.cli.test_cli import FEWER_FILES, TINY
 
 pytestmark = pytest.mark.usefixtures("learners_are_shared")
 

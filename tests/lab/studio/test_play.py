@@ -15,7 +15,7 @@ from rejeu.lab.runs.config import RunConfig
 from rejeu.lab.studio.games import HostedGame, Wanted
 from rejeu.lab.studio.state import Studio
 from rejeu.teaching.play import opened as game_opened
-from tests.lab.cli.test_cli import error_of
+from tests.helpers import error_of
 from tests.lab.studio.conftest import HOSTILE, check_widths, opened
 from tests.playing import LEVER, Pull
 

@@ -13,32 +13,30 @@ from rejeu.demonstrations import clone, dagger, read, record
 from rejeu.lab.cli import main
 from rejeu.teaching.play.assist import Assist, Expert
 from rejeu.teaching.play.window import Window
-from tests.playing import LEVER, Pull, down, error_of, pygame, up
+from tests.environments import Timed
+from tests.helpers import error_of
+from tests.playing import LEVER, Pull, down, pygame, up
 from tests.tiers import exhaustive
 
 pytestmark = pytest.mark.usefixtures("learners_are_shared")
 SMALL = {"policy_kwargs": {"net_arch": [8]}, "seed": 0}
 
 
-class Slide(gym.Env):
+class Slide(Timed):
     """Episodes of 10 steps; the observation is the last action."""
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 20}
-    observation_space = gym.spaces.Box(-2, 2, (1,))
-    action_space = gym.spaces.Box(-2, 2, (1,))
+    observation_space = action_space = gym.spaces.Box(-2, 2, (1,))
 
     def __init__(self, render_mode=None):
         self.render_mode, self.actions = render_mode, []
 
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.time = 0
-        return np.zeros(1, np.float32), {}
+    def observe(self):
+        return np.float32(self.actions[-1:]) if self.time else np.zeros(1, np.float32)
 
-    def step(self, action):
+    def reward(self, action):
         self.actions.append(float(action[0]))
-        self.time += 1
-        return np.float32(action), 1.0, False, self.time == 10, {}
+        return 1.0
 
     def render(self):
         return np.zeros((300, 300, 3), np.uint8)

@@ -18,7 +18,8 @@ from rejeu.teaching.play import Game, play, watch
 from rejeu.teaching.play.game import Player
 from rejeu.teaching.play.keys import keys_for
 from rejeu.teaching.play.window import Window, legend, message, score_summary
-from tests.playing import LEVER, Pull, down, error_of, hold, lever, perform, pygame, tap, up
+from tests.helpers import error_of
+from tests.playing import LEVER, Pull, down, hold, lever, perform, pygame, tap, up
 from tests.tiers import exhaustive
 
 

@@ -12,8 +12,9 @@ from rejeu.envs.registry import make_env
 from rejeu.lab.cli import main
 from rejeu.logs.video import HOLD_SECONDS
 from rejeu.teaching.play import play
+from tests.helpers import error_of
 from tests.logs.test_video import decode
-from tests.playing import LEVER, Lever, down, error_of, hold, perform, tap, up
+from tests.playing import LEVER, Lever, down, hold, perform, tap, up
 
 minari = pytest.importorskip("minari")
 

@@ -108,3 +108,15 @@ def use_same_draws(run: Run) -> None:
     buffer.draw = announced_draw
     if goal_index is not None:
         buffer.goal_index = announced_goals
+
+
+def assert_same_learning(one: Any, two: Any, tolerance: float, counters: tuple[str, ...] = ()) -> None:
+    """Asserts that two agents have the same parameters, replay or rollout, episodes and counters."""
+    arrays = ((agent.get_parameters(), agent.run.replay.arrays()) for agent in (one, two))
+    for ours, theirs in zip(*arrays, strict=True):
+        for name, values in ours.items():
+            np.testing.assert_allclose(values, theirs[name], rtol=tolerance, atol=tolerance, err_msg=name)
+    assert len(one.history) == len(two.history)
+    np.testing.assert_allclose(one.history.table()[:, :4], two.history.table()[:, :4], rtol=tolerance)
+    for name in ("step", "episode", "n_updates", *counters):
+        assert getattr(one.run, name) == getattr(two.run, name), name

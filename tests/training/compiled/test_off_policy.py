@@ -15,7 +15,7 @@ from rejeu.training.compiled.trainer import DeviceTrainer
 from tests.jax_environments import Reach
 from tests.sharing import shared_learners
 from tests.tiers import only
-from tests.training.compiled.same_draws import use_same_draws
+from tests.training.compiled.same_draws import assert_same_learning, use_same_draws
 
 SMALL = {"buffer_size": 200, "learning_starts": 20, "batch_size": 8, "policy_kwargs": {"net_arch": [8]}, "seed": 3}
 
@@ -37,14 +37,7 @@ def learn_on_host(agent: Any, n_steps: int) -> None:
 
 def assert_same_runs(one: Any, two: Any, tolerance: float) -> None:
     """Asserts that two agents have the same parameters, replay buffers, episodes and counters."""
-    for name, value in one.get_parameters().items():
-        np.testing.assert_allclose(value, two.get_parameters()[name], rtol=tolerance, atol=tolerance, err_msg=name)
-    for name, rows in one.replay_buffer.arrays().items():
-        np.testing.assert_allclose(rows, two.replay_buffer.arrays()[name], rtol=tolerance, atol=tolerance, err_msg=name)
-    assert len(one.history) == len(two.history)
-    np.testing.assert_allclose(one.history.table()[:, :4], two.history.table()[:, :4], rtol=tolerance)
-    for name in ("step", "episode", "n_updates", "owed", "steps_since_update"):
-        assert getattr(one.run, name) == getattr(two.run, name), name
+    assert_same_learning(one, two, tolerance, ("owed", "steps_since_update"))
     np.testing.assert_allclose(one.run.action, two.run.action, atol=tolerance)
     if one.replay_buffer.priorities is not None:
         assert_same_priorities(one, two, tolerance)

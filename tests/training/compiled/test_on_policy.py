@@ -14,6 +14,7 @@ from rejeu.envs.functional.cart_pole import CartPole
 from tests.jax_environments import Forbidden
 from tests.sharing import shared_learners
 from tests.tiers import only
+from tests.training.compiled.same_draws import assert_same_learning
 
 SMALL: dict[str, Any] = {"n_steps": 16, "policy_kwargs": {"net_arch": [8]}, "seed": 3}
 PPO = {"batch_size": 8, "n_epochs": 2}
@@ -30,16 +31,9 @@ def make(kind: Any, env: Any, n_envs: int = 2, **settings: Any) -> Any:
 
 def assert_same_runs(one: Any, two: Any, tolerance: float) -> None:
     """Asserts that two agents have the same parameters, rollouts, episodes and counters."""
-    for name, value in one.get_parameters().items():
-        np.testing.assert_allclose(value, two.get_parameters()[name], rtol=tolerance, atol=tolerance, err_msg=name)
+    assert_same_learning(one, two, tolerance)
     assert one.run.replay.length == two.run.replay.length
-    for name, rows in one.run.replay.arrays().items():
-        np.testing.assert_allclose(rows, two.run.replay.arrays()[name], rtol=tolerance, atol=tolerance, err_msg=name)
     np.testing.assert_array_equal(one.run.replay.started, two.run.replay.started)
-    assert len(one.history) == len(two.history)
-    np.testing.assert_allclose(one.history.table()[:, :4], two.history.table()[:, :4], rtol=tolerance)
-    for name in ("step", "episode", "n_updates"):
-        assert getattr(one.run, name) == getattr(two.run, name), name
 
 
 @pytest.mark.parametrize(
