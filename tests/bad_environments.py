@@ -5,8 +5,6 @@ that ends training. It is None if training continues, because the fault is corre
 training.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, NamedTuple
 

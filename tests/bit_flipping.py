@@ -1,7 +1,5 @@
 """The bit-flipping environment (Andrychowicz et al. 2017, arXiv 1707.01495, section 3.1)."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import gymnasium as gym

@@ -7,8 +7,6 @@ Mixed dtypes also raise an error, but only around rejeu's own functions (``stric
 optax raises a Python float to an int32 power, which JAX's strict mode does not allow.
 """
 
-from __future__ import annotations
-
 import ctypes
 import gc
 import os

@@ -6,8 +6,6 @@ its names at the last ``fsync`` and any subset of the changes since then. Real f
 program that is correct under these rules is therefore correct on all of them.
 """
 
-from __future__ import annotations
-
 import io
 import itertools
 import os

@@ -1,7 +1,5 @@
 """Minimal environments shared by several tests."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import gymnasium as gym

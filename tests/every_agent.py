@@ -1,7 +1,5 @@
 """Small agents of every algorithm and kind of action space. They share compiled functions (see ``sharing``)."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import gymnasium as gym

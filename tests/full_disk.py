@@ -1,7 +1,5 @@
 """Simulation of a full disk: files can be opened, but only half of the bytes are written."""
 
-from __future__ import annotations
-
 import errno
 import io
 import os

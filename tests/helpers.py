@@ -1,7 +1,5 @@
 """Small agents that are fast to create, and functions to inspect them."""
 
-from __future__ import annotations
-
 import re
 from typing import Any
 

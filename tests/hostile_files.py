@@ -3,8 +3,6 @@
 Files are assembled without rejeu and with correct checksums, so that only the intended part is invalid.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import math

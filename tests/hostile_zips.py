@@ -1,7 +1,5 @@
 """Damaged and hostile variants of a model file of Stable-Baselines3."""
 
-from __future__ import annotations
-
 import io
 import os
 import pickle

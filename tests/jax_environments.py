@@ -1,7 +1,5 @@
 """Minimal environments in JAX shared by several tests."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import equinox as eqx

@@ -5,8 +5,6 @@ those of the policy, those of the value and, if there is one, a last layer that 
 deviation.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from typing import Any
 

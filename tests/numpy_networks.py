@@ -1,7 +1,5 @@
 """Reference implementation of networks, gradients and Adam in float64 NumPy, independent of JAX."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

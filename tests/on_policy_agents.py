@@ -1,7 +1,5 @@
 """Small agents that learn from rollouts, with every kind of action space that they support; they share compiled functions."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import gymnasium as gym

@@ -1,7 +1,5 @@
 """Environments, an agent and scripted key presses for tests of the interactive player."""
 
-from __future__ import annotations
-
 import gymnasium as gym
 import numpy as np
 import pytest

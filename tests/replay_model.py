@@ -4,8 +4,6 @@ Each observation identifies its environment and its index in that list, so that 
 and checked. The reference has no ring buffer: the stored observations are the last ones of the list.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """What agents read from files of Stable-Baselines3 do, compared with what ``trials/sb3_models.py`` recorded there."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

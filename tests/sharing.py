@@ -4,8 +4,6 @@ A :class:`Learner` contains pure functions of an algorithm's configuration and t
 which these are equal can therefore share one.
 """
 
-from __future__ import annotations
-
 import contextlib
 import copy
 import dataclasses

@@ -1,7 +1,5 @@
 """What messages tell people to type exists: commands, options, arguments, names and extras."""
 
-from __future__ import annotations
-
 import ast
 import importlib
 import re

@@ -1,7 +1,5 @@
 """Minari datasets as files: the layouts that Minari writes are read, hostile ones are refused, crashes lose no episode."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os

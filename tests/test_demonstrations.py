@@ -1,7 +1,5 @@
 """Demonstrations: recorded, read, imitated, and learned from."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 from typing import Any

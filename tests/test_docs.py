@@ -4,8 +4,6 @@ Only their length is cut (the fixture ``short``), and a window is closed after a
 reader, it gets from ``PREPARATIONS``.
 """
 
-from __future__ import annotations
-
 import importlib
 import importlib.util
 import os

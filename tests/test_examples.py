@@ -1,7 +1,5 @@
 """The scripts in ``examples/`` run. Only their length is cut (the fixture ``short``)."""
 
-from __future__ import annotations
-
 import runpy
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Learning from recorded episodes without an environment."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 from types import SimpleNamespace

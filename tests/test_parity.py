@@ -7,8 +7,6 @@ random ground and engines whose thrust scatters, so there rewards are computed f
 step.
 """
 
-from __future__ import annotations
-
 import math
 import warnings
 from importlib.metadata import PackageNotFoundError, version

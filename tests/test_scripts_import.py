@@ -1,7 +1,5 @@
 """Scripts outside of the package still import: trials and benchmarks, which the suite does not run."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

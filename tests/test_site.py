@@ -1,7 +1,5 @@
 """The documentation site builds without warnings and works without a network."""
 
-from __future__ import annotations
-
 import pkgutil
 import re
 import subprocess

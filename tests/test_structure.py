@@ -1,7 +1,5 @@
 """``scripts/structure.py`` finds names of algorithms that are written where the catalog should be read."""
 
-from __future__ import annotations
-
 import ast
 import importlib.util
 from pathlib import Path

@@ -5,8 +5,6 @@ programs, none of which alone notices a planted bug (``trials/mutations.py``), a
 takes too.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Files of PyTorch and of Stable-Baselines3, made without either, to test what reads them."""
 
-from __future__ import annotations
-
 import base64
 import io
 import json

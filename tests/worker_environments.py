@@ -3,8 +3,6 @@
 Every worker imports this module, so it imports neither JAX nor pytest.
 """
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import random

@@ -1,7 +1,5 @@
 """What an agent owns and counts: steps, updates, episodes, parameters, environments."""
 
-from __future__ import annotations
-
 import threading
 
 import gymnasium as gym

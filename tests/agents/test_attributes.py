@@ -1,7 +1,5 @@
 """Attributes of agents: hyperparameters that are set count, and what has no effect raises."""
 
-from __future__ import annotations
-
 import gymnasium as gym
 import jax
 import numpy as np

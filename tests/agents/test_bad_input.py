@@ -1,7 +1,5 @@
 """What users get wrong: each mistake is one line that names it and the way out, and costs nothing on disk."""
 
-from __future__ import annotations
-
 import gymnasium as gym
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """After an exception of an environment, and after somebody else stepped it, ``learn`` goes on with new episodes."""
 
-from __future__ import annotations
-
 import functools
 from typing import ClassVar
 

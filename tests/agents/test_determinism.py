@@ -1,7 +1,5 @@
 """One seed, one result: every number of a run depends on the seed and the settings alone."""
 
-from __future__ import annotations
-
 import gymnasium as gym
 import numpy as np
 import pytest

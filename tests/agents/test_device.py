@@ -1,7 +1,5 @@
 """When agents train on the device, and what callbacks are told if they need what a chunk hides."""
 
-from __future__ import annotations
-
 import gc
 import weakref
 from pathlib import Path

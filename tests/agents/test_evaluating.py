@@ -1,7 +1,5 @@
 """Agents evaluated in environments of any kind, also their own and also while they learn."""
 
-from __future__ import annotations
-
 import gymnasium as gym
 import jax
 import numpy as np

@@ -1,7 +1,5 @@
 """Stepping only some environments: what whole-episode rollouts need, in which those that have ended wait for the others."""
 
-from __future__ import annotations
-
 import gymnasium as gym
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """What Stable-Baselines3 shipped wrong and mended later, by its changelog, where no test of a part has it already."""
 
-from __future__ import annotations
-
 import gc
 import time
 import tracemalloc

@@ -1,7 +1,5 @@
 """Whole runs on disk: cut off anywhere and taken up again, they are the run without a break, bit for bit."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal

@@ -1,7 +1,5 @@
 """Several runs in one program: each is the run that would have been trained alone."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import gymnasium as gym

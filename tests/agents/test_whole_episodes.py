@@ -1,7 +1,5 @@
 """Rollouts of whole episodes: everybody plays the same number, who is done waits, and nothing else is learnt from."""
 
-from __future__ import annotations
-
 import gymnasium as gym
 import jax
 import numpy as np

@@ -1,7 +1,5 @@
 """Spaces and random batches of transitions, for tests of losses and updates."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import gymnasium as gym

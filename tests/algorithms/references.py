@@ -3,8 +3,6 @@
 A reference starts from copies of a state's arrays. ``update`` takes the step and returns the expected metrics.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import jax

@@ -1,7 +1,5 @@
 """A2C's losses, gradients and whole updates against float64 NumPy, its settings and what it refuses."""
 
-from __future__ import annotations
-
 import jax
 import numpy as np
 import pytest

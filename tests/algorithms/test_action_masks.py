@@ -1,7 +1,5 @@
 """Action masks as a setting: what is forbidden is never done, never a maximum, and has no gradient, in every algorithm."""
 
-from __future__ import annotations
-
 import functools
 
 import equinox as eqx

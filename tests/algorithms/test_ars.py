@@ -1,7 +1,5 @@
 """ARS: which parameters each episode is played with, the step against NumPy, and what it refuses."""
 
-from __future__ import annotations
-
 import gymnasium as gym
 import jax
 import jax.numpy as jnp

@@ -1,7 +1,5 @@
 """Categorical distributions of the return against the loops of the paper's algorithm 1, in float64."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np

@@ -1,7 +1,5 @@
 """Hyperparameters: what may be written, what is kept, and how mistakes are named."""
 
-from __future__ import annotations
-
 import dataclasses
 import inspect
 import json

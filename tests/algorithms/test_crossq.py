@@ -1,7 +1,5 @@
 """CrossQ's losses against float64 NumPy, and when which network learns and which statistics move."""
 
-from __future__ import annotations
-
 import functools
 from types import SimpleNamespace
 

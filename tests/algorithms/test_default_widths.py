@@ -1,7 +1,5 @@
 """Which hidden layers networks have where none are asked for: on numbers, on images and in files."""
 
-from __future__ import annotations
-
 import gymnasium as gym
 import jax
 import numpy as np

@@ -1,7 +1,5 @@
 """The policies of SAC and DDPG over Discrete actions: what is drawn, and how actions are numbered."""
 
-from __future__ import annotations
-
 import equinox as eqx
 import jax
 import numpy as np

@@ -1,7 +1,5 @@
 """DQN's losses against float64 NumPy, whole updates against recorded ones of Stable-Baselines3, and what it learns."""
 
-from __future__ import annotations
-
 import itertools
 from typing import Any
 

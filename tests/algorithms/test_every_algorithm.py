@@ -1,7 +1,5 @@
 """What holds for every algorithm on every kind of action: counting, repeating, learning in parts, saving, targets, dtypes."""
 
-from __future__ import annotations
-
 import os
 import signal
 

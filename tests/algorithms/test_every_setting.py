@@ -7,8 +7,6 @@ buffers and networks read is in :data:`ELSEWHERE`, with the tests that show it. 
 By default a relation is checked for the cheapest algorithms that have a path of their own; ``scripts/test --all`` checks all.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import math

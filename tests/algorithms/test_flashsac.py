@@ -1,7 +1,5 @@
 """FlashSAC and XQC: whole updates against float64 NumPy, and what agents of them can do."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import jax

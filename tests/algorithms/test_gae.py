@@ -1,7 +1,5 @@
 """Advantages against plain float64 sums and closed forms."""
 
-from __future__ import annotations
-
 import jax
 import numpy as np
 import pytest

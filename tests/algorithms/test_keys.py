@@ -1,7 +1,5 @@
 """No key of random numbers is used twice: what is drawn by one key is independent of all else that is drawn."""
 
-from __future__ import annotations
-
 import itertools
 from collections import Counter
 from collections.abc import Sequence

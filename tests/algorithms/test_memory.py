@@ -1,7 +1,5 @@
 """Networks with memory that learn from replay: which memory is used when, sequences, targets against float64 NumPy, acting."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import gymnasium as gym

@@ -1,7 +1,5 @@
 """Dict and Tuple actions: one joint distribution of independent parts, from the network to the environment and back."""
 
-from __future__ import annotations
-
 import functools
 
 import jax

@@ -1,7 +1,5 @@
 """Whole updates of DDPG, TD3, TD3+BC, ReBRAC, IQL, SAC and TQC against float64 NumPy: losses, gradients, targets, metrics."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import equinox as eqx

@@ -1,7 +1,5 @@
 """The setting ``optimizer``: names, Optax optimizers of the user's own, and files that mention them."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """PPO's losses, gradients and whole updates against float64 NumPy, its networks, its settings and what it refuses."""
 
-from __future__ import annotations
-
 import functools
 
 import equinox as eqx

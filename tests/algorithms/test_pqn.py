@@ -1,7 +1,5 @@
 """PQN's targets, losses and whole updates against float64 NumPy, its exploration, its network and what it refuses."""
 
-from __future__ import annotations
-
 import functools
 
 import gymnasium as gym

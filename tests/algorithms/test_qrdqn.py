@@ -1,7 +1,5 @@
 """QR-DQN's loss against loops in float64, its target, its update, and the distributions that it learns."""
 
-from __future__ import annotations
-
 import functools
 
 import gymnasium as gym

@@ -1,7 +1,5 @@
 """The parts of Rainbow and its successors: C51, Munchausen, noise and IQN, against loops in float64, together and learned."""
 
-from __future__ import annotations
-
 import functools
 import itertools
 import shutil

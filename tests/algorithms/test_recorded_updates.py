@@ -1,7 +1,5 @@
 """Whole updates of SAC and DQN against recorded ones of Stable-Baselines3 (tests/golden/record_updates.py)."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """Recurrent PPO: its cells and losses against float64 NumPy, whose memory is used when, and that it remembers."""
 
-from __future__ import annotations
-
 import functools
 import itertools
 import operator

@@ -1,7 +1,5 @@
 """REDQ, and SAC with a subset of its critics as target and with dropout in them (DroQ)."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np

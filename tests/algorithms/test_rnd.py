@@ -1,7 +1,5 @@
 """Random network distillation, as a setting of every algorithm."""
 
-from __future__ import annotations
-
 import gymnasium as gym
 import jax
 import jax.numpy as jnp

@@ -1,7 +1,5 @@
 """Settings of every algorithm: their defaults, and what is refused. What all share is tested in ``test_config.py``."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import gymnasium as gym

@@ -1,7 +1,5 @@
 """TQC's quantile Huber loss against loops, what it truncates, and what it learns. Updates: ``test_off_policy_updates``."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np

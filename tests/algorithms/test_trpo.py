@@ -1,7 +1,5 @@
 """TRPO's step against the natural gradient in closed form, its line search, and its settings."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 

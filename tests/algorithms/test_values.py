@@ -1,7 +1,5 @@
 """What the critics say, asked by hand: shapes, ranges of actions, several critics, scaling, memory."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Environments whose episodes do not end: found before training, and evaluated for a limited time that Ctrl-C ends."""
 
-from __future__ import annotations
-
 import os
 import re
 import signal

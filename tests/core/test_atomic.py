@@ -1,7 +1,5 @@
 """Writing where a folder from elsewhere holds links to the user's own files."""
 
-from __future__ import annotations
-
 import ast
 import os
 import re

@@ -1,7 +1,5 @@
 """Files: what they keep, and what happens when they are damaged, foreign, or cannot be written."""
 
-from __future__ import annotations
-
 import errno
 import os
 import stat

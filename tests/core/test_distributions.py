@@ -1,7 +1,5 @@
 """Densities against float64 SciPy and against numerical integration."""
 
-from __future__ import annotations
-
 import itertools
 
 import jax

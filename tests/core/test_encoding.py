@@ -1,7 +1,5 @@
 """Nested plain data on its way into a file and back."""
 
-from __future__ import annotations
-
 import json
 import math
 

@@ -1,7 +1,5 @@
 """Writes that fail do not end training: they are warned of once, and reported at the end."""
 
-from __future__ import annotations
-
 import csv
 import errno
 import math

@@ -1,7 +1,5 @@
 """Whatever a file holds, reading it ends soon, in little memory, with rejeu's own error, and changes nothing."""
 
-from __future__ import annotations
-
 import os
 import time
 import tracemalloc

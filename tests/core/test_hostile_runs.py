@@ -1,7 +1,5 @@
 """Checkpoints whose checksums are right and whose values are not: nothing is resumed that could not go on."""
 
-from __future__ import annotations
-
 import copy
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Ctrl-C, SIGTERM and SIGHUP: requests while training, the end of the command everywhere else."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

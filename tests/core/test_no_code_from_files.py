@@ -1,7 +1,5 @@
 """No file is executed: ruff bans what could do so (see pyproject.toml), and a process that loads files is watched."""
 
-from __future__ import annotations
-
 import ast
 import json
 import pickle

@@ -1,7 +1,5 @@
 """Normalisation: moments against NumPy, what is scaled by them, when they move, and that they stay with the agent."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np

@@ -1,7 +1,5 @@
 """A power cut between any two file operations of a run leaves a checkpoint that is at most one interval old."""
 
-from __future__ import annotations
-
 from pathlib import PurePath
 
 import pytest

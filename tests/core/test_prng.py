@@ -1,7 +1,5 @@
 """rejeu's keys give the numbers that JAX's give, bit for bit."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np

@@ -1,7 +1,5 @@
 """JSON of files: parsed strictly, converted to typed records, with errors that name the field."""
 
-from __future__ import annotations
-
 import msgspec
 import numpy as np
 import pytest

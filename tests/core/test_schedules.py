@@ -1,7 +1,5 @@
 """Schedules: their values, and the ways to write them."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from types import SimpleNamespace

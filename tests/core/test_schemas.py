@@ -1,7 +1,5 @@
 """Recorded files are read, and hold what they held: a change of the format must change the schema."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

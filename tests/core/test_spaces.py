@@ -1,7 +1,5 @@
 """What the library reads from spaces, and how it scales actions."""
 
-from __future__ import annotations
-
 import json
 from collections import OrderedDict
 

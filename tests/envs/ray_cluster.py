@@ -1,7 +1,5 @@
 """A Ray cluster of several nodes, which are processes of this machine, for tests. All traffic is on the loopback address."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Runs on EnvPool: what was done to the environments is recorded, and replayed where a run is resumed."""
 
-from __future__ import annotations
-
 import zlib
 from contextlib import closing
 

@@ -1,7 +1,5 @@
 """Environments that do one thing wrong: found before training, and explained or mended where nobody looked."""
 
-from __future__ import annotations
-
 import re
 from types import SimpleNamespace
 

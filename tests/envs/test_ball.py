@@ -1,7 +1,5 @@
 """The ball environment: its rewards and ends, Gymnasium's own checks, exact resume, and what it looks like."""
 
-from __future__ import annotations
-
 import gymnasium as gym
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Seeds, steps, infos and descriptions that all vectors share, and the wrappers for old environments."""
 
-from __future__ import annotations
-
 import math
 from types import SimpleNamespace
 

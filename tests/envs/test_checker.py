@@ -1,7 +1,5 @@
 """What is said of an environment of one's own."""
 
-from __future__ import annotations
-
 import gymnasium as gym
 import jax.numpy as jnp
 import numpy as np

@@ -1,7 +1,5 @@
 """Connections to Ray clusters: addresses and versions."""
 
-from __future__ import annotations
-
 import socket
 import sys
 

@@ -1,7 +1,5 @@
 """What ``check`` approves of trains, is saved and goes on, in this process and in workers."""
 
-from __future__ import annotations
-
 import contextlib
 from functools import partial
 

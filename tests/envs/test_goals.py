@@ -1,7 +1,5 @@
 """The goal functions that hindsight replay calls."""
 
-from __future__ import annotations
-
 import abc
 import contextlib
 

@@ -1,7 +1,5 @@
 """Every backend keeps the same contract: the true successor is seen, and nothing resets by itself."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

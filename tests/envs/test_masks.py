@@ -1,7 +1,5 @@
 """Action masks: what is forbidden is never done nor learnt from, and who says what is allowed, and when."""
 
-from __future__ import annotations
-
 import functools
 
 import gymnasium as gym

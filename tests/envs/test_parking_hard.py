@@ -1,7 +1,5 @@
 """``rejeu/ParkingHard-v0``: what differs from highway-env's parking-v0, and what does not."""
 
-from __future__ import annotations
-
 import gymnasium as gym
 import numpy as np
 import pytest

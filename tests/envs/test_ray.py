@@ -1,7 +1,5 @@
 """Environments in Ray actors: the same as in local workers, and what becomes of lost machines."""
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import os

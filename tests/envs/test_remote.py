@@ -1,7 +1,5 @@
 """Workers that connect from elsewhere, with a stand-in for Ray whose actors are threads; test_ray.py has the real one."""
 
-from __future__ import annotations
-
 import contextlib
 import socket
 import threading

@@ -1,7 +1,5 @@
 """Environments whose state can be taken out and put back, and those where it cannot."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import re

@@ -1,7 +1,5 @@
 """Which episodes count as successes where the environment does not say so itself."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

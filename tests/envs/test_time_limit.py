@@ -1,7 +1,5 @@
 """A time limit as a terminal state, and in environments of the old package gym."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Worker processes: started safely, and what goes wrong in one is said here."""
 
-from __future__ import annotations
-
 import contextlib
 import gc
 import multiprocessing

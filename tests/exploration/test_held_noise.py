@@ -1,7 +1,5 @@
 """Noise that is held: how long, in which actions, and for which algorithms."""
 
-from __future__ import annotations
-
 import itertools
 
 import jax

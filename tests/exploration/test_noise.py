@@ -1,7 +1,5 @@
 """Action noise: its exact statistics, the repulsive boundary, resets, and its settings' forms."""
 
-from __future__ import annotations
-
 import math
 import warnings
 

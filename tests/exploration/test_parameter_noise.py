@@ -1,7 +1,5 @@
 """Adaptive parameter-space noise: who acts, when it changes, how its size is steered, and that it is plain arrays."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import jax

@@ -1,7 +1,5 @@
 """State-dependent exploration: its variance and noise against NumPy, how long it stays, and where it is refused."""
 
-from __future__ import annotations
-
 import functools
 
 import equinox as eqx

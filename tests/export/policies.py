@@ -1,7 +1,5 @@
 """Small agents of every algorithm for every kind of observation, whose environments are never stepped."""
 
-from __future__ import annotations
-
 from typing import Any
 from unittest import mock
 

@@ -3,8 +3,6 @@
 With ``SCREENSHOTS=FOLDER`` each page is photographed while both play.
 """
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

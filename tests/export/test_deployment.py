@@ -1,7 +1,5 @@
 """The services of ``examples/`` act with stand-ins for ROS 2 and FastAPI, and what cannot be exported is one line."""
 
-from __future__ import annotations
-
 import os
 import runpy
 import sys

@@ -1,7 +1,5 @@
 """Exported policies act as ``predict`` does, in every format, and so do model files in NumPy."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

@@ -1,7 +1,5 @@
 """``rejeu.load_policy``: exported policies act in NumPy, in processes without JAX. See also ``test_export``."""
 
-from __future__ import annotations
-
 import copy
 import io
 import json

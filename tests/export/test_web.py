@@ -1,7 +1,5 @@
 """Pages of HTML in which a policy acts: the policy and the environment are compared in Node.js, and the page runs."""
 
-from __future__ import annotations
-
 import re
 import shutil
 

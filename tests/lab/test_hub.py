@@ -1,7 +1,5 @@
 """Models on the hub: the package for it, against a stand-in of its server on this machine."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Whole episodes, counted once, and how sure their mean is."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """The table of episodes."""
 
-from __future__ import annotations
-
 import csv
 import math
 

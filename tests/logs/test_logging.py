@@ -1,7 +1,5 @@
 """Where rows of statistics go, and what happens if they cannot be written there."""
 
-from __future__ import annotations
-
 import csv
 import json
 import math

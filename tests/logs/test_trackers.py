@@ -4,8 +4,6 @@ To run them, in an environment of their own: ``pip install -e ".[wandb,mlflow,tr
 ``pytest tests/logs/test_trackers.py``. Without a package its test is skipped.
 """
 
-from __future__ import annotations
-
 import csv
 import json
 import math

@@ -1,7 +1,5 @@
 """Videos: what is in the file, what happens to the file when something goes wrong, what a notebook is given."""
 
-from __future__ import annotations
-
 import base64
 import builtins
 import ctypes.util

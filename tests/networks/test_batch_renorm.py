@@ -1,7 +1,5 @@
 """Batch renormalisation against float64 NumPy, written from Ioffe 2017 (arXiv 1702.03275), algorithm 1."""
 
-from __future__ import annotations
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp

@@ -1,7 +1,5 @@
 """Frames stored once, stacks built when sampled: against a list of every observation ever seen."""
 
-from __future__ import annotations
-
 import tracemalloc
 
 import gymnasium as gym

@@ -1,7 +1,5 @@
 """The layers that all networks are made of, against NumPy, and the shapes that users may ask for."""
 
-from __future__ import annotations
-
 import re
 
 import jax

@@ -1,7 +1,5 @@
 """Networks against the same computation written once more in NumPy, in double precision."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import equinox as eqx

@@ -1,7 +1,5 @@
 """Layers with noise on their weights against the definition of factorized noise."""
 
-from __future__ import annotations
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp

@@ -1,7 +1,5 @@
 """Normalized layers and projected weights against float64 NumPy."""
 
-from __future__ import annotations
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp

@@ -1,7 +1,5 @@
 """The replay buffer on the device returns the batches of the replay buffer on the host."""
 
-from __future__ import annotations
-
 import itertools
 from types import SimpleNamespace
 from typing import Any

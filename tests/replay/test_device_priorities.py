@@ -1,7 +1,5 @@
 """The sum tree on the device finds, changes and weighs as the one on the host."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import jax

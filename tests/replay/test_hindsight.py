@@ -4,8 +4,6 @@ The achieved goal of every observation names its environment and its place in th
 sampled goal tells where it was taken from.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """Prioritised replay: the sum-tree, the probabilities and weights, what can be drawn, and how it composes."""
 
-from __future__ import annotations
-
 import itertools
 import timeit
 

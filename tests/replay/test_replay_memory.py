@@ -1,7 +1,5 @@
 """The replay memory for loops of one's own."""
 
-from __future__ import annotations
-
 import gymnasium as gym
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """What a rollout buffer keeps, and what an agent puts into it."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import gymnasium as gym

@@ -1,7 +1,5 @@
 """The ring and the plain replay buffer against a brute-force list of episodes."""
 
-from __future__ import annotations
-
 import gymnasium as gym
 import jax
 import numpy as np

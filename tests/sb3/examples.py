@@ -4,8 +4,6 @@ Each function is one example of the page that :func:`example` names. Trainings a
 not run here; classes of PyTorch are replaced by those of ``equinox`` and ``jax``, which the page says.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """What scripts expect of an agent: its environments, seeds, files and evaluation."""
 
-from __future__ import annotations
-
 import random
 from collections import deque
 

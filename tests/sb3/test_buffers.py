@@ -1,7 +1,5 @@
 """Every attribute and method of the buffers of agents, on the buffers of agents that have learned."""
 
-from __future__ import annotations
-
 import copy
 
 import gymnasium as gym

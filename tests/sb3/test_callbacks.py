@@ -1,7 +1,5 @@
 """Callbacks with hooks, as scripts for Stable-Baselines3 write them; when they are called is in test_sb3_golden.py."""
 
-from __future__ import annotations
-
 import csv
 
 import gymnasium as gym

@@ -1,7 +1,5 @@
 """The examples of Stable-Baselines3's documentation run, or fail for the stated reason."""
 
-from __future__ import annotations
-
 import importlib.util
 
 import pytest

@@ -1,7 +1,5 @@
 """Stable-Baselines3's module paths and its self-resetting vector environments."""
 
-from __future__ import annotations
-
 import importlib
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """What scripts for Stable-Baselines3 do, line by line, and the tests that show each of them."""
 
-from __future__ import annotations
-
 import io
 from pathlib import Path
 from types import SimpleNamespace

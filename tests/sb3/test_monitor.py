@@ -1,7 +1,5 @@
 """Monitor: its numbers, its file, its refusals; what it hides of the environment (nothing)."""
 
-from __future__ import annotations
-
 import csv
 import json
 

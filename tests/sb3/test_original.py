@@ -1,7 +1,5 @@
 """What scripts for Stable-Baselines3 do: one test for each kind of call."""
 
-from __future__ import annotations
-
 import io
 import json
 import warnings

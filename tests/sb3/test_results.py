@@ -1,7 +1,5 @@
 """Reading and drawing the files that Monitor writes."""
 
-from __future__ import annotations
-
 import csv
 import json
 import tracemalloc

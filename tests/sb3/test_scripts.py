@@ -1,7 +1,5 @@
 """Scripts as Stable-Baselines3's documentation has them, with the imports of rejeu's mirror and nothing else changed."""
 
-from __future__ import annotations
-
 import importlib
 import os
 import random

@@ -1,7 +1,5 @@
 """Hyperparameters that are set on an agent count from the next update on, or raise."""
 
-from __future__ import annotations
-
 import gymnasium as gym
 import numpy as np
 import pytest

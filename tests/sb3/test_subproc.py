@@ -1,7 +1,5 @@
 """Vector environments with one process for each environment."""
 
-from __future__ import annotations
-
 import os
 import signal
 

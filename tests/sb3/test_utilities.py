@@ -1,7 +1,5 @@
 """Small functions of Stable-Baselines3's modules, by their definitions."""
 
-from __future__ import annotations
-
 import io
 import math
 from types import SimpleNamespace

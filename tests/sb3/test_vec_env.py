@@ -1,7 +1,5 @@
 """Vector environments that reset themselves: what agents make of them, and what the wrappers refuse."""
 
-from __future__ import annotations
-
 import math
 
 import gymnasium as gym

@@ -1,7 +1,5 @@
 """Models of Stable-Baselines3 act here as they do there, and no code of a file is run."""
 
-from __future__ import annotations
-
 import os
 import pickle
 import shutil

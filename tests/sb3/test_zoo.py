@@ -1,7 +1,5 @@
 """Files that others trained: RL Zoo's folders, the files beside a model, and the forms of older versions."""
 
-from __future__ import annotations
-
 import json
 import pickle
 import shutil

@@ -1,7 +1,5 @@
 """Training stops, or goes on without it, where an update would leave NaN or infinity; and says what, where and why."""
 
-from __future__ import annotations
-
 import itertools
 
 import equinox as eqx

@@ -4,8 +4,6 @@ After ``jax.clear_caches()`` every program must be compiled again. So the number
 of different programs that run in them: nothing else is dispatched, no arithmetic on device arrays either.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import gymnasium as gym

@@ -1,7 +1,5 @@
 """Packing many arrays into few is exact, and large arrays are left alone."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np

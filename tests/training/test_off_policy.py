@@ -1,7 +1,5 @@
 """When off-policy learning takes gradient steps, on the host and on the device, against counting step by step."""
 
-from __future__ import annotations
-
 from itertools import product
 from types import SimpleNamespace
 

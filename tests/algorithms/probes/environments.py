@@ -4,8 +4,6 @@ After "Debugging RL, Without the Agonizing Pain" (Andy Jones 2021). All have one
 that they share compiled functions.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import gymnasium as gym

@@ -4,8 +4,6 @@ A value that differs between two places that follow each other needs what is see
 differs between two places needs all of these and the policy. So these are the probes of all algorithms.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """How each classic control task of Gymnasium is compared with its counterpart in JAX."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, NamedTuple
 

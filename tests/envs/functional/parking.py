@@ -1,7 +1,5 @@
 """Steps of highway-env's parking-v0, with which the one in JAX is compared."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import jax

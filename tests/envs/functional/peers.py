@@ -1,7 +1,5 @@
 """Transitions of the environments that those in JAX are compared with, and the comparison."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, NamedTuple
 

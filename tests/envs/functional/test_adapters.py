@@ -1,8 +1,6 @@
 """Environments with the interfaces of gymnax and Brax. Their packages conflict with rejeu's; small stand-ins have the same
 functions, and the test of gymnax itself runs where it is installed."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """The ball in JAX against ``rejeu/Ball-v0``."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np

@@ -1,7 +1,5 @@
 """The classic control tasks in JAX against Gymnasium's."""
 
-from __future__ import annotations
-
 import gymnasium as gym
 import jax
 import numpy as np

@@ -1,7 +1,5 @@
 """Bit flipping and the point maze: steps, walls, goals."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np

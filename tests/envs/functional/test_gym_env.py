@@ -1,7 +1,5 @@
 """Environments in JAX as Gymnasium environments: checks, resets, pictures, exact resume, training."""
 
-from __future__ import annotations
-
 import gymnasium as gym
 import numpy as np
 import pytest

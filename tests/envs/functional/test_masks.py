@@ -1,7 +1,5 @@
 """Action masks of environments in JAX."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """An environment on MJX against MuJoCo itself."""
 
-from __future__ import annotations
-
 import importlib.util
 
 import jax

@@ -1,7 +1,5 @@
 """Parking in JAX against highway-env's parking-v0."""
 
-from __future__ import annotations
-
 from importlib.metadata import version
 
 import jax

@@ -1,7 +1,5 @@
 """Errors of environments in JAX are reported in one line, with the fix."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Many environments in JAX at once: streams of random numbers, ends of episodes, resets, and the vector for the host."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import jax

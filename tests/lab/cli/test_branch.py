@@ -1,7 +1,5 @@
 """``rejeu branch``: a new run from a checkpoint of another."""
 
-from __future__ import annotations
-
 import json
 import shutil
 

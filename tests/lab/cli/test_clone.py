@@ -1,7 +1,5 @@
 """``rejeu clone`` and ``rejeu train --offline``."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The option ``--json``, exit codes, and what programs read of the documentation."""
 
-from __future__ import annotations
-
 import csv
 import json
 import re

@@ -1,7 +1,5 @@
 """Every option of a command reaches what it is for. What would train, play or use the network is replaced and noted."""
 
-from __future__ import annotations
-
 import dataclasses
 import importlib
 import inspect

@@ -1,7 +1,5 @@
 """The final comparison of a study, without Optuna. The rest is in ``test_study``."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np

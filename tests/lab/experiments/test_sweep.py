@@ -1,7 +1,5 @@
 """What a sweep returns, by the states of its jobs. With real processes: ``tests/lab/cli/test_sweep.py``."""
 
-from __future__ import annotations
-
 from itertools import product
 from pathlib import Path
 from types import SimpleNamespace

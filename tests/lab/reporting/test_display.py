@@ -1,7 +1,5 @@
 """What a notebook shows: IPython's own formatters and display messages, without a kernel."""
 
-from __future__ import annotations
-
 import builtins
 import math
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """Pictures of noise: its processes, the repulsive boundary, and saturation with and without it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Trajectories as figures: a coordinate against time, the plane, and the plane beside every coordinate."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The table of an agent's networks."""
 
-from __future__ import annotations
-
 import equinox as eqx
 import jax
 import numpy as np

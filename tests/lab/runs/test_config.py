@@ -1,7 +1,5 @@
 """The description of a run: declared once, read from files of every version, and handed to processes as data."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 

@@ -1,7 +1,5 @@
 """Environments of the user's own on the command line: what is typed is imported, what a run folder says never is."""
 
-from __future__ import annotations
-
 import dataclasses
 import io
 import json

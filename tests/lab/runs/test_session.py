@@ -1,7 +1,5 @@
 """What ``rejeu train``, ``resume`` and ``status`` measure and print: columns, times, limits."""
 
-from __future__ import annotations
-
 import csv
 import json
 import math

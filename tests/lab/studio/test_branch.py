@@ -1,7 +1,5 @@
 """The form on the page of a run that begins another run from a checkpoint, in headless Chromium."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

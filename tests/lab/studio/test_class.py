@@ -1,7 +1,5 @@
 """The page of a class: in headless Chromium, and its leaderboard without a page."""
 
-from __future__ import annotations
-
 import shutil
 import time
 

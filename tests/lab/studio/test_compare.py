@@ -1,7 +1,5 @@
 """The comparison of runs that were chosen in the table of runs, in headless Chromium."""
 
-from __future__ import annotations
-
 from tests.lab.studio.conftest import HOSTILE, check_widths, opened
 
 

@@ -1,7 +1,5 @@
 """The page on which environments are played and agents watched: in headless Chromium, and its games without a page."""
 
-from __future__ import annotations
-
 import queue
 import re
 from functools import partial

@@ -1,7 +1,5 @@
 """Taking over from an agent while it trains, and from a clone, with key events in SDL's own queue."""
 
-from __future__ import annotations
-
 import signal
 
 import gymnasium as gym

@@ -1,7 +1,5 @@
 """Which action the keys held stand for."""
 
-from __future__ import annotations
-
 from itertools import combinations
 
 import gymnasium as gym

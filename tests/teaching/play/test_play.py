@@ -1,7 +1,5 @@
 """Playing by hand and watching, in a window on SDL's dummy driver, with key events in SDL's own queue."""
 
-from __future__ import annotations
-
 import re
 import sys
 import time

@@ -1,7 +1,5 @@
 """What was played, read back: by Minari, and from the video."""
 
-from __future__ import annotations
-
 import re
 import sys
 

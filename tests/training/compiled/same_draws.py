@@ -1,7 +1,5 @@
 """The random numbers of the loops on the device, for the loops of the host, so that both can be compared."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import jax

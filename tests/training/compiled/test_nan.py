@@ -1,7 +1,5 @@
 """NaN on the device: the error says in which steps, and the agent has the state before them."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """On-policy learning on the device: the same as on the host, step by step, and wherever the chunks end."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

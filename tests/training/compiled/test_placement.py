@@ -1,7 +1,5 @@
 """An agent on another device than the default one, in a process with two CPU devices."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Steps and episodes on the device against counting them one by one."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any
 
