@@ -6,6 +6,7 @@ from typing import Any
 
 import equinox as eqx
 import gymnasium as gym
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -361,7 +362,7 @@ def test_good_actions_of_iql_weigh_more(inverse_temperature: float) -> None:
     obs, action, following = (rng.uniform(-1, 1, (5, 2)).astype(np.float32) for _ in range(3))
     reward, discount = rng.normal(size=5).astype(np.float32), np.full(5, 0.9, np.float32)
     batch = rejeu.Transition(obs, action, reward, following, discount)
-    after, metrics = algorithm.update(before, batch, rejeu.Clock(np.uint32(0), np.uint32(0), np.float32(0)))
+    after, metrics = jax.jit(algorithm.update)(before, batch, rejeu.Clock(np.uint32(0), np.uint32(0), np.float32(0)))
 
     q = np.min(action_values(before.target_critics, obs, action), axis=0)
     advantage = q - np.asarray(before.value(obs))[:, 0]

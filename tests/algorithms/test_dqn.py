@@ -106,7 +106,7 @@ def test_td_loss_equals_numpy(name, weighted):
 def test_update_reports_td_errors_of_the_batch_it_learnt_from():
     algorithm, state = make(double_q=True)
     batch = random_batch()
-    _, metrics = algorithm.update(state, batch, CLOCK)
+    _, metrics = jax.jit(algorithm.update)(state, batch, CLOCK)
     values, following = forward(state.network, batch.obs), forward(state.network, batch.next_obs)
     target = batch.reward + batch.discount * following.max(axis=1)
     taken = values[np.arange(BATCH), batch.action]

@@ -213,8 +213,9 @@ def test_sequences_of_one_step_are_transitions_whose_observations_begin_episodes
     state, batch = algorithm.init(jax.random.PRNGKey(0)), transitions(action_space)
     n_numbers = algorithm.explorer.init(algorithm.actor(state), 1).shape[1]
     clock = rejeu.core.algorithm.Clock(np.uint32(4), np.uint32(0), np.float32(0.0))
-    plain, metrics = algorithm.update(state, batch, clock)
-    unrolled, same_metrics = algorithm.update(state, one_step(batch, n_numbers), clock)
+    update = jax.jit(algorithm.update)
+    plain, metrics = update(state, batch, clock)
+    unrolled, same_metrics = update(state, one_step(batch, n_numbers), clock)
     for one, other in zip(jax.tree.leaves((plain, metrics)), jax.tree.leaves((unrolled, same_metrics)), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-6)
 

@@ -282,7 +282,7 @@ def test_the_critic_learns_the_value_of_the_combination_that_was_taken():
     index = np.ravel_multi_index(batch.action[:, [0, 1, 2, 3, 5]].astype(int).T, (2, 2, 2, 3, 3))
     box, rows_ = batch.action[:, [4, 6, 7]], np.arange(16)
     values = np.asarray(jax.vmap(lambda critic: critic(batch.obs, box))(state.critics))[:, rows_, index]
-    _, metrics = algorithm.update(state, batch, Clock(np.uint32(0), np.uint32(0), np.float32(0)))
+    _, metrics = jax.jit(algorithm.update)(state, batch, Clock(np.uint32(0), np.uint32(0), np.float32(0)))
     np.testing.assert_allclose(metrics["q_value"], values.mean(), rtol=1e-4)
     action = np.asarray(algorithm.explore(state.actor, np.zeros((400, 2), np.float32), jax.random.PRNGKey(0), None))
     for column, size in {0: 2, 1: 2, 2: 2, 3: 3, 5: 3}.items():

@@ -87,7 +87,7 @@ def test_quantile_loss_equals_loops(weighted):
 def test_update_reports_the_difference_of_means_as_td_error():
     algorithm, state = make()
     batch = random_batch()
-    _, metrics = algorithm.update(state, batch, CLOCK)
+    _, metrics = jax.jit(algorithm.update)(state, batch, CLOCK)
     current = numpy_quantiles(state.network, batch.obs)[np.arange(BATCH), batch.action].mean(axis=1)
     following = numpy_quantiles(state.network, batch.next_obs).mean(axis=2).max(axis=1)
     np.testing.assert_allclose(
@@ -100,7 +100,7 @@ def test_update_descends_by_adam_with_the_papers_epsilon():
     """One step of optax's own Adam with epsilon 0.01 / batch_size, 0.01 / 4 here, is what the update takes."""
     algorithm, state = make(learning_rate=0.1, batch_size=4)
     batch = random_batch()
-    after, _ = algorithm.update(state, batch, CLOCK)
+    after, _ = jax.jit(algorithm.update)(state, batch, CLOCK)
     target = dqn.td_target(state.network, state.target_network, batch, False, RETURNS)
     gradient, _ = jax.grad(dqn.td_loss, has_aux=True)(state.network, batch, target, RETURNS)
     optimizer = optax.adam(0.1, eps=0.01 / 4)

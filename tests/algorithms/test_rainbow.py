@@ -255,7 +255,8 @@ def test_noise_acts_in_training_and_not_in_evaluation():
     assert not np.allclose(values(jax.random.PRNGKey(0)), values(jax.random.PRNGKey(1)))
     np.testing.assert_allclose(algorithm.action_values(state, obs, None)[0], forward(state.network, obs), atol=1e-5)
     keys = jax.random.split(jax.random.PRNGKey(2), 200)
-    actions = {int(algorithm.explore(state.network, obs, key, CLOCK)[0]) for key in keys}
+    explore = jax.jit(algorithm.explore)
+    actions = {int(explore(state.network, obs, key, CLOCK)[0]) for key in keys}
     assert len(actions) > 1
     assert int(algorithm.exploit(state.network, obs)[0]) == int(forward(state.network, obs).argmax())
     assert dqn.Config(noisy=True).epsilon(0.0) == 0.0
@@ -267,7 +268,7 @@ def test_an_update_draws_noise_for_the_network_the_target_and_the_choice():
     other = make(seed=2, noisy=True)[1].network
     state = state.__class__(**{**vars(state), "target_network": other})
     batch = random_batch()
-    _, metrics = algorithm.update(state, batch, CLOCK)
+    _, metrics = jax.jit(algorithm.update)(state, batch, CLOCK)
     key, chooser_key, target_key = jax.random.split(jax.random.fold_in(state.key, 0), 3)
     shown = lambda network, key, obs: forward(dqn.drawn(network, key), obs)  # noqa: E731
     best = shown(state.network, chooser_key, batch.next_obs).argmax(axis=1)

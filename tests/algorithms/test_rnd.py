@@ -54,12 +54,13 @@ def test_the_bonus_is_the_error_over_its_running_deviation():
     config = RndConfig(coefficient=0.5, learning_rate=0.01)
     algorithm = rnd.with_rnd(seeing(), leaves(rejeu.make_vector("Pendulum-v1").observation_space), config)
     state, all_errors, everything = algorithm.init(jax.random.PRNGKey(0)), [], np.zeros((0, 3))
+    update = jax.jit(algorithm.update)
     for _ in range(3):
         batch = transitions(rng)
         everything = np.concatenate([everything, batch.next_obs])
         expected, error = bonus(state, batch.next_obs, everything, all_errors)
         all_errors.append(error)
-        before, (state, metrics) = state, algorithm.update(state, batch, CLOCK)
+        before, (state, metrics) = state, update(state, batch, CLOCK)
         np.testing.assert_allclose(state.learner, batch.reward + 0.5 * expected, rtol=1e-4, atol=1e-5)
         np.testing.assert_allclose(metrics["rnd_loss"], error.mean(), rtol=1e-5)
         for old, new in zip(jax.tree.leaves(before.target), jax.tree.leaves(state.target), strict=True):
