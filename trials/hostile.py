@@ -34,7 +34,7 @@ import rejeu
 from rejeu.core import checkpoint
 from rejeu.sb3.common.vec_env import DummyVecEnv, VecNormalize
 from tests import hostile_files
-from tests.core.test_hostile_runs import files_of, make_run, replaced, resumed_from
+from tests.core.test_hostile_runs import files_of, make_run, replaced, trained_further
 from tests.environments import Counter
 from tests.golden import record_files
 from tests.sharing import shared_learners
@@ -178,7 +178,7 @@ def replaced_by(run: Any, folder: Path, whole: Path, path: Path) -> str:
     (folder / whole.name).unlink()
     path.rename(folder / whole.name)
     path.touch()
-    return resumed_from(run, folder)
+    return hostile_files.outcome_of(trained_further, run, folder)
 
 
 def peak_memory() -> int:
