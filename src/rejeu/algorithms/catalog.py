@@ -54,5 +54,5 @@ CATALOG = {
     ).items()
 }
 """Every algorithm by its name, in the order of ``rejeu list --algorithms``."""
-OFFLINE = next(name for name, one in CATALOG.items() if one.kind == "offline")
+OFFLINE = next(name for name, entry in CATALOG.items() if entry.kind == "offline")
 """The first that learns from recorded episodes: the default of ``rejeu train --offline``."""

@@ -137,7 +137,7 @@ OFF_POLICY: SearchSpace = {
     "policy_kwargs.net_arch": Choice(([64, 64], [256, 256], [400, 300])),
 }
 """Of every algorithm with a replay buffer."""
-OFFLINE: SearchSpace = {name: one for name, one in OFF_POLICY.items() if name != "learning_starts"}
+OFFLINE: SearchSpace = {name: values for name, values in OFF_POLICY.items() if name != "learning_starts"}
 """Of algorithms for recorded episodes; each adds how far it may go from the recorded actions."""
 HINDSIGHT: SearchSpace = {
     "replay_buffer_kwargs.n_sampled_goal": Integers(1, 5),
@@ -147,7 +147,7 @@ HINDSIGHT: SearchSpace = {
 ACTION_NOISE: SearchSpace = {"action_noise": Uniform(0.05, 1.0)}
 """Further ones of deterministic policies."""
 Q_LEARNING: SearchSpace = {
-    **{name: one for name, one in OFF_POLICY.items() if name != "tau"},
+    **{name: values for name, values in OFF_POLICY.items() if name != "tau"},
     "exploration_fraction": Uniform(0.02, 0.5),
     "exploration_final_eps": Uniform(0.0, 0.2),
     "target_update_interval": Choice((100, 1_000, 5_000, 10_000)),

@@ -90,8 +90,8 @@ def files(source: Exportable) -> tuple[tuple[bytes, ...], Run | None]:
     stem = source.stem
     if not stem.isprintable() or {*stem} & {*'"\\'}:
         raise ValueError(f"{stem + '.c'!r} cannot be included by a C program; leave out quotes and backslashes")
-    code, header = write(source.one, source.card, stem)
-    return (code, header), c_run(source.one, code, header, stem)
+    code, header = write(source.single, source.card, stem)
+    return (code, header), c_run(source.single, code, header, stem)
 
 
 def c_run(policy: Policy, source: bytes, header: bytes, stem: str, compiler: str | None = None) -> Run | None:

@@ -122,7 +122,7 @@ class Exportable(NamedTuple):
     """The source of the files of a format."""
 
     policy: Policy
-    one: Policy
+    single: Policy
     """The policy for one observation at a time."""
     card: JsonObject
     """About it."""

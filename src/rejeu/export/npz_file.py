@@ -81,4 +81,4 @@ def files(source: Exportable) -> tuple[tuple[bytes, ...], Run]:
     def call(inputs: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         return dict(zip(names, policy.program(1, [inputs[port.name] for port in ports]), strict=True))
 
-    return (file.getvalue(),), one_by_one(source.one, call)
+    return (file.getvalue(),), one_by_one(source.single, call)

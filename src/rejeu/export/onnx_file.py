@@ -198,4 +198,4 @@ def write(policy: Policy, card: JsonObject) -> bytes:
 def files(source: Exportable) -> tuple[tuple[bytes, ...], Run | None]:
     """Returns the model, and its run for one observation at a time."""
     content = write(source.policy, source.card)
-    return (content,), onnx_run(source.one, content if source.is_general else write(source.one, source.card))
+    return (content,), onnx_run(source.single, content if source.is_general else write(source.single, source.card))

@@ -58,5 +58,5 @@ def read(content: bytes) -> Callable[[dict[str, np.ndarray]], dict[str, Array]]:
 def files(source: Exportable) -> tuple[tuple[bytes, ...], Run]:
     """Returns the zip file, and its run for one observation at a time."""
     content = write(source.policy, source.card)
-    single = content if source.is_general else write(source.one, source.card)
-    return (content,), one_by_one(source.one, read(single))
+    single = content if source.is_general else write(source.single, source.card)
+    return (content,), one_by_one(source.single, read(single))

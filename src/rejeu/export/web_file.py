@@ -102,8 +102,8 @@ def write(script: str) -> bytes:
 
 def files(source: Exportable) -> tuple[tuple[bytes, ...], Run | None]:
     """Returns the page, and the run of its policy."""
-    code = script(source.one, environment(source.env_id, source.env_kwargs), source.card)
-    return (write(code),), node_run(source.one, code)
+    code = script(source.single, environment(source.env_id, source.env_kwargs), source.card)
+    return (write(code),), node_run(source.single, code)
 
 
 def node_run(policy: Policy, script: str) -> Run | None:

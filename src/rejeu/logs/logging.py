@@ -145,7 +145,7 @@ class CsvFile:
         columns = [*self._columns, *new]
         line = csv_lines([[row.get(name, "") for name in columns]])
         if new:
-            rows = [one + b"," * len(new) + b"\r\n" for one in read_log(self.path).splitlines()[1:]]
+            rows = [row + b"," * len(new) + b"\r\n" for row in read_log(self.path).splitlines()[1:]]
             atomic.write(self.path, b"".join([csv_lines([columns]), *rows, line]))
             self._columns = columns
         else:

@@ -261,8 +261,8 @@ class DeviceReplay:
         """Returns the positions of the rows whose goals become the new goals of ``rows``; see :class:`HerReplayBuffer`."""
         strategy = strategy or self.strategy
         if isinstance(strategy, MixedStrategies):
-            choose = lambda i, env, time, place, name: self.goal_positions(  # noqa: E731
-                ring, jax.random.fold_in(key, i), DeviceRows(env, time, place), name
+            choose = lambda i, env, time, position, name: self.goal_positions(  # noqa: E731
+                ring, jax.random.fold_in(key, i), DeviceRows(env, time, position), name
             )
             return jnp.asarray(strategy.joined(jnp, choose, *rows))
         newest, numbers = ring.head[rows.env], count()

@@ -188,12 +188,16 @@ MODULES: dict[str, dict[str, Any]] = {
     },
 }
 """Names by the module in which sb3-contrib has them."""
-named = {"CnnPolicy": CnnPolicy, "MlpPolicy": MlpPolicy, "MultiInputPolicy": MultiInputPolicy}
-for kind in (QRDQN, TQC, CrossQ, MaskablePPO, TRPO):
-    parts = {f"{kind.__name__}Policy": SACPolicy, "Actor": Actor, "Critic": ContinuousCritic}
+policies = {"CnnPolicy": CnnPolicy, "MlpPolicy": MlpPolicy, "MultiInputPolicy": MultiInputPolicy}
+for algorithm in (QRDQN, TQC, CrossQ, MaskablePPO, TRPO):
+    parts = {f"{algorithm.__name__}Policy": SACPolicy, "Actor": Actor, "Critic": ContinuousCritic}
     parts |= {"QRDQNPolicy": DQNPolicy, "QuantileNetwork": QNetwork, "CrossQCritic": ContinuousCritic}
-    folder = CATALOG[kind.__name__].original.rpartition(".")[2]
-    MODULES[folder] = {kind.__name__: kind, **named, **(parts if CATALOG[kind.__name__].policy else {})}
+    folder = CATALOG[algorithm.__name__].original.rpartition(".")[2]
+    MODULES[folder] = {
+        algorithm.__name__: algorithm,
+        **policies,
+        **(parts if CATALOG[algorithm.__name__].policy else {}),
+    }
 linear = dict.fromkeys(("LinearPolicy", "ARSLinearPolicy"), "LinearPolicy")
 MODULES["ars"] = {"ARS": ARS, **linear, **dict.fromkeys(("MlpPolicy", "ARSPolicy"), "MlpPolicy")}
 lstm = {"CnnLstmPolicy": CnnPolicy, "MlpLstmPolicy": MlpPolicy, "MultiInputLstmPolicy": MultiInputPolicy}

@@ -214,22 +214,22 @@ def start_clock(run: Run) -> None:
     run.began = time.perf_counter() - run.seconds["total"]
 
 
-def add_time(run: Run, part: str, since: float) -> None:
-    """Adds the wall time ``since`` a value of ``time.perf_counter`` to a part of ``run.seconds``, and updates the total."""
+def add_time(run: Run, phase: str, since: float) -> None:
+    """Adds the wall time ``since`` a value of ``time.perf_counter`` to a phase of ``run.seconds``, and updates the total."""
     now, seconds = time.perf_counter(), run.seconds
-    seconds[part] += now - since
+    seconds[phase] += now - since
     seconds["total"] = now - run.began
 
 
-def timed(part: str) -> Callable[[F], F]:
-    """Returns a decorator of functions ``(run, ...)`` that adds the time of each call to a part of ``run.seconds``."""
+def timed(phase: str) -> Callable[[F], F]:
+    """Returns a decorator of functions ``(run, ...)`` that adds the time of each call to a phase of ``run.seconds``."""
 
     def decorate(function: F) -> F:
         @wraps(function)
         def call(run: Run, *arguments: object) -> Any:
             began = time.perf_counter()
             result = function(run, *arguments)
-            add_time(run, part, began)
+            add_time(run, phase, began)
             return result
 
         return call  # type: ignore[return-value]

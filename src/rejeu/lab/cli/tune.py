@@ -31,24 +31,24 @@ def run_tune(arguments: Tune) -> tuple[int, JsonObject]:
 
     It is 2 if no trial is complete or a training of the comparison failed.
     """
-    made = environment.from_arguments(arguments.env, arguments)
-    made.vector(1, arguments.backend or "auto", arguments.seed).close()  # an error before there is a folder
+    trial_env = environment.from_arguments(arguments.env, arguments)
+    trial_env.vector(1, arguments.backend or "auto", arguments.seed).close()  # an error before there is a folder
     name = None if arguments.algo is None else find_agent(arguments.algo).algorithm.Config.name
-    preset = find_preset(made.env_id, name, arguments.preset)
+    preset = find_preset(trial_env.env_id, name, arguments.preset)
     algorithm = name if preset is None else preset.algorithm
     plan = plans.make(
-        made.env_id,
+        trial_env.env_id,
         algorithm,
-        env_argument=made.run.env,
-        env_kwargs=made.run.env_kwargs,
-        wrappers=made.run.wrappers,
+        env_argument=trial_env.run.env,
+        env_kwargs=trial_env.run.env_kwargs,
+        wrappers=trial_env.run.wrappers,
         preset=preset,
         fixed=merged(arguments.hyperparameters, {}),
         search=read_search(arguments.search, algorithm),
         n_envs=arguments.envs,
         **{name: getattr(arguments, name) for name in OF_THE_PLAN},
     )
-    return complete(tuning.open_study(plan, arguments.out), made, arguments.workers)
+    return complete(tuning.open_study(plan, arguments.out), trial_env, arguments.workers)
 
 
 def resume_study(arguments: Resume) -> tuple[int, JsonObject]:
@@ -59,10 +59,10 @@ def resume_study(arguments: Resume) -> tuple[int, JsonObject]:
         CheckpointError: if the command line must name it again.
     """
     study = studies.open_study(StudyFolder(arguments.run))
-    made = environment.from_run(study.plan.run, arguments.run, arguments)
-    if made.env_id != study.plan.default.env_id:
-        raise ValueError(f"{arguments.run} is a study of {study.plan.default.env_id}, not of {made.env_id}")
-    return complete(study, made, arguments.workers)
+    trial_env = environment.from_run(study.plan.run, arguments.run, arguments)
+    if trial_env.env_id != study.plan.default.env_id:
+        raise ValueError(f"{arguments.run} is a study of {study.plan.default.env_id}, not of {trial_env.env_id}")
+    return complete(study, trial_env, arguments.workers)
 
 
 def read_search(assignments: Iterable[str], algorithm: str | None) -> dict[str, Dimension]:
@@ -71,14 +71,16 @@ def read_search(assignments: Iterable[str], algorithm: str | None) -> dict[str, 
     return dict(space.parse(assignment, declared) for assignment in assignments)
 
 
-def complete(study: Study, made: Environment, workers: int | None) -> tuple[int, JsonObject]:
+def complete(study: Study, trial_env: Environment, workers: int | None) -> tuple[int, JsonObject]:
     """Runs a study to its end; returns the exit status and the result."""
-    echo("\n".join(header(study, made)))
+    echo("\n".join(header(study, trial_env)))
     with Interrupt() as stop:
-        result = tuning.run(study, made.run, workers, stop, echo)
+        result = tuning.run(study, trial_env.run, workers, stop, echo)
     echo()
     if stop.signal is not None:
-        echo(f"stopped by {NAMES[stop.signal]}; rejeu resume {quoted(study.folder.path)}{made.run.again()} continues")
+        echo(
+            f"stopped by {NAMES[stop.signal]}; rejeu resume {quoted(study.folder.path)}{trial_env.run.again()} continues"
+        )
     echo(str(result))
     if stop.signal is not None:
         return 128 + stop.signal, result.to_dict()
@@ -87,7 +89,7 @@ def complete(study: Study, made: Environment, workers: int | None) -> tuple[int,
     return (0 if result.complete and result.best is not None else 2), result.to_dict()
 
 
-def header(study: Study, made: Environment) -> list[str]:
+def header(study: Study, trial_env: Environment) -> list[str]:
     """Returns the first lines of a study."""
     plan, default = study.plan, study.plan.default
     n_ended = sum(trial.state.is_finished() for trial in study.trials())
@@ -95,7 +97,7 @@ def header(study: Study, made: Environment) -> list[str]:
     evaluations = f"evaluated on {counted(default.evaluate_episodes, 'episode')} every {default.evaluate_every:,} steps"
     ended = f"; {n_ended} have ended" if n_ended else ""
     return [
-        f"environment   {made}, {default.n_envs} at once",
+        f"environment   {trial_env}, {default.n_envs} at once",
         f"algorithm     {default.algorithm}, seed {plan.seed}, pruner {plan.pruner}",
         f"trials        {plan.trials} of {default.total_steps:,} steps{seeds}, {evaluations}{ended}",
         *(f"{'search' if i == 0 else '':<14}{name}: {text}" for i, (name, text) in enumerate(plan.space.items())),

@@ -196,9 +196,9 @@ def choose_space(
 
 def is_set(fixed: Mapping[str, object], name: str) -> bool:
     """Returns whether the user set the hyperparameter of a dotted name."""
-    head, _, rest = name.partition(".")
+    head, _, inner_name = name.partition(".")
     inner = fixed.get(head)
-    return head in fixed and (not rest or not isinstance(inner, Mapping) or is_set(inner, rest))
+    return head in fixed and (not inner_name or not isinstance(inner, Mapping) or is_set(inner, inner_name))
 
 
 def read(path: Path) -> StudyPlan:
@@ -222,9 +222,9 @@ def check_ends(config_class: type, values: Mapping[str, object], space: SearchSp
             validation.build(config_class, spaces.applied(values, {name: value}))
 
 
-def difference(plan: StudyPlan, other: StudyPlan) -> str:
+def difference(plan: StudyPlan, new_plan: StudyPlan) -> str:
     """Returns the first setting in which two plans differ and which a study cannot change, as text; empty if none does."""
-    before, after = ({**vars(study.default), **vars(study), "default": None} for study in (plan, other))
+    before, after = ({**vars(study.default), **vars(study), "default": None} for study in (plan, new_plan))
     for name, value in before.items():
         if name not in ("trials", "final_seeds", "checkpoint_minutes") and value != after[name]:
             option = name.removeprefix("total_")  # --steps

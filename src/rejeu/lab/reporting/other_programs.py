@@ -132,17 +132,17 @@ def read_tensorboard(folder: Path) -> RunSummary:
         import tensorboard.util.tensor_util  # noqa: F401 - where it is used it may not fail
     notes = []
     values: dict[str, dict[int, tuple[float, float]]] = {}
-    left = MAX_SCALAR_BYTES
+    bytes_left = MAX_SCALAR_BYTES
     for path in files(folder, EVENTS):
         with path.open("rb") as file:
             try:
                 for record in records(file):
-                    if (left := left - len(record)) < 0:
+                    if (bytes_left := bytes_left - len(record)) < 0:
                         break
                     take_scalars(record, values)
             except Exception as error:  # of protobuf or of TensorBoard, for damaged records
                 notes.append(f"{path.name} is damaged or incomplete: {shown(error)}")
-            if left < 0:
+            if bytes_left < 0:
                 notes.append(f"only the first {MAX_SCALAR_BYTES >> 20} MiB of scalars were read")
                 break
     metrics = ordered(table_of(values)) if values else EMPTY

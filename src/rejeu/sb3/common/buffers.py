@@ -140,8 +140,8 @@ class ReplayBuffer(BaseBuffer):
         if self.seen[0] == (now := (id(ring), ring.head.tobytes())):
             return self.seen[1][name]
         times = [np.arange(ring.oldest()[env], ring.head[env]) for env in range(ring.n_envs)]
-        kept = [t[ring.kind[ring.index(np.full(len(t), env), t)] != LAST][-n:] for env, t in enumerate(times)]
-        time = np.stack(kept, axis=1).ravel() if n else np.zeros(0, int)
+        stored_times = [t[ring.kind[ring.index(np.full(len(t), env), t)] != LAST][-n:] for env, t in enumerate(times)]
+        time = np.stack(stored_times, axis=1).ravel() if n else np.zeros(0, int)
         envs = np.tile(np.arange(ring.n_envs), n)
         following = ring.index(envs, time + 1)
         step, obs = ring.read(ring.index(envs, time))
@@ -178,13 +178,13 @@ class ReplayBuffer(BaseBuffer):
         """
         timeouts = np.array([bool(info.get(TIME_LIMIT_TRUNCATED, False)) for info in infos])
         terminated, reward = np.asarray(done, bool) & ~timeouts, np.asarray(reward, np.float32)
-        ring, kind = (
+        ring, buffer_class = (
             self.core.ring,
             type(self.core),
         )  # whose methods take what is given, also behind those of VecNormalize
-        kind.begin(self.core, obs)
+        buffer_class.begin(self.core, obs)
         actions = np.asarray(action, ring.action.dtype).reshape(ring.n_envs, *ring.action.shape[1:])
-        kind.add(self.core, actions, reward, terminated, next_obs)
+        buffer_class.add(self.core, actions, reward, terminated, next_obs)
         if self.own is None:
             self.agent.abandon_episodes()
 

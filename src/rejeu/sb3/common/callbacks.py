@@ -88,10 +88,10 @@ class CheckpointCallback(BaseCallback):
                 self._write(statistics.save, "vecnormalize_")
         return True
 
-    def _write(self, save: Callable[[Path], object], kind: str) -> None:
+    def _write(self, save: Callable[[Path], object], prefix: str) -> None:
         """Saves one file, or warns."""
-        suffix = ".pkl" if kind else ".zip"
-        path = self.save_path / f"{self.name_prefix}_{kind}{self.num_timesteps}_steps{suffix}"
+        suffix = ".pkl" if prefix else ".zip"
+        path = self.save_path / f"{self.name_prefix}_{prefix}{self.num_timesteps}_steps{suffix}"
         is_saved = self.model.failed_writes.attempt(str(path), lambda: save(path))
         if is_saved and self.verbose >= 2:
             print(f"Saved {path}")

@@ -28,7 +28,7 @@ def check_env(env: gym.Env, warn: bool = True, skip_render_check: bool = True) -
             actions have no bounds.
     """
     try:
-        faults = [one.text for one in checker.quick_findings(env) if one.level == "error"]
+        faults = [finding.text for finding in checker.quick_findings(env) if finding.level == "error"]
     except TypeError as error:
         faults = [str(error)]
     actions = env.action_space if not faults and isinstance(env.action_space, spaces.Box) else None
@@ -37,7 +37,7 @@ def check_env(env: gym.Env, warn: bool = True, skip_render_check: bool = True) -
     if not faults:
         observations = env.reset()[0], env.step(env.action_space.sample())[0]
         bounds_faults = [validation.bounds_fault(env.observation_space, obs) for obs in observations]
-        faults = [one[1] for one in bounds_faults if one is not None]
+        faults = [fault[1] for fault in bounds_faults if fault is not None]
     if faults:
         raise AssertionError("\n".join(faults))
     if warn:

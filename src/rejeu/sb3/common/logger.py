@@ -243,9 +243,11 @@ def _add(summary: Any, key: str, value: Any) -> None:
 
         names = [api_pb2.MetricInfo(name=api_pb2.MetricName(tag=name)) for name in value.metric_dict]
         start = plugin_data_pb2.SessionStartInfo(start_time_secs=time.time())
-        for name, one in value.hparam_dict.items():
-            kind = "bool" if isinstance(one, bool) else "number" if isinstance(one, int | float) else "string"
-            setattr(start.hparams[name], f"{kind}_value", str(one) if kind == "string" else one)
+        for name, setting in value.hparam_dict.items():
+            type_name = (
+                "bool" if isinstance(setting, bool) else "number" if isinstance(setting, int | float) else "string"
+            )
+            setattr(start.hparams[name], f"{type_name}_value", str(setting) if type_name == "string" else setting)
         for tag, content in (
             (metadata.EXPERIMENT_TAG, {"experiment": api_pb2.Experiment(metric_infos=names)}),
             (metadata.SESSION_START_INFO_TAG, {"session_start_info": start}),

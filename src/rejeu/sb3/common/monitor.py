@@ -254,14 +254,14 @@ def load_results(path: str | Path) -> np.recarray:
             try:
                 start = float(json.loads(file.readline(MAX_LINE).removeprefix("#"))["t_start"])
                 reader = csv.DictReader(lines_of(file))
-                found = [{**row, "t": float(row["t"]) + start} for row in reader]
+                episodes = [{**row, "t": float(row["t"]) + start} for row in reader]
             except (ValueError, KeyError, TypeError, csv.Error) as error:
                 raise LoadMonitorResultsError(f"{name} was not written by Monitor: {error}") from None
         if columns not in (None, reader.fieldnames):
             raise LoadMonitorResultsError(f"{name} has the columns {reader.fieldnames}, other files have {columns}")
         columns = reader.fieldnames
         starts.append(start)
-        rows += found
+        rows += episodes
     assert columns is not None
     rows.sort(key=lambda row: row["t"])
     arrays = {key: _column([row[key] for row in rows]) for key in columns}

@@ -232,8 +232,8 @@ def register_again(name: object) -> None:
             _register(name, extractor, settings, normalize_images)
 
 
-def subclasses(kind: type[Any]) -> Iterator[type[Any]]:
+def subclasses(base: type[Any]) -> Iterator[type[Any]]:
     """Yields the subclasses of a class, and theirs."""
-    for one in kind.__subclasses__():
-        yield one
-        yield from subclasses(one)
+    for subclass in base.__subclasses__():
+        yield subclass
+        yield from subclasses(subclass)

@@ -224,10 +224,10 @@ class Tensor(np.ndarray):
     ) -> Any:
         """Returns the result of a function of PyTorch's, which calls this where an argument is of this class."""
         torch = sys.modules["torch"]
-        given = jax.tree.map(
+        in_torch = jax.tree.map(
             lambda x: torch.as_tensor(np.asarray(x)) if isinstance(x, cls) else x, (args, kwargs or {})
         )
-        return function(*given[0], **given[1])
+        return function(*in_torch[0], **in_torch[1])
 
 
 def explained_variance(y_pred: np.ndarray, y_true: np.ndarray) -> float:
@@ -266,9 +266,9 @@ def update_learning_rate(optimizer: Any, learning_rate: float) -> None:
 
 def check_for_correct_spaces(env: Any, observation_space: gym.Space, action_space: gym.Space) -> None:
     """Raises ``ValueError`` if the spaces of an environment are others."""
-    for kind, own in (("Observation", observation_space), ("Action", action_space)):
-        if own != (other := getattr(env, f"{kind.lower()}_space")):
-            raise ValueError(f"{kind} spaces do not match: {own} != {other}")
+    for name, space in (("Observation", observation_space), ("Action", action_space)):
+        if space != (env_space := getattr(env, f"{name.lower()}_space")):
+            raise ValueError(f"{name} spaces do not match: {space} != {env_space}")
 
 
 def is_vectorized_observation(observation: Observation, observation_space: gym.Space) -> bool:

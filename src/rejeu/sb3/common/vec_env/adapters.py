@@ -207,8 +207,8 @@ class VecEnvAdapter(VectorEnv):
         """Returns a method of the first environment as a function of batches, None if there is none."""
         if not self.venv.has_attr(name):
             return None
-        one = lambda achieved, desired, info: self.venv.env_method(name, achieved, desired, info, indices=[0])[0]  # noqa: E731
-        return goals_module.over_batches(one, dtype)
+        compute = lambda achieved, desired, info: self.venv.env_method(name, achieved, desired, info, indices=[0])[0]  # noqa: E731
+        return goals_module.over_batches(compute, dtype)
 
     def original_obs(self, final: bool) -> Observation:
         """Returns the observations of the last step as they were before ``VecNormalize``, the outermost wrapper.
@@ -269,9 +269,9 @@ class AutoResetView(SingleEnvs):
         step = self.vector.step(self._actions)
         dones = step.terminated | step.truncated
         infos: list[Info] = []
-        given = self.vector.infos()
+        env_infos = self.vector.infos()
         for i in range(self.num_envs):
-            info = dict(given[i])
+            info = dict(env_infos[i])
             info[TIME_LIMIT_TRUNCATED] = bool(step.truncated[i] and not step.terminated[i])
             success = self.vector.success(step, i)
             if not math.isnan(success):

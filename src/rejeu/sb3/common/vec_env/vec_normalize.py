@@ -235,7 +235,7 @@ class VecNormalize(VecEnvWrapper):
 
     def statistics(self) -> dict[str, np.ndarray]:
         """Returns the statistics as arrays by name."""
-        return {f"{name}.{part}": a for name, one in self._moments().items() for part, a in _arrays(one).items()}
+        return {f"{name}.{field}": a for name, m in self._moments().items() for field, a in _arrays(m).items()}
 
     def put_statistics(self, arrays: Mapping[str, np.ndarray], path: str | Path = "the statistics") -> None:
         """Restores what :meth:`statistics` returned; ``path`` names the source in messages.
@@ -254,7 +254,7 @@ class VecNormalize(VecEnvWrapper):
     def _moments(self) -> dict[str, RunningMeanStd]:
         """Returns all moments by name."""
         if isinstance(self.obs_rms, dict):
-            return {"returns": self.ret_rms} | {f"obs.{i}": one for i, one in enumerate(self.obs_rms.values())}
+            return {"returns": self.ret_rms} | {f"obs.{i}": moments for i, moments in enumerate(self.obs_rms.values())}
         return {"returns": self.ret_rms} | ({} if self.obs_rms is None else {"obs": self.obs_rms})
 
     def save(self, save_path: str | Path) -> Path:
@@ -304,10 +304,10 @@ def of_original(path: Path, venv: VecEnv) -> VecNormalize:
         settings = {key: state[key] for key in Settings.__struct_fields__}
         new, arrays = VecNormalize(venv, **settings, norm_obs_keys=state.get("norm_obs_keys")), {}
         for name in new.statistics():
-            kind, *index, part = name.split(".")
-            moments = state["ret_rms" if kind == "returns" else "obs_rms"]
+            moments_name, *index, field = name.split(".")
+            moments = state["ret_rms" if moments_name == "returns" else "obs_rms"]
             moments = moments[[*new.obs_rms][int(index[0])]] if index else moments
-            arrays[name] = np.asarray(array_of(moments.state[part]), np.float64)
+            arrays[name] = np.asarray(array_of(moments.state[field]), np.float64)
         new.put_statistics(arrays, path)
     return new
 
