@@ -1,15 +1,13 @@
 """The log of the actions of environments that do not expose their state, but are deterministic given seed and actions.
 
 They are restored by replaying the log of all actions and resets since their creation. A log is a sequence of operations:
-a step of all environments, a step of some, a reset of all, or a reset of some. An operation is stored as one byte for its
-kind, one bit per environment if it concerns only some, and the actions. Blocks of about a megabyte are compressed.
+a step of all environments, a step of some, a reset of all, or a reset of some. Stored are one byte for the kind of each, one
+bit per environment if it concerns only some, and the actions.
 """
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Iterator
-from itertools import islice
 from typing import NamedTuple
 
 import gymnasium as gym
@@ -20,8 +18,6 @@ from rejeu.core.types import JsonObject
 from rejeu.core.validation import whole
 
 STEP, STEP_SOME, RESET, RESET_SOME = range(4)
-BLOCK = 2**20
-"""Size of a block before compression, in bytes."""
 MOST_STEPS = 500_000
 """Environment steps after which a log is full. Replaying takes 10 to 60 microseconds per step."""
 MOST_IMAGE_STEPS = 100_000
@@ -52,13 +48,15 @@ class ActionLog:
         """Whether all operations were recorded."""
         self.n_steps = 0
         """Number of steps, summed over the environments."""
-        self.n_operations = 0
         example = action_scaler(action_space)(random_action(action_space, 1, np.random.default_rng(0)))
         self._space, self._dtype, self._shape = action_space, example.dtype, example.shape[1:]
-        self._row_bytes = example.nbytes
-        self._most_steps = min(most_steps, MOST_BYTES // max(self._row_bytes, 1))
-        self._blocks: list[np.ndarray] = []
-        self._open = bytearray()
+        self._most_steps = min(most_steps, MOST_BYTES // max(example.nbytes, 1))
+        self._codes, self._flags, self._actions = bytearray(), bytearray(), bytearray()
+
+    @property
+    def n_operations(self) -> int:
+        """Number of steps and resets."""
+        return len(self._codes)
 
     @property
     def most_operations(self) -> int:
@@ -87,24 +85,22 @@ class ActionLog:
         """Records a reset of all environments, or of those in ``indices``."""
         self._add(RESET if indices is None else RESET_SOME, indices, b"")
 
-    def _add(self, operation: int, indices: np.ndarray | None, action: bytes) -> None:
+    def _add(self, code: int, indices: np.ndarray | None, action: bytes) -> None:
         self.is_complete &= self.is_on
         if not self.is_complete:
             return
-        self.n_operations += 1
-        self._open.append(operation)
+        self._codes.append(code)
         if indices is not None:
             flags = np.zeros(self.n_envs, bool)
             flags[indices] = True
-            self._open += np.packbits(flags).tobytes()
-        self._open += action
-        if len(self._open) >= BLOCK:
-            self._blocks.append(_compressed(self._open))
-            self._open = bytearray()
+            self._flags += np.packbits(flags).tobytes()
+        self._actions += action
 
-    def to_plain(self) -> JsonObject:
+    def to_plain(self) -> dict[str, np.ndarray]:
         """Returns the log as plain data (see :mod:`rejeu.core.records`)."""
-        return {"n_operations": self.n_operations, "blocks": [*self._blocks, _compressed(self._open)]}
+        actions = np.frombuffer(bytes(self._actions), self._dtype).reshape(-1, *self._shape)
+        codes, flags = (np.frombuffer(bytes(content), np.uint8) for content in (self._codes, self._flags))
+        return {"codes": codes, "flags": flags.reshape(-1, (self.n_envs + 7) // 8), "actions": actions}
 
     def operations(self, saved: JsonObject) -> Iterator[LoggedOperation]:
         """Yields the operations of a log that :meth:`to_plain` returned, oldest first.
@@ -112,27 +108,30 @@ class ActionLog:
         Raises:
             ValueError: if the log is corrupted, or belongs to other environments.
         """
-        n_flags = (self.n_envs + 7) // 8
-        longest = BLOCK + 1 + n_flags + self.n_envs * self._row_bytes
-        for block in saved["blocks"]:
-            data, at = _expanded(block, longest), 0
-            while at < len(data):
-                operation = data[at]
-                at += 1
-                if operation > RESET_SOME:
-                    raise ValueError(f"{operation} is no kind of operation")
-                indices = None
-                if operation in (STEP_SOME, RESET_SOME):
-                    flags = np.unpackbits(_part(data, at, n_flags).view(np.uint8), count=self.n_envs)
-                    indices = np.flatnonzero(flags).astype(np.int32)
-                    at += n_flags
-                action = None
-                if operation in (STEP, STEP_SOME):
-                    rows = self.n_envs if indices is None else len(indices)
-                    action = _part(data, at, rows * self._row_bytes).view(self._dtype).reshape(rows, *self._shape)
-                    check_env_actions(self._space, action, "the record of actions")
-                    at += rows * self._row_bytes
-                yield LoggedOperation(indices, action)
+        for name, empty in ActionLog(self.n_envs, self._space).to_plain().items():
+            array = np.asarray(saved[name])
+            if array.dtype != empty.dtype or array.ndim != empty.ndim or array.shape[1:] != empty.shape[1:]:
+                raise ValueError(
+                    f"the {name} in the record of actions are not those of {self.n_envs} such environments"
+                )
+        codes, flags, actions = saved["codes"], iter(saved["flags"]), saved["actions"]
+        whole("the number of operations in the record of actions", len(codes), least=0, most=self.most_operations)
+        check_env_actions(self._space, actions, "the record of actions")
+        is_some, at = np.isin(codes, (STEP_SOME, RESET_SOME)), 0
+        if is_some.sum() != len(saved["flags"]) or codes.max(initial=0) > RESET_SOME:
+            raise ValueError("the record of actions holds an operation that is none, or says not whom one concerns")
+        for code, concerns_some in zip(codes.tolist(), is_some.tolist(), strict=True):
+            indices = action = None
+            if concerns_some:
+                indices = np.flatnonzero(np.unpackbits(next(flags), count=self.n_envs)).astype(np.int32)
+            if code in (STEP, STEP_SOME):
+                n_rows = self.n_envs if indices is None else len(indices)
+                action, at = actions[at : at + n_rows], at + n_rows
+                if at > len(actions):
+                    break
+            yield LoggedOperation(indices, action)
+        if at != len(actions):
+            raise ValueError(f"the record of actions has {len(actions)} rows of actions, expected {at}")
 
 
 def replay(log: ActionLog, saved: JsonObject, title: str) -> Iterator[LoggedOperation]:
@@ -144,35 +143,7 @@ def replay(log: ActionLog, saved: JsonObject, title: str) -> Iterator[LoggedOper
     from rich.console import Console  # not loaded with every model
     from rich.progress import track
 
-    n = whole("n_operations", saved["n_operations"], least=0, most=log.most_operations)
-    console = Console(stderr=True)
+    n, console = np.size(saved["codes"]), Console(stderr=True)
     hidden = n < MANY_OPERATIONS or not (console.is_terminal or console.is_jupyter)
-    operations = log.operations(saved)
     text = f"Replaying {title}"
-    yield from islice(track(operations, text, total=n, console=console, transient=True, disable=hidden), n)
-    if log.n_operations != n or next(operations, None) is not None:
-        raise ValueError(f"the record of actions does not hold the {n} operations that it should")
-
-
-def _compressed(data: bytearray) -> np.ndarray:
-    return np.frombuffer(zlib.compress(bytes(data), 1), np.uint8)
-
-
-def _expanded(block: object, longest: int) -> bytes:
-    """Returns the decompressed bytes of a block, at most ``longest``."""
-    if not isinstance(block, np.ndarray) or block.dtype != np.uint8 or block.ndim != 1:
-        raise ValueError("a block of the record of actions is no array of bytes")
-    reader = zlib.decompressobj()
-    try:
-        data = reader.decompress(block.tobytes(), longest)
-    except zlib.error as error:
-        raise ValueError(f"a block of the record of actions is damaged: {error}") from None
-    if not reader.eof:
-        raise ValueError("a block of the record of actions is too long or cut short")
-    return data
-
-
-def _part(data: bytes, at: int, n: int) -> np.ndarray:
-    if at + n > len(data):
-        raise ValueError("the record of actions is cut short")
-    return np.frombuffer(data, np.uint8, n, at).copy()
+    yield from track(log.operations(saved), text, total=n, console=console, transient=True, disable=hidden)

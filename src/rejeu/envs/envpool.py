@@ -117,7 +117,9 @@ class EnvPool(VectorEnv):
         return {"seed": seed, **self._log.to_plain()}
 
     def restore(self, saved: object, obs: Observation) -> list[int]:
-        if not isinstance(saved, dict) or {*saved} != {"seed", "n_operations", "blocks"}:
+        if isinstance(saved, dict) and "blocks" in saved:
+            raise DivergedError(f"the actions in {self.env_id} were recorded before version 0.1, in another form")
+        if not isinstance(saved, dict) or {*saved} != {"seed", "codes", "flags", "actions"}:
             raise ValueError("the record of actions is not one of EnvPool")
         self._pool.close()
         self._pool, self._log = self._make(_saved_seed(saved["seed"], self.n_envs)), self._new_log(is_on=True)
