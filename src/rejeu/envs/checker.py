@@ -8,6 +8,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from itertools import islice
 from typing import Any, Literal, NamedTuple
 
 import gymnasium as gym
@@ -73,6 +74,15 @@ class Finding(NamedTuple):
     """The received value, the expected one, and the fix."""
 
 
+class Problems(dict[str, Finding]):
+    """The problems found so far, the first of each key. Mutable."""
+
+    def add(self, key: str, text: str | None, level: Level = "error", method: str = "") -> None:
+        """Adds a problem, unless the text is None or there is one of this key; ``method`` returned what the text names."""
+        if text is not None:
+            self.setdefault(key, Finding(level, f"{method} returned {text}" if method else text))
+
+
 class SeenStep(NamedTuple):
     """One step, with copies of the returned values."""
 
@@ -106,15 +116,17 @@ def check_env(env: gym.Env | FunctionalEnv, warn: bool = True, skip_render_check
 
     >>> check_env(gym.make("Pendulum-v1"), warn=False)
     """
-    problems = findings(env, skip_render_check)
-    if warn:
-        for finding in problems:
-            if finding.level == "warning":
-                warnings.warn(finding.text, UserWarning, stacklevel=2)
-    errors = [finding.text for finding in problems if finding.level == "error"]
-    if errors:
+    if errors := errors_of(findings(env, skip_render_check), warn):
         name = type(env).__name__ if isinstance(env, FunctionalEnv) else validation.id_of(env)
         raise BadEnvironmentError(f"{name}: " + "\n".join(errors))
+
+
+def errors_of(problems: Sequence[Finding], warn: bool = True) -> list[str]:
+    """Returns the texts of the errors; warns of the others if ``warn``."""
+    for finding in problems if warn else ():
+        if finding.level == "warning":
+            warnings.warn(finding.text, UserWarning, stacklevel=3)
+    return [finding.text for finding in problems if finding.level == "error"]
 
 
 def findings(env: gym.Env | FunctionalEnv, skip_render_check: bool = True) -> list[Finding]:
@@ -132,11 +144,9 @@ def findings(env: gym.Env | FunctionalEnv, skip_render_check: bool = True) -> li
         except BadEnvironmentError as error:  # of what it traces
             return [Finding("error", str(error))]
     problems = _played(env, Effort(seconds=MOST_SECONDS))
-    if all(finding.level == "warning" for finding in problems.values()):
-        for text in _gymnasium_messages(env, skip_render_check):
-            problems[text] = Finding("warning", text)
-    for text in (*advice_on_observations(env.observation_space), *advice_on_actions(env.action_space)):
-        problems[text] = Finding("warning", text)
+    messages = [] if errors_of([*problems.values()], warn=False) else _gymnasium_messages(env, skip_render_check)
+    for text in (*messages, *advice_on_observations(env.observation_space), *advice_on_actions(env.action_space)):
+        problems.add(text, text, "warning")
     return [*problems.values()]
 
 
@@ -146,10 +156,11 @@ def quick_findings(env: gym.Env, keeps_infos: bool = False) -> list[Finding]:
     return [finding for key, finding in problems.items() if finding.level == "error" or key == "endless"]
 
 
-def _played(env: gym.Env, effort: Effort) -> dict[str, Finding]:
+def _played(env: gym.Env, effort: Effort) -> Problems:
     """Returns the problems that random steps show, by kind."""
     if (fault := validation.environment_fault(env)) is not None:
         raise TypeError(fault)
+    problems = Problems()
     try:
         is_nested = isinstance(env.observation_space, spaces.Dict | spaces.Tuple)
         check_policy("MultiInputPolicy" if is_nested else "MlpPolicy", env.observation_space)
@@ -159,15 +170,16 @@ def _played(env: gym.Env, effort: Effort) -> dict[str, Finding]:
         ):  # SAC takes whole numbers too
             check_action(env.action_space, "every algorithm")
     except (TypeError, ValueError) as error:
-        return {"space": Finding("error", str(error))}
-    problems: dict[str, Finding] = {}
+        problems.add("space", str(error))
+        return problems
     steps = _play(env, problems, effort)
     if steps and isinstance(env.observation_space, spaces.Dict) and "desired_goal" in env.observation_space.spaces:
-        problems |= {finding.text: finding for finding in goal_findings(env, steps, effort.keeps_infos)}
+        for level, text in goal_problems(env, steps, effort.keeps_infos):
+            problems.add(text, text, level)
     return problems
 
 
-def _play(env: gym.Env, problems: dict[str, Finding], effort: Effort) -> list[SeenStep] | None:
+def _play(env: gym.Env, problems: Problems, effort: Effort) -> list[SeenStep] | None:
     """Takes random steps and records each kind of problem once. Returns the steps, None if they had to stop."""
     space = env.observation_space
     env.action_space.seed(SEED)
@@ -175,7 +187,7 @@ def _play(env: gym.Env, problems: dict[str, Finding], effort: Effort) -> list[Se
         for seed in (SEEDS_END - 1, SEED):  # the largest that a run may choose is taken too
             validation.called_reset(env, seed)
     except BadEnvironmentError as error:
-        problems["seed"] = Finding("error", str(error))
+        problems.add("seed", str(error))
         env = env.unwrapped if validation.arguments_fault(env) else env  # wrappers pass a seed on
     if (begun := _reset(env, problems)) is None:
         with suppress(Exception):  # whatever step raises after a wrong reset
@@ -202,9 +214,8 @@ def _play(env: gym.Env, problems: dict[str, Finding], effort: Effort) -> list[Se
             return None
         obs, reward, terminated, truncated, info = validation.convert_step(result)
         obs_copy = jax.tree.map(np.array, plain(space, obs))
-        is_next = effort.is_patient and length > 0
-        if is_next and (lost := validation.lost_change(space, steps[-1].obs, obs_copy)) is not None:
-            problems.setdefault("resolution", Finding("warning", lost))
+        if effort.is_patient and length > 0:
+            problems.add("resolution", validation.lost_change(space, steps[-1].obs, obs_copy), "warning")
         steps.append(SeenStep(obs_copy, reward, terminated, truncated, copy.deepcopy(info), {}))
         seeks_end = seeks_end and not terminated and success_of(info) != 1.0 and len(steps) < QUICK.most_steps
         for name, function in functions.items() if len(steps) <= MOST_GOALS else ():
@@ -224,22 +235,21 @@ def _play(env: gym.Env, problems: dict[str, Finding], effort: Effort) -> list[Se
             "that is the limit and not the task, return terminated=False, truncated=True there, or what comes after is "
             "learned to have no value"
         )
-        problems["limit"] = Finding("warning", text)
+        problems.add("limit", text, "warning")
     if len(steps) >= effort.most_steps and not lengths and limit is None:
         text = (
             f"no episode ended in {effort.most_steps:,} steps; it declares no time limit, so give it one: "
             "gymnasium.register(..., max_episode_steps=1000), or gymnasium.wrappers.TimeLimit(env, 1000)"
         )
-        problems["endless"] = Finding("warning", text)
+        problems.add("endless", text, "warning")
     return steps
 
 
-def _reset(env: gym.Env, problems: dict[str, Finding]) -> tuple[Observation, Info] | None:
+def _reset(env: gym.Env, problems: Problems) -> tuple[Observation, Info] | None:
     """Resets the environment and checks its observation, which is returned with the info; None if it is unusable."""
     space = env.observation_space
     result = env.reset()
-    if (fault := validation.reset_fault(result, space)) is not None:
-        problems.setdefault("reset", Finding("error", fault))
+    problems.add("reset", validation.reset_fault(result, space))
     has_info = isinstance(result, tuple) and len(result) == 2 and isinstance(result[1], dict)
     obs = result[0] if has_info else result
     if validation.observation_fault(space, obs) is not None:
@@ -248,11 +258,11 @@ def _reset(env: gym.Env, problems: dict[str, Finding]) -> tuple[Observation, Inf
     return obs, result[1] if has_info else {}
 
 
-def _check_step(result: object, space: gym.Space, problems: dict[str, Finding]) -> bool:
+def _check_step(result: object, space: gym.Space, problems: Problems) -> bool:
     """Checks the values of a step, and returns whether training could go on after it."""
     faults = dict(validation.step_faults(result, space, strict=True))
     for name, text in faults.items():
-        problems.setdefault(name, Finding("error", text))
+        problems.add(name, text)
     if not isinstance(result, tuple) or len(result) != 5:
         return False
     obs, _, terminated, truncated, info = result
@@ -264,27 +274,24 @@ def _check_step(result: object, space: gym.Space, problems: dict[str, Finding]) 
             f"step returned the info {{'is_success': {success!r:.80}}}, expected one bool; an array counts as a success "
             "where all its numbers are at least 1, and what is no number as unknown"
         )
-        problems.setdefault("success", Finding("warning", text))
+        problems.add("success", text, "warning")
     if isinstance(info, dict) and info.get("TimeLimit.truncated") and not truncated:
         text = (
             f"step returned info['TimeLimit.truncated']={info['TimeLimit.truncated']!r} with terminated={terminated} and "
             "truncated=False; return truncated=True where a time limit ended the episode"
         )
-        problems.setdefault("folded", Finding("error", text))
+        problems.add("folded", text)
     return validation.step_fault(result, space) is None
 
 
-def _check_observation(obs: Observation, space: gym.Space, problems: dict[str, Finding], method: str) -> None:
-    fault = validation.observation_fault(space, obs, strict=True)
-    if fault is not None:
-        problems.setdefault("observation", Finding("error", f"{method} returned {fault}"))
+def _check_observation(obs: Observation, space: gym.Space, problems: Problems, method: str) -> None:
+    problems.add("observation", validation.observation_fault(space, obs, strict=True), method=method)
     fault = validation.nonfinite_fault(space, obs)
-    if fault is not None:
-        problems.setdefault("finite", Finding("error", f"{method} returned {fault}"))
-    elif (outside := validation.bounds_fault(space, obs)) is not None:
+    problems.add("finite", fault, method=method)
+    if fault is None and (outside := validation.bounds_fault(space, obs)) is not None:
         # Networks never see the bounds of a Box, but a choice that does not exist has no place in them.
         level, fault = outside
-        problems.setdefault("bounds", Finding(level, f"{method} returned {fault}"))
+        problems.add("bounds", fault, level, method)
 
 
 def known_limit(env: gym.Env) -> int | None:
@@ -319,26 +326,28 @@ def _gymnasium_messages(env: gym.Env, skip_render_check: bool) -> list[str]:
     ]
 
 
-def goal_findings(env: gym.Env, steps: Sequence[SeenStep], keeps_infos: bool = False) -> list[Finding]:
-    """Returns the problems with the goals of an environment, from some of its steps: the first of each function."""
+def goal_problems(env: gym.Env, steps: Sequence[SeenStep], keeps_infos: bool = False) -> Iterator[tuple[Level, str]]:
+    """Yields the problems with the goals of an environment, from some of its steps: the first of each function."""
     try:
         check_goal_space(env.observation_space)
     except ValueError as error:
-        return [Finding("error", str(error))]
+        yield "error", str(error)
+        return
     functions = _functions_of_goals(env)
     if "compute_reward" not in functions:
-        text = (
+        yield (
+            "error",
             "observations with a desired_goal need the method compute_reward(achieved_goal, desired_goal, info), and "
-            "there is none; add it, for hindsight replay"
+            "there is none; add it, for hindsight replay",
         )
-        return [Finding("error", text)]
+        return
     ended = [step for step in steps if step.terminated][: MOST_GOALS // 4]
     rows = [*steps[:MOST_GOALS], *ended]
     env.reset()  # to another state than that of any step
-    first = [next(_goal_faults(name, f, rows, keeps_infos), None) for name, f in functions.items()]
+    for name, function in functions.items():
+        yield from islice(_goal_faults(name, function, rows, keeps_infos), 1)
     if _lacks_terminated(env):
-        first.append(next(_ends_at_goals(functions["compute_reward"], ended), None))
-    return [Finding(*fault) for fault in first if fault is not None]
+        yield from islice(_ends_at_goals(functions["compute_reward"], ended), 1)
 
 
 def _functions_of_goals(env: gym.Env) -> dict[str, Callable[..., Any]]:

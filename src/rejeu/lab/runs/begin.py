@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import random
 import sys
-import warnings
 from collections.abc import Mapping
 from contextlib import ExitStack, closing
 from dataclasses import replace
@@ -176,13 +175,8 @@ def check_own_environment(environment: Environment, config: Any) -> None:
         findings = sorted(checker.quick_findings(env, keeps_infos))
     random.setstate(states[0])
     np.random.set_state(states[1])  # noqa: NPY002
-    errors = [finding.text for finding in findings if finding.level == "error"]
-    for finding in findings:
-        if finding.level == "warning":
-            warnings.warn(finding.text, UserWarning, stacklevel=2)
-    for text in errors:
-        print(f"error: {text}", file=sys.stderr)
-    if errors:
+    if errors := checker.errors_of(findings):
+        print("\n".join(f"error: {text}" for text in errors), file=sys.stderr)
         raise BadEnvironmentError(
             f"{environment.run.env} has {counted(len(errors), 'error')}, so nothing is trained; rejeu check shows its "
             "warnings too"

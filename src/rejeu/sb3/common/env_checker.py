@@ -28,7 +28,7 @@ def check_env(env: gym.Env, warn: bool = True, skip_render_check: bool = True) -
             actions have no bounds.
     """
     try:
-        faults = [finding.text for finding in checker.quick_findings(env) if finding.level == "error"]
+        faults = checker.errors_of(checker.quick_findings(env), warn=False)
     except TypeError as error:
         faults = [str(error)]
     actions = env.action_space if not faults and isinstance(env.action_space, spaces.Box) else None
