@@ -15,7 +15,6 @@ from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.callbacks.base import Periodic, TrainingCallback
 from rejeu.core import devices
 from rejeu.envs.functional.vector import reset_all
-from rejeu.envs.masks import functional_vector
 from rejeu.replay.hindsight import HerReplayBuffer
 from rejeu.replay.rollout import RolloutBuffer
 from rejeu.replay.uniform import ReplayBuffer
@@ -46,7 +45,7 @@ def stops_of(agent: BaseAgent, call: TrainingCall, callbacks: Sequence[object]) 
         raise ValueError(
             f"on_device=True is not possible: {reason}; leave it at None to train with the loop of the host"
         )
-    if functional_vector(agent.run.env) is not None:
+    if agent.run.env.backend == "jax":
         warnings.warn(
             f"{agent.run.env.env_id} trains with the loop of the host, which is slower than one on the device: {reason}; "
             "set agent.on_device = False to say that this is intended",
@@ -129,7 +128,7 @@ def stops_at(call: TrainingCall, callbacks: Sequence[object]) -> Stops:
 def reason_against(agent: BaseAgent, callbacks: Sequence[object]) -> str | None:
     """Returns why an agent cannot train on the device, None if it can."""
     run, config = agent.run, agent.config
-    if functional_vector(run.env) is None:
+    if run.env.backend != "jax":
         return f"the backend of {run.env.env_id} is {run.env.backend!r}, not 'jax'"
     if reason := reason_against_callbacks(callbacks):
         return reason

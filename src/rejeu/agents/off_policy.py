@@ -106,7 +106,8 @@ class OffPolicyAgent(Agent):
             raise ValueError("this agent has no environment and so no replay buffer; give one to load(path, env=...)")
 
     def make_noise(self) -> Noise | None:
-        return for_actions(self.config.action_noise, self.action_space)
+        noise = self.config.action_noise
+        return None if noise is None else for_actions(noise, self.action_space)
 
     def gradient_batch_size(self, n_envs: int) -> int:
         return self.config.batch_size
@@ -185,7 +186,7 @@ class OffPolicyAgent(Agent):
             action_shape=action.shape[1:],
             action_dtype=action.dtype,
             frame_stack=config.frame_stack,
-            counters=counters(config.hindsight),
+            counters=() if config.hindsight is None else counters(config.hindsight),
             memory_size=sum(leaf.size for leaf in jax.tree.leaves(self.learner.initial_memory(1))),
         )
         tree = None if priorities is None else Priorities(ring, priorities)

@@ -127,7 +127,7 @@ class AlgorithmConfig:
         coerce(self, "optimizer", optimizers.parse, optional=type(self).optimizer is None)
         coerce(self, "gamma", number, least=0, most=1)
         coerce(self, "max_grad_norm", number, above=0, optional=True)
-        assign(self, normalize=normalization.parse(self.normalize))
+        coerce(self, "normalize", normalization.parse, optional=True)
         coerce(self, "nonfinite", choice, among=("stop", "skip"))
         coerce(self, "policy_kwargs", nested, config_class=self.policy_kwargs_class)
         coerce(self, "rnd", RndConfig.parse)

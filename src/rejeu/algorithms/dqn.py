@@ -47,7 +47,7 @@ from jax import Array
 
 from rejeu.algorithms import categorical, optimizers, search
 from rejeu.algorithms.config import OffPolicyConfig, network_inputs
-from rejeu.algorithms.memory import remembering
+from rejeu.algorithms.memory import acting_from_memory
 from rejeu.algorithms.search import SearchSpace
 from rejeu.core.algorithm import (
     AVERAGED,
@@ -284,7 +284,7 @@ def q_learning(
         return State(network, target_network, optimizer_state, step, state.n_updates + 1, state.key), metrics
 
     algorithm = epsilon_greedy_algorithm(init, update, epsilon, values=returns.values)
-    return remembering(algorithm, shape, lambda state: (state.network,))
+    return acting_from_memory(algorithm, lambda state: (state.network,)) if config.has_memory else algorithm
 
 
 def epsilon_greedy_algorithm(

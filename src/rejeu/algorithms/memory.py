@@ -1,4 +1,4 @@
-"""Acting with networks that have a memory: what an algorithm without one becomes with them (:func:`remembering`)."""
+"""Acting with networks that have a memory: what an algorithm without one becomes with them (:func:`acting_from_memory`)."""
 
 from __future__ import annotations
 
@@ -8,21 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from rejeu.core.algorithm import Algorithm, Clock, Explorer, Masked, PyTree, Remembered, unmasked
-from rejeu.networks import MemoryConfig, Recurrent
-
-
-def remembering(
-    algorithm: Algorithm, shape: MemoryConfig, networks: Callable[[PyTree], tuple[Recurrent, ...]]
-) -> Algorithm:
-    """Returns an algorithm whose networks may have a memory as one that acts with it; unchanged if they have none.
-
-    Args:
-        algorithm: how it acts and learns with the observations of :class:`rejeu.core.algorithm.Remembered`, and
-            :class:`rejeu.core.algorithm.Sequences`.
-        shape: the settings of the networks.
-        networks: returns the networks with memory of a state, the one that acts first.
-    """
-    return algorithm if shape.lstm_hidden_size is None else acting_from_memory(algorithm, networks)
+from rejeu.networks import Recurrent
 
 
 def acting_from_memory(algorithm: Algorithm, networks: Callable[[PyTree], tuple[Recurrent, ...]]) -> Algorithm:
@@ -30,6 +16,11 @@ def acting_from_memory(algorithm: Algorithm, networks: Callable[[PyTree], tuple[
 
     The memory is one array ``(n_envs, n_numbers)``, of all networks with memory in the order of their slots, so that critics
     too start a sequence from what they remembered.
+
+    Args:
+        algorithm: how it acts and learns with the observations of :class:`rejeu.core.algorithm.Remembered`, and
+            :class:`rejeu.core.algorithm.Sequences`.
+        networks: returns the networks with memory of a state, the one that acts first.
     """
 
     def init(actor: tuple[Recurrent, ...], n_envs: int) -> Array:

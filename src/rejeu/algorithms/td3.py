@@ -28,7 +28,7 @@ from jax import Array
 from rejeu.algorithms import optimizers
 from rejeu.algorithms.config import network_inputs
 from rejeu.algorithms.ddpg.continuous import DeterministicPolicyConfig, actor_loss, explore, metrics_of, policy
-from rejeu.algorithms.memory import remembering
+from rejeu.algorithms.memory import acting_from_memory
 from rejeu.core.algorithm import (
     AVERAGED,
     Algorithm,
@@ -171,7 +171,8 @@ def make_with(
         return state, metrics
 
     algorithm = Algorithm(init, lambda state: state.actor, explore, policy, update, action_values=values_by_critics)
-    return remembering(algorithm, shape, lambda state: (state.actor, state.critics))
+    networks = lambda state: (state.actor, state.critics)  # noqa: E731
+    return acting_from_memory(algorithm, networks) if config.has_memory else algorithm
 
 
 def policy_loss(actor: Network, critics: QNetwork, batch: Transition) -> Array:

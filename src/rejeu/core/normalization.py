@@ -60,17 +60,17 @@ class NormalizationConfig:
         coerce(self, "max_return", number, above=0, optional=True)
 
 
-def parse(value: object) -> NormalizationConfig | None:
-    """Returns the settings that ``normalize`` stands for: None for False or None, the defaults for True.
+def parse(name: str, value: object) -> NormalizationConfig | None:
+    """Returns the settings that the argument ``normalize`` stands for: None for False, the defaults for True.
 
     Raises:
         TypeError: for anything else.
     """
-    if value is None or value is False:
+    if value is False:
         return None
     if value is True or isinstance(value, NormalizationConfig | Mapping):
-        return nested("normalize", {} if value is True else value, NormalizationConfig)
-    raise TypeError(f"normalize={value!r} must be True, False or a dict such as dict(norm_obs=True, norm_reward=False)")
+        return nested(name, {} if value is True else value, NormalizationConfig)
+    raise TypeError(f"{name}={value!r} must be True, False or a dict such as dict(norm_obs=True, norm_reward=False)")
 
 
 class Moments(NamedTuple):

@@ -191,6 +191,8 @@ def auto_backend(env_id: str, n_envs: int, env_kwargs: Arguments = MappingProxyT
 
 def check_workers(env: Any, n_envs: int, backend: Backend, options: WorkerOptions) -> None:
     """Raises ``ValueError`` if options of worker processes are out of range, or given where there will be none."""
+    if options == WorkerOptions():
+        return
     check_options(options.worker_timeout, options.restart_workers)
     in_workers = backend in WORKERS and (isinstance(env, str) or is_maker(env))
     for name, value in options._asdict().items():

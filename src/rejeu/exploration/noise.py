@@ -325,13 +325,12 @@ def read(text: str, n: int) -> Noise:
     )
 
 
-def for_actions(noise: Noise | float | str | None, action_space: spaces.Space) -> Noise | None:
+def for_actions(noise: Noise | str, action_space: spaces.Space) -> Noise:
     """Returns noise for these actions: a string from :func:`parse` gets as many dimensions as they have.
 
     >>> for_actions("normal(0.1)", spaces.Box(-1, 1, (2,)))
     NormalActionNoise(mean=(0.0, 0.0), sigma=(0.1, 0.1), random=0.0)
     """
-    assert not isinstance(noise, float | int)  # parse turns numbers into strings
     return read(noise, math.prod(action_space.shape or (1,))) if isinstance(noise, str) else noise
 
 

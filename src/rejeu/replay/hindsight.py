@@ -293,15 +293,15 @@ def registered_strategy(strategy: Any) -> str | GoalStrategy:
     return strategy
 
 
-def counters(config: HindsightConfig | None) -> tuple[str, ...]:
-    """Returns the counters that the ring must keep of every row for these settings, None being no hindsight.
+def counters(config: HindsightConfig) -> tuple[str, ...]:
+    """Returns the counters that the ring must keep of every row for these settings.
 
     >>> counters(HindsightConfig(goal_selection_strategy="future"))
     ('until_end',)
     """
-    strategy = config and config.goal_selection_strategy
+    strategy = config.goal_selection_strategy
     names = {*dict(strategy.shares)} if isinstance(strategy, MixedStrategies) else {strategy}
-    strategies = names - {*ANY_STEP, None}
+    strategies = names - {*ANY_STEP}
     return () if not strategies else ("until_end",) if strategies <= {*FROM_LATER} else ("since_start", "until_end")
 
 

@@ -35,7 +35,7 @@ from jax import Array
 from rejeu.algorithms import optimizers
 from rejeu.algorithms.actor_critic.network import sde_explorer, sde_log_std
 from rejeu.algorithms.config import network_inputs
-from rejeu.algorithms.memory import remembering
+from rejeu.algorithms.memory import acting_from_memory
 from rejeu.algorithms.soft import EntropyConfig, SoftCritic, soft_actor_critic
 from rejeu.core.algorithm import Algorithm, Clock, Explorer, PyTree, Transition, weighted_mean
 from rejeu.core.distributions import TanhNormal
@@ -203,7 +203,8 @@ def algorithm_of(
         parts = parts._replace(target=lambda *arguments: jnp.clip(target(*arguments), *bounds))
     optimizer = optimizers.make(config.optimizer, config.max_grad_norm)
     algorithm = soft_actor_critic(parts, config, explore, exploit, optimizer)._replace(**others)
-    return remembering(algorithm, config.policy_kwargs, lambda state: (state.actor, state.critics))
+    networks = lambda state: (state.actor, state.critics)  # noqa: E731
+    return acting_from_memory(algorithm, networks) if config.has_memory else algorithm
 
 
 def drawn(parts: SoftCritic, config: Config) -> SoftCritic:
