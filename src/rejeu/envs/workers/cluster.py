@@ -17,6 +17,7 @@ from contextlib import contextmanager
 from types import ModuleType
 
 from rejeu.core.errors import ClusterError, MissingExtra, installed
+from rejeu.core.records import brief
 
 LOOPBACK = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
 """Environment variable without which Ray listens on the address of a network card, also for processes of one machine."""
@@ -96,7 +97,7 @@ def connect(address: str | None = None, purpose: str = "backend='ray'", shows_ou
                 )
         except (ConnectionError, RuntimeError, ValueError, TimeoutError) as error:
             where = "a cluster on this machine" if address is None else f"the Ray cluster {address!r}"
-            raise ClusterError(f"cannot connect to {where}: {one_line(error)}") from error
+            raise ClusterError(f"cannot connect to {where}: {brief(error)}") from error
         _is_ours, _is_local = True, address is None
     return Connection(ray)
 
@@ -180,8 +181,3 @@ def check_versions(there: Mapping[str, str], where: str, here: Mapping[str, str]
     ]
     if wrong:
         raise ClusterError(f"{where} has {', '.join(wrong)} as here; install the same versions on all machines")
-
-
-def one_line(error: object) -> str:
-    """Returns the text of an error on one line, shortened to 400 characters."""
-    return " ".join(str(error).split())[:400]

@@ -23,6 +23,7 @@ from gymnasium.vector.utils import CloudpickleWrapper
 
 from rejeu.core import validation
 from rejeu.core.errors import WorkerError
+from rejeu.core.records import brief, shown
 from rejeu.core.types import Settings
 from rejeu.envs.workers import cluster, process
 from rejeu.envs.workers.pool import LOOK_SECONDS, Starter, Worker, seconds_until
@@ -237,8 +238,8 @@ class ActorWorker(Worker):
         except ray.exceptions.GetTimeoutError:
             return "its connection has ended", False
         except ray.exceptions.RayTaskError as error:
-            return f"{type(error.cause).__name__}: {cluster.one_line(error.cause)}", True
+            return f"{type(error.cause).__name__}: {brief(error.cause)}", True
         except ray.exceptions.RayError as error:
             *_, reason = ["", *str(error).strip().splitlines()]
-            return cluster.one_line(reason.partition(" Some common causes")[0]) or type(error).__name__, False
+            return shown(reason.partition(" Some common causes")[0], 400) or type(error).__name__, False
         return "it has returned", True

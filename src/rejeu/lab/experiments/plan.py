@@ -19,6 +19,7 @@ from msgspec import Meta
 
 from rejeu.agents import AGENTS, choose_algorithm, find_agent, find_preset, presets
 from rejeu.core import devices, spaces
+from rejeu.core.errors import one_line
 from rejeu.core.records import MAX_DEPTH, Seed, convert, is_deep, shown
 from rejeu.core.validation import as_path, build, check_names, choice, field_names
 from rejeu.envs.make import BACKENDS, make_vector
@@ -97,8 +98,7 @@ def at(plan: object, *keys: str) -> Iterator[None]:
         raise
     except (ValueError, TypeError, ArithmeticError, ImportError, OSError, gym.error.Error, AssertionError) as error:
         where = f"{plan}, {'.'.join(keys)}" if keys else plan
-        problem = " ".join(str(error or type(error).__name__).split())
-        raise PlanError(f"{where}: {shown(problem, 1000)}") from None
+        raise PlanError(f"{where}: {shown(one_line(error), 1000)}") from None
 
 
 def read_plan(plan: str | Path | Mapping[str, Any]) -> tuple[Plan, str | None]:

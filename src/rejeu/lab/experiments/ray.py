@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from rejeu.core import atomic, hardware
 from rejeu.core.errors import ClusterError
+from rejeu.core.records import brief
 from rejeu.core.types import Settings
 from rejeu.envs.workers import cluster
 from rejeu.lab.runs.config import read_task, write_task
@@ -138,7 +139,7 @@ class RayRun:
     def _note(self, error: Exception) -> None:
         """Writes an error of the cluster to the log."""
         with suppress(OSError), atomic.open_file(self._log) as file:
-            file.write(f"{type(error).__name__}: {cluster.one_line(error)}\n".encode())
+            file.write(f"{type(error).__name__}: {brief(error)}\n".encode())
 
 
 class RayLauncher:
@@ -250,7 +251,7 @@ class RayLauncher:
             except ray.exceptions.RayError as error:
                 cause = getattr(error, "cause", None) or error
                 raise ClusterError(
-                    f"{where} cannot run rejeu: {cluster.one_line(cause)}; install the same packages on all machines"
+                    f"{where} cannot run rejeu: {brief(cause)}; install the same packages on all machines"
                 ) from None
             check_node(there, is_seen, where, self._versions, self._marker)
 

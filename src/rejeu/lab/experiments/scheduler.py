@@ -24,6 +24,7 @@ from filelock import FileLock
 
 from rejeu.checkpoints.run_folder import newest_step
 from rejeu.core.interrupt import TAKEN, Interrupt
+from rejeu.core.records import brief
 from rejeu.lab.experiments.work import Ending, Work
 from rejeu.lab.runs.config import write_task
 from rejeu.lab.runs.process import hold, last_line
@@ -204,7 +205,7 @@ class Scheduler:
 
     def _leave(self, work: Work, error: OSError) -> None:
         """Leaves a run that cannot be started to a later process, which may be one of another machine."""
-        work.ending, work.reason = "left", f"could not be started: {' '.join(str(error).split())}"
+        work.ending, work.reason = "left", f"could not be started: {brief(error)}"
         self.say(f"{work.name} {work.reason}")
 
     def _end(self, attempt: Attempt, status: int) -> None:

@@ -15,7 +15,7 @@ from rejeu.agents import Agent
 from rejeu.callbacks import Evaluate, Evaluated
 from rejeu.checkpoints.run_folder import RunFolder, checkpoint_files
 from rejeu.core import atomic, xla
-from rejeu.core.errors import RunInUseError
+from rejeu.core.errors import RunInUseError, one_line
 from rejeu.core.interrupt import NAMES
 from rejeu.core.types import JsonObject
 from rejeu.envs.registry import register
@@ -144,9 +144,9 @@ def noted_in(path: Path) -> Iterator[None]:
     """Context whose warnings, and the error that ends it, are also written to a file, one a line."""
     show = warnings.showwarning
 
-    def note(text: object) -> None:
+    def note(text: Warning | str) -> None:
         with suppress(OSError), atomic.open_file(path) as file:
-            file.write((" ".join(str(text).split()) + "\n").encode())
+            file.write(f"{one_line(text)}\n".encode())
 
     def show_and_note(message: Warning | str, *arguments: Any, **options: Any) -> None:
         show(message, *arguments, **options)
