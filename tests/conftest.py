@@ -13,10 +13,12 @@ import os
 import re
 import shutil
 import signal
+import subprocess
+import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import suppress
-from functools import wraps
+from functools import cache, wraps
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +32,7 @@ import hypothesis
 import jax
 import pytest
 
+from rejeu.core.errors import MissingExtra
 from rejeu.core.xla import RUN_ONCE
 
 hypothesis.settings.register_profile("rejeu", max_examples=50, derandomize=True, deadline=None, database=None)
@@ -80,6 +83,38 @@ def pytest_collection_finish(session: pytest.Session) -> None:
     """Collects garbage less often, and not among what was imported, because JAX keeps many objects."""
     gc.freeze()
     gc.set_threshold(50_000, 10, 10)
+
+
+@cache
+def is_envpool_importable() -> bool:
+    """Returns whether a new process, in which no test has replaced anything, can import EnvPool."""
+    return subprocess.run([sys.executable, "-c", "import envpool"], capture_output=True, check=False).returncode == 0
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> Iterator[None]:
+    """Skips a test that asks for EnvPool itself in a system that cannot import it, such as one without libEGL.
+
+    A test in a file that does not name EnvPool has no reason to need it, and fails.
+    """
+    try:
+        return (yield)
+    except MissingExtra as error:
+        names_envpool = "envpool" in pyfuncitem.path.read_text(encoding="utf-8").lower()
+        if "needs EnvPool" in str(error) and names_envpool and not is_envpool_importable():
+            pytest.skip(str(error))
+        raise
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Skips a test marked with ``needs_envpool``, which fails without EnvPool in another way than by asking for it by name."""
+    if item.get_closest_marker("needs_envpool"):
+        from rejeu.envs.registry import import_envpool
+
+        try:
+            import_envpool()
+        except MissingExtra as error:
+            pytest.skip(str(error))
 
 
 @pytest.fixture

@@ -236,6 +236,7 @@ def import_envpool() -> Any:
     with requires("backend='envpool'", f"EnvPool ({ENVPOOL_SIZE})", "envpool"):
         if "envpool" in sys.modules or not (tables := _tables_of_envpool()):
             return importlib.import_module("envpool")
+        _forget_envpool()  # what an import that failed elsewhere left behind
         sys.modules["envpool.entry"] = ModuleType("envpool.entry")
         try:
             envpool = importlib.import_module("envpool")
@@ -246,9 +247,15 @@ def import_envpool() -> Any:
                 sys.modules[name] = importlib.util.module_from_spec(spec)
                 spec.loader.exec_module(sys.modules[name])
         except (ImportError, OSError):
-            sys.modules.pop("envpool", None)
+            _forget_envpool()
             raise
         return envpool
+
+
+def _forget_envpool() -> None:
+    """Removes EnvPool's modules after an import that failed, because EnvPool refuses to register a game twice."""
+    for name in [name for name in sys.modules if name.partition(".")[0] == "envpool"]:
+        del sys.modules[name]
 
 
 def usable_envpool() -> Any:

@@ -139,6 +139,7 @@ def test_the_best_model_is_that_of_the_best_evaluation(run):
     assert counters == int(table[last_best]["step"])
 
 
+@pytest.mark.needs_envpool
 def test_train_says_what_it_does_and_what_came_of_it(tmp_path, capsys):
     assert train(tmp_path / "run", "--seed", "1", *FEWER_FILES, steps=60) == 0
     text = capsys.readouterr().out
@@ -160,6 +161,7 @@ def test_a_preset_for_envpool_trains_on_gymnasium_without_it_and_says_so(tmp_pat
     assert json.loads((tmp_path / "run" / "config.json").read_text())["backend"] == "gymnasium"
 
 
+@pytest.mark.needs_envpool
 @pytest.mark.usefixtures("untrained")
 def test_goal_environments_are_trained_with_hindsight(tmp_path):
     assert train(tmp_path / "run", "--envs", "2", env="parking-v0") == 0
