@@ -32,11 +32,10 @@ from rejeu.algorithms.config import network_inputs
 from rejeu.algorithms.rollout_config import RolloutConfig
 from rejeu.algorithms.search import LogUniform, SearchSpace
 from rejeu.core import schedules
-from rejeu.core.algorithm import Algorithm, Clock, Explorer, Metrics, PyTree, Rollout
+from rejeu.core.algorithm import Algorithm, Clock, Explorer, Metrics, PyTree, Rollout, Scalar
 from rejeu.core.prng import nth
 from rejeu.core.schedules import Schedule, at
 from rejeu.core.spaces import action_dimension, check_action
-from rejeu.core.types import Scalar
 from rejeu.core.validation import coerce, flag, number, whole
 from rejeu.networks import Network, Widths
 

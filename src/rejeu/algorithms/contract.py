@@ -11,9 +11,8 @@ import numpy as np
 from gymnasium import spaces
 from jax import Array
 
-from rejeu.core.algorithm import TD_ERROR, Algorithm, Clock, Metrics, PyTree, names
+from rejeu.core.algorithm import TD_ERROR, Action, Algorithm, Clock, Metrics, PyTree, names
 from rejeu.core.spaces import random_action
-from rejeu.core.types import Action
 
 
 def checked(algorithm: Algorithm, action_space: spaces.Space) -> Algorithm:

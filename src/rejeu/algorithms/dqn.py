@@ -57,6 +57,7 @@ from rejeu.core.algorithm import (
     Metrics,
     Optimizer,
     PyTree,
+    Scalar,
     Transition,
     copy,
     minimize,
@@ -70,7 +71,6 @@ from rejeu.core.distributions import forbid
 from rejeu.core.prng import nth
 from rejeu.core.schedules import Exponential, Linear, Schedule, at
 from rejeu.core.spaces import Leaf, check_discrete_action, nth_allowed
-from rejeu.core.types import Scalar
 from rejeu.core.validation import LARGEST_VALUE, choice, coerce, flag, number, whole
 from rejeu.exploration.noise import NoiseProcess
 from rejeu.networks import MLP, Network, PolicyConfig, Torso, Widths, make_encoder, make_head, make_torso, with_memory

@@ -49,10 +49,9 @@ from rejeu.algorithms.actor_critic.steps import (
 )
 from rejeu.algorithms.search import SearchSpace
 from rejeu.core import schedules
-from rejeu.core.algorithm import EXPLAINED_VARIANCE, GRADIENT_STEPS, Algorithm, Clock, Metrics, PyTree, Rollout
+from rejeu.core.algorithm import EXPLAINED_VARIANCE, GRADIENT_STEPS, Algorithm, Clock, Metrics, PyTree, Rollout, Scalar
 from rejeu.core.prng import nth
 from rejeu.core.schedules import Schedule, at
-from rejeu.core.types import Scalar
 from rejeu.core.validation import coerce, number, whole
 
 ADAM_EPSILON = 1e-5

@@ -34,6 +34,7 @@ from rejeu.core.algorithm import (
     Metrics,
     Optimizer,
     PyTree,
+    Scalar,
     Transition,
     copy,
     descend,
@@ -44,7 +45,6 @@ from rejeu.core.algorithm import (
 )
 from rejeu.core.prng import nth
 from rejeu.core.schedules import at
-from rejeu.core.types import Scalar
 from rejeu.core.validation import coerce, is_number, number, whole
 
 ALPHA_OPTIMIZER = optimizers.make("adam")

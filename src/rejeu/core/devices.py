@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any
 
 import jax
 
@@ -74,7 +73,7 @@ def local(name: str) -> list[jax.Device]:
         ) from None
 
 
-def chosen(name: str) -> AbstractContextManager[Any]:
+def chosen(name: str) -> AbstractContextManager[object]:
     """Returns a context in which JAX computes on a device, if that is not its default device already.
 
     Raises:

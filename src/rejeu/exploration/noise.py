@@ -25,8 +25,7 @@ from gymnasium import spaces
 from jax import Array
 from numpy.typing import ArrayLike, DTypeLike
 
-from rejeu.core.algorithm import PyTree
-from rejeu.core.types import Action, AnyArray
+from rejeu.core.algorithm import Action, AnyArray, PyTree
 from rejeu.core.validation import assign, coerce, number
 from rejeu.exploration.parameter_space import ParameterNoise
 

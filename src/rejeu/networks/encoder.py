@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -199,7 +199,7 @@ class OwnEncoder(eqx.Module):
         """Maps observations ``(batch, ...)`` to features ``(batch, n_features)``."""
         return self.module(self.arrange(jax.tree.leaves(unmasked(obs)[0])))
 
-    def arrange(self, arrays: list[PyTree]) -> Any:
+    def arrange(self, arrays: list[PyTree]) -> PyTree:
         """Returns the argument of the module: an array, or for a Dict or Tuple space a dict from path to array."""
         paths = [leaf.path for leaf in self.leaves]
         return arrays[0] if paths == [""] else dict(zip(paths, arrays, strict=True))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import equinox as eqx
 import jax
@@ -14,7 +14,7 @@ from jax import Array, ShapeDtypeStruct
 from rejeu.core import xla
 from rejeu.core.algorithm import PyTree
 
-M = TypeVar("M", bound=Callable[..., Any])
+M = TypeVar("M", bound=Callable[..., object])
 ENCODERS: dict[str, Callable[..., PyTree]] = {}
 """Encoders by name; :func:`register_encoder` adds to it."""
 

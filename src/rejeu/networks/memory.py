@@ -190,7 +190,7 @@ def with_memory(
     shape: Any,
     make: Callable[[tuple[Leaf, ...], PyTree], PyTree],
     slot: int = 0,
-) -> Any:
+) -> PyTree:
     """Returns the networks ``make(leaves, shape)``; with a memory, they read what a cell remembers of the observations.
 
     ``slot`` numbers the memories of an algorithm, those of its actor, of all its critics, and so on.

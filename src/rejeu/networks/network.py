@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -102,7 +101,7 @@ class SimBa(eqx.Module):
         return self.norm(x)
 
 
-Torso = MLP | Branches | SimBa | Any
+Torso = MLP | Branches | SimBa | PyTree
 """Hidden layers: rejeu's, or a module of the user's own."""
 
 

@@ -22,9 +22,8 @@ import numpy as np
 from jax import Array
 
 from rejeu.core import schedules
-from rejeu.core.algorithm import PyTree, Transition
+from rejeu.core.algorithm import PyTree, Scalar, Transition
 from rejeu.core.prng import below
-from rejeu.core.types import Scalar
 from rejeu.replay import device_priorities
 from rejeu.replay.device_priorities import DevicePriorities
 from rejeu.replay.hindsight import GoalStrategy, HindsightSteps, MixedStrategies

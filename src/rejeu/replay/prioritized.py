@@ -8,16 +8,16 @@ New steps get the largest priority so far.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from rejeu.core import schedules
 from rejeu.core.schedules import Schedule
-from rejeu.core.types import AnyArray, Settings
+from rejeu.core.types import AnyArray, JsonObject, Settings
 from rejeu.core.validation import coerce, number
 from rejeu.replay.ring import LAST, Ring, Rows
 
@@ -161,7 +161,7 @@ class Priorities:
         n = self.ring.rows * self.ring.n_envs
         return {"values": self.tree[np.arange(n)], "largest": self.largest}
 
-    def restore(self, state: Mapping[str, Any] | None = None) -> None:
+    def restore(self, state: JsonObject | None = None) -> None:
         """Restores a state of :meth:`state`. Without a state, all steps of the ring get the largest priority.
 
         Raises:

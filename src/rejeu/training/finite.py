@@ -21,9 +21,8 @@ import numpy as np
 from jax import Array
 
 from rejeu.core import checkpoint
-from rejeu.core.algorithm import Clock, Rollout, Transition
+from rejeu.core.algorithm import Clock, PyTree, Rollout, Transition
 from rejeu.core.errors import NonFiniteError
-from rejeu.core.types import PyTree
 from rejeu.training.learner import PackedState, Readings, bad_leaves, checked, is_finite
 
 MAX_SKIPPED = 100

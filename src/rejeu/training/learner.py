@@ -25,6 +25,7 @@ from rejeu.core.algorithm import (
     EXPLAINED_VARIANCE,
     TD_ERROR,
     Algorithm,
+    AnyArray,
     Clock,
     Explorer,
     Metrics,
@@ -35,7 +36,6 @@ from rejeu.core.algorithm import (
     names,
 )
 from rejeu.core.prng import nth
-from rejeu.core.types import AnyArray
 from rejeu.exploration import explorer as exploration
 from rejeu.exploration.noise import Noise
 

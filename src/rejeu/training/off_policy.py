@@ -17,7 +17,6 @@ updates are started, and wait for them.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
 
 import jax
 import numpy as np
@@ -28,6 +27,8 @@ from rejeu.core.algorithm import Clock, PyTree, unmasked
 from rejeu.core.spaces import action_scaler, random_action
 from rejeu.envs.base import Step
 from rejeu.exploration.explorer import memory_in
+from rejeu.replay.hindsight import HerReplayBuffer
+from rejeu.replay.uniform import ReplayBuffer
 from rejeu.training.checks import check_state, checked_reset, checked_restart, checked_step
 from rejeu.training.finite import gradient_steps
 from rejeu.training.learner import Learner
@@ -106,7 +107,12 @@ def offline(
 
 
 def learn_from(
-    run: Run, learner: Learner, config: OffPolicyConfig, replay: Any, progress: Sequence[float], before: int = 0
+    run: Run,
+    learner: Learner,
+    config: OffPolicyConfig,
+    replay: ReplayBuffer | HerReplayBuffer,
+    progress: Sequence[float],
+    before: int = 0,
 ) -> None:
     """Starts gradient steps on batches of a replay buffer in one call, one for each progress of schedules.
 

@@ -14,10 +14,9 @@ from jax import Array
 from rejeu.algorithms.actor_critic.config import OnPolicyConfig
 from rejeu.algorithms.actor_critic.gae import advantages
 from rejeu.algorithms.actor_critic.network import ActorCritic, Distribution, is_value
-from rejeu.core.algorithm import PyTree, Rollout, clip, descend
+from rejeu.core.algorithm import PyTree, Rollout, Scalar, clip, descend
 from rejeu.core.distributions import is_squashed
 from rejeu.core.schedules import at
-from rejeu.core.types import Scalar
 
 D = TypeVar("D")
 MOST_SORTED = 2**14

@@ -16,7 +16,6 @@ never becomes good.
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -27,6 +26,7 @@ from rejeu.algorithms.sac.continuous import Config, algorithm_of, check_discrete
 from rejeu.algorithms.soft import SoftCritic
 from rejeu.core.algorithm import Algorithm, Clock, PyTree, Transition, some_allowed, unmasked
 from rejeu.core.distributions import Categorical, forbid
+from rejeu.core.types import AnyArray
 from rejeu.networks import Network, each
 
 TARGET_ENTROPY_SHARE = 0.3
@@ -78,7 +78,7 @@ def logits(actor: Network, obs: PyTree) -> Array:
     return forbid(actor(obs), unmasked(obs)[1])
 
 
-def mean_log_count(obs: PyTree, n_actions: int) -> Any:
+def mean_log_count(obs: PyTree, n_actions: int) -> AnyArray:
     """Returns the mean entropy in nats of choosing uniformly: ``log(n_actions)``, or that of the allowed ones."""
     mask = unmasked(some_allowed(obs))[1]
     return math.log(n_actions) if mask is None else jnp.mean(jnp.log(jnp.sum(mask, axis=-1, dtype=jnp.float32)))

@@ -16,7 +16,6 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
-from typing import Any
 
 import gymnasium as gym
 from gymnasium.vector.utils import CloudpickleWrapper
@@ -108,7 +107,7 @@ class Actors(Starter):
     def start(self, number: int, make: Callable[[], gym.Env]) -> ActorWorker:
         return ActorWorker(number, make, self)
 
-    def launch(self, worker: ActorWorker) -> tuple[Any, Any]:
+    def launch(self, worker: ActorWorker) -> tuple[object, object]:
         """Makes the actor of a worker, which will connect; returns it, and the reference to the end of its only task."""
         self.forget(worker)
         token = secrets.token_bytes(TOKEN_BYTES)

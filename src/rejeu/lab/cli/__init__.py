@@ -17,7 +17,6 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
@@ -144,7 +143,7 @@ def dumps(value: object) -> str:
     return msgspec.json.format(msgspec.json.encode(value, enc_hook=plain), indent=2).decode()
 
 
-def plain(value: object) -> Any:
+def plain(value: object) -> object:
     """Returns a NumPy array or number as Python's, a mapping as a dict, and anything else as text."""
     import numpy as np  # takes longer than all that --help needs
 

@@ -21,7 +21,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rejeu.agents import presets
 from rejeu.agents.presets import Preset
@@ -263,7 +263,7 @@ def open_study(folder: StudyFolder, plan: StudyPlan | None = None) -> Study:
         atomic.write(folder.plan, json_text(plan))
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     atomic.make_folder(folder.path / HIDDEN)
-    lock: Any = atomic.lock(folder.path / HIDDEN / "lock")  # unlike Optuna's, it ends with its process
+    lock: FileLock = atomic.lock(folder.path / HIDDEN / "lock")  # unlike Optuna's, it ends with its process
     with lock, readable(folder.journal):
         cut_last_line(folder.journal)
         storage = JournalStorage(JournalFileBackend(str(folder.journal), lock))

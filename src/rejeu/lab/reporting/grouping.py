@@ -10,7 +10,7 @@ import itertools
 import json
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -205,7 +205,7 @@ def scale(curves: Sequence[Curve], normalize: str | Mapping[str, tuple[float, fl
             curve.evaluation = curve.evaluation[0], (curve.evaluation[1] - low) / span
 
 
-def references(env: str, pair: Any) -> tuple[float, float]:
+def references(env: str, pair: tuple[float, float]) -> tuple[float, float]:
     """Returns the two reference returns of an environment.
 
     Raises:

@@ -8,7 +8,6 @@ from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from rejeu.checkpoints.run_folder import RunFolder
 from rejeu.core.errors import MissingExtra
@@ -56,7 +55,7 @@ def read_all(paths: str | Path | RunSummary | Iterable[str | Path | RunSummary])
     Raises:
         FileNotFoundError: if a path does not exist, or holds no run.
     """
-    sources: dict[Any, Path | RunSummary] = {}
+    sources: dict[object, Path | RunSummary] = {}
     for source in [paths] if isinstance(paths, str | RunSummary) or not isinstance(paths, Iterable) else paths:
         if isinstance(source, RunSummary):
             sources[source] = source

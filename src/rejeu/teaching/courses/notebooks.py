@@ -38,11 +38,13 @@ from collections.abc import Iterator
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import Any, Literal, get_args
+from types import ModuleType
+from typing import Literal, get_args
 
 from rejeu.core.atomic import make_folder
 from rejeu.core.errors import requires
 from rejeu.core.language import LANGUAGES, Language
+from rejeu.core.types import JsonObject
 
 Version = Literal["exercise", "solution"]
 
@@ -106,7 +108,7 @@ def write(language: Language, folder: Path) -> Iterator[tuple[Path, bool]]:
                 yield path, _write_new(path, jupytext().writes(document, form))
 
 
-def jupytext() -> Any:
+def jupytext() -> ModuleType:
     """Returns jupytext, which reads and writes notebooks as text.
 
     Raises:
@@ -126,7 +128,7 @@ def text(source: str, language: Language, version: Version) -> str:
     return jupytext().writes(notebook(source, language, version), "py:percent")
 
 
-def notebook(source: str, language: Language, version: Version) -> Any:
+def notebook(source: str, language: Language, version: Version) -> JsonObject:
     r"""Returns a version of a source in one language, as a notebook of ``nbformat``.
 
     Raises:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -16,7 +16,7 @@ from rejeu.envs.base import success_of
 from rejeu.envs.rendering import rgb_frame
 from rejeu.teaching.play.keys import CONTROLS
 
-Act = Callable[[Any, frozenset[str], int], Any]
+Act = Callable[[Observation, frozenset[str], int], Action]
 """Maps the observation, the held keys and the step of the episode (from 0) to an action, or None to wait."""
 
 

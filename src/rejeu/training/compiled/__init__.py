@@ -41,7 +41,12 @@ class Stops(NamedTuple):
 
 
 def train_one(
-    run: Run, learner: Learner, config: Any, n_steps: int | None, progress: Callable[[AnyArray], AnyArray], stops: Stops
+    run: Run,
+    learner: Learner,
+    config: OffPolicyConfig | RolloutConfig,
+    n_steps: int | None,
+    progress: Callable[[AnyArray], AnyArray],
+    stops: Stops,
 ) -> Iterator[Progress]:
     """Trains a run; the arguments are those of :func:`train`, which see."""
     for (turn,) in train([run], learner, config, n_steps, progress, stops, [0]):

@@ -18,9 +18,8 @@ from jax import Array
 
 from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.core import spaces
-from rejeu.core.algorithm import Clock, PyTree, Transition, unmasked
+from rejeu.core.algorithm import Clock, PyTree, Scalar, Transition, unmasked
 from rejeu.core.prng import nth
-from rejeu.core.types import Scalar
 from rejeu.envs.functional.protocol import FunctionalEnv, GoalEnv, of_two_goals
 from rejeu.envs.masks import FunctionalMask
 from rejeu.replay import device_priorities

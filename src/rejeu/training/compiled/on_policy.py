@@ -15,9 +15,8 @@ import numpy as np
 from jax import Array
 
 from rejeu.algorithms.rollout_config import RolloutConfig
-from rejeu.core.algorithm import Clock, Rollout
+from rejeu.core.algorithm import Clock, PyTree, Rollout, Scalar
 from rejeu.core.prng import nth
-from rejeu.core.types import PyTree, Scalar
 from rejeu.envs.functional.protocol import FunctionalEnv
 from rejeu.training.compiled.program import Carry, Limits, Loop, Program, capacity_of, step_envs
 from rejeu.training.on_policy import begin_episodes

@@ -23,16 +23,17 @@ from rejeu.core.algorithm import (
     GRADIENT_STEPS,
     TD_ERROR,
     Algorithm,
+    AnyArray,
     Clock,
     Explorer,
     Masked,
     Metrics,
     PyTree,
     Rollout,
+    Scalar,
     Transition,
 )
 from rejeu.core.prng import below
-from rejeu.core.types import AnyArray, Scalar
 from rejeu.envs.functional.protocol import FunctionalEnv
 from rejeu.envs.functional.vector import VectorState, reset_done, step_all
 from rejeu.envs.masks import FunctionalMask, masked

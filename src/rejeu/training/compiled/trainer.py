@@ -14,8 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from rejeu.core.algorithm import Clock, PyTree
-from rejeu.core.types import Scalar
+from rejeu.core.algorithm import Clock, PyTree, Scalar
 from rejeu.core.xla import for_runs
 from rejeu.envs.base import success_by
 from rejeu.envs.functional.protocol import FunctionalEnv
