@@ -274,7 +274,7 @@ class SavedRun(msgspec.Struct, kw_only=True):
     buffer: JsonObject
     history: np.ndarray
     best: SavedBest | None
-    logger: tuple[dict[str, Any], dict[str, Count]]
+    logger: tuple[JsonObject, dict[str, Count]]
     n_predictions: Count
     call: JsonObject | None
     callbacks: list[tuple[str, Any]]

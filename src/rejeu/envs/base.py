@@ -268,7 +268,7 @@ def describe_spec(env: gym.Env | gym.vector.VectorEnv) -> tuple[str, int | None,
     return env.spec.id, limit, env.spec.reward_threshold
 
 
-def each_info(info: Any, n_envs: int, begun: bool = False) -> list[dict[str, Any]]:
+def each_info(info: Any, n_envs: int, begun: bool = False) -> list[Info]:
     """Returns the info of each environment, of a list or of Gymnasium's dict of arrays; empty ones of anything else.
 
     With ``begun`` it is that of the reset, where an environment was reset in the same step.
@@ -278,7 +278,7 @@ def each_info(info: Any, n_envs: int, begun: bool = False) -> list[dict[str, Any
     """
     if isinstance(info, list):
         return info
-    infos: list[dict[str, Any]] = [{} for _ in range(n_envs)]
+    infos: list[Info] = [{} for _ in range(n_envs)]
     for key, values in info.items() if isinstance(info, dict) else ():
         each = each_info(values, n_envs) if isinstance(values, dict) else values
         if not key.startswith("_") and np.shape(each)[:1] == (n_envs,):

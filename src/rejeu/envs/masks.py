@@ -21,7 +21,7 @@ from jax import Array
 from rejeu.core.algorithm import Masked
 from rejeu.core.errors import BadEnvironmentError
 from rejeu.core.spaces import Leaf
-from rejeu.core.types import Action, AnyArray, Info, Observation, PyTree
+from rejeu.core.types import Action, AnyArray, Info, Observation, PyTree, Settings
 from rejeu.envs import functional, snapshot
 from rejeu.envs.base import Seed, Step, VectorEnv
 from rejeu.envs.envpool import EnvPool
@@ -279,7 +279,7 @@ def make_masked(
         )
     if isinstance(env, VectorEnv):
         return MaskedVector(env, asks=True)
-    made_from: tuple[str, dict[str, Any]] | None = (env, {}) if isinstance(env, str) else None
+    made_from: tuple[str, Settings] | None = (env, {}) if isinstance(env, str) else None
     if isinstance(env, str):
         env = maker(env)
     if not callable(env):

@@ -17,7 +17,7 @@ from rejeu.export.numpy_policy import FUNCTIONS, POLICY, parse
 from rejeu.export.program import Operation, TracedProgram, unsupported
 
 
-def described(program: TracedProgram) -> tuple[dict[str, Any], list[np.ndarray]]:
+def described(program: TracedProgram) -> tuple[JsonObject, list[np.ndarray]]:
     """Returns a program in JSON values, and its constants, which have the first numbers.
 
     Raises:
@@ -61,7 +61,7 @@ def plain(param: Any) -> Any:
     return int(param) if isinstance(param, int | np.integer) else None
 
 
-def content_of(source: Exportable) -> tuple[dict[str, Any], list[np.ndarray]]:
+def content_of(source: Exportable) -> tuple[JsonObject, list[np.ndarray]]:
     """Returns the content of a file: JSON values and constants."""
     program, constants = described(source.policy.program)
     observations, actions = map(spaces.describe, (source.observation_space, source.action_space))

@@ -14,7 +14,7 @@ import numpy as np
 from rejeu.core import spaces
 from rejeu.core.errors import CheckpointError
 from rejeu.core.records import WRONG, brief, is_sparse, parse_json
-from rejeu.core.types import Observation, PyTree
+from rejeu.core.types import JsonObject, Observation, PyTree
 from rejeu.export import PRIMITIVES
 
 POLICY = "policy"
@@ -153,7 +153,7 @@ class NumpyPolicy:
 
     def __init__(self, content: Mapping[str, Any], constants: Sequence[np.ndarray], largest: int) -> None:
         """Builds the policy from its description and constants; ``largest`` limits the numbers of a space."""
-        self.card: dict[str, Any] = content["card"]
+        self.card: JsonObject = content["card"]
         """Where it is from, and what it takes and returns; see ``docs/deployment.md``."""
         self.observation_space, self.action_space = (
             spaces.rebuild(content[key], largest) for key in ("observation_space", "action_space")

@@ -46,7 +46,7 @@ NEUTRAL: dict[str, tuple[Any, ...]] = {
     "enable_critic_lstm": (True,),
 }
 """Settings that some algorithms do not have, with the values that they would have there."""
-OPTIMIZERS: dict[str, dict[str, Any]] = {
+OPTIMIZERS: dict[str, Settings] = {
     "Adam": {"name": "adam"},
     "AdamW": {"name": "adamw", "weight_decay": 1e-2},
     "NAdam": {"name": "nadam"},

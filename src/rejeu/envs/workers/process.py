@@ -21,7 +21,7 @@ from gymnasium.vector.utils import CloudpickleWrapper
 
 from rejeu.core.errors import BadEnvironmentError
 from rejeu.core.spaces import leaves
-from rejeu.core.types import Action, Observation, Settings
+from rejeu.core.types import Action, Info, Observation, Settings
 from rejeu.envs import snapshot, validation
 from rejeu.envs.workers import cluster
 
@@ -250,7 +250,7 @@ def seed_globals(seed: int | None) -> None:
 
 def step_and_reset(
     env: gym.Env, encode: Encode, action: Action
-) -> tuple[Any, float, bool, bool, dict[str, Any], Any, dict[str, Any]]:
+) -> tuple[Observation, float, bool, bool, Info, Observation, Info]:
     """Steps an environment, and resets it if the episode has ended.
 
     Args:

@@ -64,7 +64,7 @@ class InWorkers(VectorEnv):
         """Environments whose process was replaced between two steps. The next step reports it."""
         self._restarted: set[int] = set()
         """Environments in new processes that have not been reset yet."""
-        self._reset_infos: dict[int, dict[str, Any]] = {}
+        self._reset_infos: dict[int, Info] = {}
         self._make_one = make_one
         self._seed = seed
         self._seeds: list[int | None] = [None] * n_envs

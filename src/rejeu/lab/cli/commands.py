@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal
 from msgspec import Meta
 
 from rejeu.core.records import Duration, Positive, Seed
+from rejeu.core.types import Settings
 from rejeu.export import FORMATS
 from rejeu.lab.runs.arguments import (
     Branch,
@@ -65,7 +66,7 @@ class Clone(RunOptions):
     env: Annotated[str | None, Shown("ENV"), Topic.ENVIRONMENT] = None
     """Environment, as for rejeu train; by default the dataset's. One that is imported must be named."""
     algo: Algorithm = None
-    hyperparameters: Annotated[dict[str, Any], Shown("NAME=VALUE ...", "set")] = field(default_factory=dict)
+    hyperparameters: Annotated[Settings, Shown("NAME=VALUE ...", "set")] = field(default_factory=dict)
     """Hyperparameters of the agent, as for rejeu train."""
     updates: Annotated[Positive, Shown("N")] = 2000
     """Gradient steps; with --expert, in each round."""
@@ -131,7 +132,7 @@ class Tune(EnvironmentOptions):
     """auto, envpool, gymnasium, gymnasium-async or jax; by default the preset's, else auto."""
     preset: Annotated[Path | None, Shown("FILE"), Topic.TRAINING] = None
     """Where the search starts, and the other hyperparameters; by default rejeu's preset, else the algorithm's defaults."""
-    hyperparameters: Annotated[dict[str, Any], Shown("NAME=VALUE ...", "set")] = field(default_factory=dict)
+    hyperparameters: Annotated[Settings, Shown("NAME=VALUE ...", "set")] = field(default_factory=dict)
     """Hyperparameters to set instead of searching them, as for rejeu train."""
     search: Annotated[Assignments, Shown("NAME=LOW..HIGH ...")] = ()
     """Other ranges, or further hyperparameters: learning_rate=1e-4..1e-2 "batch_size=[64,128]" tau=log:0.001..0.1"""
@@ -441,7 +442,7 @@ class Import(EnvironmentOptions):
     """File of the VecNormalize that the policy was trained behind; by default the one beside the zip file. "none" for none."""
     env: Annotated[str | None, Shown("ENV")] = None
     """Environment, as for rejeu train, which the model file then names, for rejeu evaluate and others."""
-    hyperparameters: Annotated[dict[str, Any], Shown("NAME=VALUE ...", "set")] = field(default_factory=dict)
+    hyperparameters: Annotated[Settings, Shown("NAME=VALUE ...", "set")] = field(default_factory=dict)
     """Hyperparameters that replace those of the file."""
     out: Annotated[Path | None, Shown("FILE")] = None
     """Model file to write; by default next to the zip file, under its name."""

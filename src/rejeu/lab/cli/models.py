@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from rejeu.teaching.play import Game
 
 
-def run_evaluate(arguments: Evaluate) -> tuple[int, dict[str, Any]]:
+def run_evaluate(arguments: Evaluate) -> tuple[int, JsonObject]:
     """Evaluates an agent on whole episodes and prints the result."""
     devices.start_with("--device", arguments.device)
     episodes, minutes = arguments.episodes, arguments.minutes
@@ -44,7 +44,7 @@ def run_evaluate(arguments: Evaluate) -> tuple[int, dict[str, Any]]:
     return 0, {**facts, **evaluation.to_dict(), **each}
 
 
-def run_record(arguments: Record) -> tuple[int, dict[str, Any]]:
+def run_record(arguments: Record) -> tuple[int, JsonObject]:
     """Records a video of an agent and prints its path."""
     model = find_model(arguments.run, arguments.best_or_last)
     default = RunFolder(arguments.run).video if arguments.run.is_dir() else model.with_suffix(".mp4")
@@ -55,7 +55,7 @@ def run_record(arguments: Record) -> tuple[int, dict[str, Any]]:
     return 0, {"video": path, "episodes": arguments.episodes, "model": model, "env_id": environment.env_id}
 
 
-def run_export(arguments: Export) -> tuple[int, dict[str, Any]]:
+def run_export(arguments: Export) -> tuple[int, JsonObject]:
     """Writes the policy of an agent to a file of another format, and prints how it compares with ``predict``."""
     model = find_model(arguments.run, arguments.best_or_last)
     out, to = arguments.out, arguments.to
@@ -81,7 +81,7 @@ def run_export(arguments: Export) -> tuple[int, dict[str, Any]]:
     return 0, exported.to_dict()
 
 
-def run_watch(arguments: Watch) -> tuple[int, dict[str, Any] | None]:
+def run_watch(arguments: Watch) -> tuple[int, JsonObject | None]:
     """Shows an agent in a window, and prints its scores; or two in the web browser."""
     from rejeu.teaching.play import watch
 
@@ -116,7 +116,7 @@ def watch_together(arguments: Watch) -> tuple[int, None]:
     return 0, None
 
 
-def run_play(arguments: Play) -> tuple[int, dict[str, Any]]:
+def run_play(arguments: Play) -> tuple[int, JsonObject]:
     """Lets a person play, alone or next to an agent, and prints the scores."""
     from rejeu.teaching.play import play
     from rejeu.teaching.play.keys import full_name
@@ -186,7 +186,7 @@ def scores(game: Game) -> str:
     return "\n".join(lines)
 
 
-def run_import(arguments: Import) -> tuple[int, dict[str, Any]]:
+def run_import(arguments: Import) -> tuple[int, JsonObject]:
     """Converts a model of Stable-Baselines3 and prints what was taken over."""
     from rejeu.agents.zip_files import load_zip
     from rejeu.agents.zoo import model_in
@@ -207,7 +207,7 @@ def run_import(arguments: Import) -> tuple[int, dict[str, Any]]:
     return 0, {"model": path, "algorithm": agent.name, "notes": agent.notes}
 
 
-def run_push(arguments: Push) -> tuple[int, dict[str, Any]]:
+def run_push(arguments: Push) -> tuple[int, JsonObject]:
     """Uploads a model, or writes the files that would be, and prints where they are."""
     from rejeu.lab import hub
 
@@ -220,7 +220,7 @@ def run_push(arguments: Push) -> tuple[int, dict[str, Any]]:
     return 0, {"address": address}
 
 
-def run_pull(arguments: Pull) -> tuple[int, dict[str, Any]]:
+def run_pull(arguments: Pull) -> tuple[int, JsonObject]:
     """Downloads a model and prints what to do with it."""
     from rejeu.lab import hub
 

@@ -6,7 +6,6 @@ import dataclasses
 import os
 from contextlib import ExitStack, closing
 from pathlib import Path
-from typing import Any
 
 from rejeu.agents import find_agent, training
 from rejeu.agents.device import reason_against, require_memory
@@ -15,6 +14,7 @@ from rejeu.checkpoints.run_folder import RunFolder, check_free, dated
 from rejeu.core import devices
 from rejeu.core.errors import MissingExtra
 from rejeu.core.interrupt import NAMES, Interrupt
+from rejeu.core.types import JsonObject
 from rejeu.core.validation import choice
 from rejeu.envs.functional import is_functional
 from rejeu.envs.make import BACKENDS
@@ -34,14 +34,14 @@ from rejeu.lab.runs.session import Session, installed_logs, make_evaluation_env
 from rejeu.logs.formatting import counted, quoted
 
 
-def run_sweep(arguments: Sweep) -> tuple[int, dict[str, Any]]:
+def run_sweep(arguments: Sweep) -> tuple[int, JsonObject]:
     """Begins or joins a sweep; the exit status is 0, 2 if a run failed, 1 if one was left, 130 or 143 after a signal."""
     typed = RunConfig(env="", imports=arguments.imports)
     folder = prepare(arguments.plan, arguments.out, arguments.workers, typed, arguments.ray)
     return complete(folder, typed, arguments.workers, arguments.ray, retry=False)
 
 
-def resume(arguments: Resume) -> tuple[int, dict[str, Any]]:
+def resume(arguments: Resume) -> tuple[int, JsonObject]:
     """Completes the sweep in a folder, failed runs included; returns the exit status and the result."""
     options = {key: getattr(arguments, key) for key in ("env_kwargs", "wrappers", "imports")}
     typed = RunConfig(env=arguments.env or "", **options)
@@ -51,7 +51,7 @@ def resume(arguments: Resume) -> tuple[int, dict[str, Any]]:
 
 def complete(
     folder: SweepFolder, typed: RunConfig, workers: int | None, ray: str | None, retry: bool
-) -> tuple[int, dict[str, Any]]:
+) -> tuple[int, JsonObject]:
     """Trains what is missing in a folder, compares the runs, and returns the exit status and the result."""
     launcher = make_launcher(folder, workers, ray)
     echo(f"run folders   {folder.path}, {counted(len(folder.jobs), 'run')}, {launcher.capacity} at once")
@@ -61,7 +61,7 @@ def complete(
     return finish(folder, scheduler.works, typed, stop)
 
 
-def finish(folder: SweepFolder, works: list[Work], typed: RunConfig, stop: Interrupt) -> tuple[int, dict[str, Any]]:
+def finish(folder: SweepFolder, works: list[Work], typed: RunConfig, stop: Interrupt) -> tuple[int, JsonObject]:
     """Says what has become of the jobs and compares the runs; returns the exit status and the result."""
     result = SweepResult(folder.path, tuple(works))
     states = {outcome.state for outcome in result.outcomes}
@@ -93,7 +93,7 @@ def summarize(folder: Path, by: By | None = None) -> Comparison | None:
     return comparison
 
 
-def train_all(arguments: Train) -> tuple[int, dict[str, Any]]:
+def train_all(arguments: Train) -> tuple[int, JsonObject]:
     """Trains all seeds and compares them; returns the exit status and the result."""
     jobs = make_jobs(arguments)
     threads = threads_of(min(arguments.jobs or default_workers(), len(jobs)))
@@ -144,7 +144,7 @@ def fit_together(arguments: Train) -> bool:
     return arguments.jobs is None and not arguments.wrappers and is_functional(find_id(arguments.env))
 
 
-def train_together(arguments: Train) -> tuple[int, dict[str, Any]]:
+def train_together(arguments: Train) -> tuple[int, JsonObject]:
     """Trains all seeds and compares them; returns the exit status and the result.
 
     Settings that cannot be trained on the device are trained in processes.

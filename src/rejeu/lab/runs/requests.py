@@ -13,8 +13,8 @@ from collections.abc import Sequence
 from contextlib import suppress
 from itertools import islice
 from pathlib import Path
-from typing import Any
 
+from rejeu.agents.agent import Agent
 from rejeu.callbacks.base import TrainingCallback
 from rejeu.checkpoints.run_folder import RunFolder
 from rejeu.core import atomic
@@ -61,15 +61,15 @@ class Requests(TrainingCallback):
         self.folder, self.stop = folder, stop
         self._next = 0.0
 
-    def before_training(self, agent: Any) -> None:
+    def before_training(self, agent: Agent) -> None:
         """Removes what an earlier process has shown, and the mark of its pause."""
         drop(self.folder.watch, self.folder.live, self.folder.paused)
 
-    def after_training(self, agent: Any, error: BaseException | None) -> None:
+    def after_training(self, agent: Agent, error: BaseException | None) -> None:
         """Removes the files of requests and of what was shown."""
         drop(self.folder.stop, self.folder.watch, self.folder.live, self.folder.paused)
 
-    def __call__(self, agent: Any, progress: Progress) -> None:
+    def __call__(self, agent: Agent, progress: Progress) -> None:
         """Answers, at most every two seconds: writes the current model while it is watched; stops as Ctrl-C does."""
         now = time.monotonic()
         if now < self._next:
@@ -81,7 +81,7 @@ class Requests(TrainingCallback):
         self._next = now + EVERY
 
 
-def show(agent: Any, path: Path) -> None:
+def show(agent: Agent, path: Path) -> None:
     """Writes the current model for those who watch, if that is possible; no error message names it as the last one."""
     saved = agent.last_saved
     with suppress(OSError):
@@ -89,7 +89,7 @@ def show(agent: Any, path: Path) -> None:
     agent.last_saved = saved
 
 
-def keep_model(agent: Any, folder: Path, step: int) -> None:
+def keep_model(agent: Agent, folder: Path, step: int) -> None:
     """Writes the model of a step among those of the course of training; of too many every second one is removed."""
     show(agent, folder / f"step_{step:012}.safetensors")
     paths = models(folder)

@@ -20,6 +20,7 @@ from rejeu.checkpoints.run_folder import RunFolder, create
 from rejeu.core import errors, xla
 from rejeu.core.errors import one_line
 from rejeu.core.interrupt import Interrupt, leaving
+from rejeu.core.types import JsonObject
 from rejeu.envs.make import VectorEnv
 from rejeu.lab.runs import config as runs
 from rejeu.lab.runs.config import DecidedRun, RunConfig
@@ -120,7 +121,7 @@ class Session(NamedTuple):
         """Whether there is nothing left to train, so that only files are written."""
         return not self.is_new and self.limits == TrainingLimits() and has_reached_goal(self.agent)
 
-    def run(self, stop: Interrupt, stopwatch: Stopwatch) -> tuple[int, dict[str, Any]]:
+    def run(self, stop: Interrupt, stopwatch: Stopwatch) -> tuple[int, JsonObject]:
         """Trains, evaluates, plots and records a video; prints a summary, and returns the exit status and the result.
 
         The status is 0, 2 if something could not be written, 130 after Ctrl-C and 143 after SIGTERM. Until the models are
@@ -146,7 +147,7 @@ class Session(NamedTuple):
         """Episodes between two rows of statistics."""
         return 4 * self.config.n_envs
 
-    def finish(self, learning: Learning, stop: Interrupt, stopwatch: Stopwatch) -> tuple[int, dict[str, Any]]:
+    def finish(self, learning: Learning, stop: Interrupt, stopwatch: Stopwatch) -> tuple[int, JsonObject]:
         """Evaluates, plots and records a video after training; prints a summary, and returns what :meth:`run` does."""
         agent, folder, environment, evaluate = self.agent, self.folder, self.environment, learning.evaluate
         is_complete = not stop.requested and has_reached_goal(agent)

@@ -5,12 +5,13 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from rejeu.core import atomic
 from rejeu.core.errors import requires
+from rejeu.core.types import Settings
 from rejeu.logs.charts import GROUP_COLORS, Chart
 
 if TYPE_CHECKING:
@@ -23,7 +24,7 @@ DOT_COLOR, LINE_COLOR, ACCENT_COLOR, GOOD_COLOR, BAD_COLOR = "#63a4e0", "#1d4f91
 COLORS = {"dots": DOT_COLOR, "line": LINE_COLOR, "accent": ACCENT_COLOR, "good": GOOD_COLOR, "bad": BAD_COLOR}
 COLORS |= {f"group{i}": light for i, (light, _) in enumerate(GROUP_COLORS)}
 """Colors by their names in a chart."""
-LINE: dict[str, Any] = {"color": LINE_COLOR, "linewidth": 1.8, "solid_capstyle": "round", "solid_joinstyle": "round"}
+LINE: Settings = {"color": LINE_COLOR, "linewidth": 1.8, "solid_capstyle": "round", "solid_joinstyle": "round"}
 WIDTH = 8.0
 """Default width of a figure in inches."""
 TITLE_CHARACTERS, LEGEND_CHARACTERS = 7.5, 13.5
@@ -80,7 +81,7 @@ def draw(panel: Axes, chart: Chart, along: str = "x", unit: float = 1.0) -> None
         elif series["kind"] == "points":
             reach = np.nan_to_num(np.stack([y - low, high - y]).clip(0))
             panel.errorbar(x, y, reach, fmt="none", ecolor=color, elinewidth=1.2, alpha=0.6, zorder=3)
-            edge: dict[str, Any] = {"markeredgecolor": "white", "markeredgewidth": 0.8, "zorder": 4}
+            edge: Settings = {"markeredgecolor": "white", "markeredgewidth": 0.8, "zorder": 4}
             panel.plot(x, y, "o", markersize=5, color=color, label=label, clip_on=False, **edge)
         else:
             dash = "--" if labels_drawn.count(color) else "-"  # more groups than colors
@@ -132,9 +133,9 @@ def add_title_and_legend(panel: Axes, title: str) -> None:
         panel.set_title(title, loc="left", color=INK, fontsize=12, fontweight="bold", pad=9)
         return
     labels = [textwrap.fill(label, round(LEGEND_CHARACTERS * width)) for label in labels]
-    style: dict[str, Any] = {"frameon": False, "fontsize": 8.5, "labelcolor": INK, "handlelength": 1.2}
-    position: dict[str, Any] = {"loc": "lower left", "bbox_to_anchor": (-0.01, 1.0), "borderaxespad": 0.2}
-    heading: dict[str, Any] = {
+    style: Settings = {"frameon": False, "fontsize": 8.5, "labelcolor": INK, "handlelength": 1.2}
+    position: Settings = {"loc": "lower left", "bbox_to_anchor": (-0.01, 1.0), "borderaxespad": 0.2}
+    heading: Settings = {
         "title": title,
         "alignment": "left",
         "title_fontproperties": {"size": 12, "weight": "bold"},

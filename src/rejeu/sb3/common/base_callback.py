@@ -286,7 +286,7 @@ class ConvertCallback(BaseCallback):
         verbose: see :class:`BaseCallback`.
     """
 
-    def __init__(self, callback: Callable[[dict[str, Any], dict[str, Any]], Any] | None, verbose: int = 0) -> None:
+    def __init__(self, callback: Callable[[Variables, Variables], Any] | None, verbose: int = 0) -> None:
         super().__init__(verbose)
         self.callback = callback
 

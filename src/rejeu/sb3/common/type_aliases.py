@@ -10,15 +10,15 @@ import gymnasium as gym
 import numpy as np
 
 from rejeu.callbacks.base import Callback
-from rejeu.core.types import Observation
+from rejeu.core.types import Info, Observation
 from rejeu.sb3.common.vec_env.base_vec_env import VecEnv
 
 GymEnv = gym.Env | VecEnv
 GymObs = Any
-GymResetReturn = tuple[Any, dict[str, Any]]
-GymStepReturn = tuple[Any, float, bool, bool, dict[str, Any]]
-AtariResetReturn = tuple[np.ndarray, dict[str, Any]]
-AtariStepReturn = tuple[np.ndarray, float, bool, bool, dict[str, Any]]
+GymResetReturn = tuple[Observation, Info]
+GymStepReturn = tuple[Observation, float, bool, bool, Info]
+AtariResetReturn = tuple[np.ndarray, Info]
+AtariStepReturn = tuple[np.ndarray, float, bool, bool, Info]
 TensorDict = dict[str, np.ndarray]
 TensorIndex = Any
 MaybeCallback = Callback | list[Callback] | None

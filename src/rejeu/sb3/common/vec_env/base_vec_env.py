@@ -47,7 +47,7 @@ VecEnvIndices = int | Iterable[int] | None
 """Which environments: one, several, or None for all."""
 VecEnvObs = Any
 """Observations ``(num_envs, ...)``: an array, or a dict or tuple of arrays."""
-VecEnvStepReturn = tuple[VecEnvObs, np.ndarray, np.ndarray, list[dict[str, Any]]]
+VecEnvStepReturn = tuple[VecEnvObs, np.ndarray, np.ndarray, list[Info]]
 """Observations, rewards ``float32 (num_envs,)``, dones ``bool (num_envs,)`` and infos."""
 
 
@@ -74,7 +74,7 @@ class VecEnv(ABC):
         self.reset_infos: list[Info] = [{} for _ in range(num_envs)]
         """Info returned by the last ``reset`` of each environment."""
         self._seeds: list[int | None] = [None] * num_envs
-        self._options: list[dict[str, Any] | None] = [None] * num_envs
+        self._options: list[Info | None] = [None] * num_envs
 
     @abstractmethod
     def reset(self) -> Observation:
@@ -140,7 +140,7 @@ class VecEnv(ABC):
         self._seeds = [first + i for i in range(self.num_envs)]
         return list(self._seeds)
 
-    def set_options(self, options: dict[str, Any] | Sequence[dict[str, Any]] | None = None) -> None:
+    def set_options(self, options: Info | Sequence[Info] | None = None) -> None:
         """Sets the options of the next :meth:`reset`: one dict for all environments, or one for each."""
         one_for_all = options is None or isinstance(options, dict)
         each: list[Any] = [options] * self.num_envs if one_for_all else list(options or ())
@@ -293,7 +293,7 @@ class VecEnvWrapper(VecEnv):
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         return self.venv.seed(seed)
 
-    def set_options(self, options: dict[str, Any] | Sequence[dict[str, Any]] | None = None) -> None:
+    def set_options(self, options: Info | Sequence[Info] | None = None) -> None:
         self.venv.set_options(options)
 
     def get_images(self) -> Sequence[np.ndarray | None]:

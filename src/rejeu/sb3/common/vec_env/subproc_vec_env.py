@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium as gym
 
 from rejeu.core.errors import BadEnvironmentError, WorkerError
-from rejeu.core.types import Action, Observation
+from rejeu.core.types import Action, Info, Observation
 from rejeu.envs.validation import with_location
 from rejeu.envs.workers.pool import RESTARTED, TIMEOUT, Processes, ProcessWorker, Restarted, Workers
 from rejeu.envs.workers.process import WorkerFailure
@@ -73,9 +73,9 @@ class SubprocVecEnv(SingleEnvs):
         self._reset_options()
         return stacked(self.observation_space, self._last)
 
-    def _reset(self, numbers: Sequence[int]) -> dict[int, tuple[Any, dict[str, Any]]]:
+    def _reset(self, numbers: Sequence[int]) -> dict[int, tuple[Observation, Info]]:
         """Resets some environments, again where the process had to be replaced; returns observations and infos."""
-        done: dict[int, tuple[Any, dict[str, Any]]] = {}
+        done: dict[int, tuple[Observation, Info]] = {}
         while len(done) < len(numbers):
             waiting = {i: ("reset", self._seeds[i], self._options[i]) for i in numbers if i not in done}
             self.workers.send(waiting)
