@@ -143,7 +143,7 @@ class Config(RolloutConfig):
         return self.n_epochs * -(-n // self.batch_size)
 
 
-class Samples(NamedTuple):
+class StepTargets(NamedTuple):
     """The steps of a rollout as the loss takes them, leaves ``(batch, ...)``."""
 
     obs: PyTree
@@ -198,12 +198,12 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     return epsilon_greedy_algorithm(init, update, epsilon, state_value=value)
 
 
-def samples(network: Network, rollout: Rollout, q_lambda: float) -> Samples:
+def samples(network: Network, rollout: Rollout, q_lambda: float) -> StepTargets:
     """Returns the steps of a rollout along one axis, with their targets by the network that collected it."""
     next_value = jnp.max(network(flat(rollout.next_obs)), axis=-1).reshape(rollout.reward.shape)
     last = jnp.concatenate([~rollout.valid[1:], jnp.ones_like(rollout.valid[:1])])
     target = lambda_returns(rollout.reward, next_value, rollout.discount, rollout.ended | last, q_lambda)
-    return flat(Samples(rollout.obs, rollout.action, target, rollout.valid))
+    return flat(StepTargets(rollout.obs, rollout.action, target, rollout.valid))
 
 
 def lambda_returns(reward: Array, next_value: Array, discount: Array, ended: Array, q_lambda: float) -> Array:
@@ -226,7 +226,7 @@ def lambda_returns(reward: Array, next_value: Array, discount: Array, ended: Arr
     return summed_backwards(reward + discount * (1.0 - mixing) * next_value, discount * mixing)
 
 
-def td_loss(network: Network, batch: Samples) -> tuple[Array, Array]:
+def td_loss(network: Network, batch: StepTargets) -> tuple[Array, Array]:
     """Returns half the mean square of the TD errors ``Q(s, a) - R``, and the mean of ``Q(s, a)``."""
     value = taken(network(batch.obs), batch.action)
     return masked_mean(0.5 * jnp.square(value - batch.target), batch.valid), masked_mean(value, batch.valid)

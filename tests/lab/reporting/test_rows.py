@@ -8,7 +8,7 @@ import pytest
 
 from rejeu.lab.cli import dumps, main
 from rejeu.lab.reporting import rows as module, run_list
-from rejeu.lab.reporting.rows import COLUMNS, Rows, cells
+from rejeu.lab.reporting.rows import COLUMNS, RowReader, cells
 from rejeu.lab.runs.output import noted_in
 from tests.lab.reporting.report.folders import CONFIG, write
 
@@ -24,7 +24,7 @@ def reads(monkeypatch):
 
 def test_the_best_evaluation_has_its_interval(tmp_path):
     write(tmp_path / "a" / "b")
-    (row,) = Rows(tmp_path).read()
+    (row,) = RowReader(tmp_path).read()
     # mean 160, standard deviation 9 of 20 episodes: 160 -+ 2.093 * 9 / sqrt(19)
     assert (row["best"]["low"], row["best"]["high"]) == pytest.approx((155.679, 164.321), abs=1e-3)
     assert cells(row)["best"] == "160.00 (155.68 to 164.32), 50% success"
@@ -36,7 +36,7 @@ def test_the_rate_is_what_training_measured_last(tmp_path):
     (run / "metrics.csv").write_text(
         "step,time/time_elapsed,time/fps\n1000,10,90\n2000,20,70\n3000,30,\n", encoding="utf-8"
     )
-    (row,) = Rows(tmp_path).read()
+    (row,) = RowReader(tmp_path).read()
     assert row["steps_per_second"] == 70.0
     assert cells(row)["rate"] == "70/s"
 
@@ -44,7 +44,7 @@ def test_the_rate_is_what_training_measured_last(tmp_path):
 def test_a_run_is_read_again_only_after_it_has_changed(tmp_path, reads):
     for name in ("a", "b"):
         write(tmp_path / name)
-    reader = Rows(tmp_path)
+    reader = RowReader(tmp_path)
     first = reader.read()
     assert reader.read() == first
     assert reads == ["a", "b"]
@@ -64,7 +64,7 @@ def test_a_row_says_that_its_run_is_damaged_or_gone_or_not_read_yet(tmp_path):
     shutil.move(tmp_path / "monitor.csv", tmp_path / "c" / "monitor.csv")
     for name in ("config.json", "episodes.csv", "metrics.csv"):
         (tmp_path / "c" / name).unlink()
-    reader = Rows(tmp_path)
+    reader = RowReader(tmp_path)
     assert [row["state"] for row in reader.read(seconds=0)] == ["unread"] * 3
     a, b, c = reader.read()
     assert "config.json is damaged" in a["notes"][0]
@@ -79,7 +79,7 @@ def test_a_row_says_that_its_run_is_damaged_or_gone_or_not_read_yet(tmp_path):
 
 def test_rows_are_json(tmp_path):
     write(tmp_path / "a")
-    (row,) = json.loads(dumps(Rows(tmp_path).read()))
+    (row,) = json.loads(dumps(RowReader(tmp_path).read()))
     assert len(row["curve"]) == 40
 
 
@@ -95,7 +95,7 @@ def test_odd_names_links_and_files_for_folders_hide_no_other_run(tmp_path, capsy
         (tmp_path / "files" / name).touch()
     for name, target in (("loop", "loop"), ("up", ".."), ("nowhere", "no/where")):
         (tmp_path / name).symlink_to(target)
-    reader = Rows(tmp_path)
+    reader = RowReader(tmp_path)
     rows = {row["run"]: row for row in reader.read()}
     assert {*rows} == {"good", "L" * 250, "loops", "files", r"group/\udce9", r"bad\udcff\udcfe"}
     for name, row in rows.items():
@@ -121,7 +121,7 @@ def test_a_run_that_causes_any_error_hides_no_other_run(tmp_path, monkeypatch):
         return read(path, **options)
 
     monkeypatch.setattr(run_list, "read", fail)
-    assert [(row["state"], row["notes"]) for row in Rows(tmp_path).read()] == [
+    assert [(row["state"], row["notes"]) for row in RowReader(tmp_path).read()] == [
         ("damaged", ("RecursionError()",)),
         ("finished", ()),
     ]
@@ -133,7 +133,7 @@ def test_a_folder_without_permission_has_a_row_that_says_so(tmp_path, mode):
     for name in ("a", "b"):
         write(tmp_path / name, videos=False)
     (tmp_path / "a").chmod(mode)
-    a, b = Rows(tmp_path).read()
+    a, b = RowReader(tmp_path).read()
     (tmp_path / "a").chmod(0o755)
     assert (a["state"], b["state"]) == ("damaged", "finished")
     assert "Permission denied" in a["notes"][0]
@@ -154,7 +154,7 @@ def test_a_folder_that_cannot_be_read_has_a_row_that_says_so(tmp_path, monkeypat
 
     for name in ("scandir", "lstat"):
         monkeypatch.setattr(os, name, denied(getattr(os, name)))
-    a, b = Rows(tmp_path).read()
+    a, b = RowReader(tmp_path).read()
     assert (a["run"], a["state"], b["state"]) == ("a", "damaged", "finished")
     assert "Permission denied" in a["notes"][0]
 
@@ -162,21 +162,21 @@ def test_a_folder_that_cannot_be_read_has_a_row_that_says_so(tmp_path, monkeypat
 def test_a_row_says_which_error_has_ended_a_run_until_it_is_resumed(tmp_path):
     run = write(tmp_path / "a", {**CONFIG, "steps": 10**6}, videos=False)
     (run / "warnings.txt").write_text("the reward is large\nNonFiniteError: the loss is NaN\n", encoding="utf-8")
-    (row,) = Rows(tmp_path).read()
+    (row,) = RowReader(tmp_path).read()
     assert (row["state"], row["notes"][0]) == ("crashed", "NonFiniteError: the loss is NaN")
     with noted_in(run / "warnings.txt"):
         pass
-    (row,) = Rows(tmp_path).read()
+    (row,) = RowReader(tmp_path).read()
     assert (row["state"], row["notes"]) == ("interrupted", ())
     assert row["warnings"][-1] == "the run was resumed after this error"
     with pytest.raises(KeyError), noted_in(run / "warnings.txt"):
         raise KeyError("at")
-    (row,) = Rows(tmp_path).read()
+    (row,) = RowReader(tmp_path).read()
     assert (row["state"], row["notes"][0]) == ("crashed", "KeyError: 'at'")
 
 
 def test_the_error_that_ended_a_run_is_found_after_many_warnings(tmp_path):
     run = write(tmp_path / "a", {**CONFIG, "steps": 10**6}, videos=False)
     (run / "warnings.txt").write_text("odd\n" * 500 + "ValueError: end\n", encoding="utf-8")
-    (row,) = Rows(tmp_path).read()
+    (row,) = RowReader(tmp_path).read()
     assert (row["state"], row["notes"][0], len(row["warnings"])) == ("crashed", "ValueError: end", 100)

@@ -4,7 +4,7 @@ from urllib.parse import urlencode
 
 import pytest
 
-from rejeu.lab.reporting.rows import Rows
+from rejeu.lab.reporting.rows import RowReader
 from tests.lab.studio.conftest import opened, serving
 from tests.lab.studio.hostile import write_all
 from tests.tiers import exhaustive
@@ -21,7 +21,7 @@ def served(tmp_path_factory):
 @pytest.fixture(scope="module")
 def names(served):
     """The names of the runs, as addresses have them."""
-    return [row["run"] for row in Rows(served.folder).read()]
+    return [row["run"] for row in RowReader(served.folder).read()]
 
 
 def test_no_row_is_missing(browser, served, names):

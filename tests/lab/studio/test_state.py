@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip("nicegui", reason="needs nicegui, which is in the extra studio")
 
 from rejeu.lab import studio as package
-from rejeu.lab.reporting.rows import Rows
+from rejeu.lab.reporting.rows import RowReader
 from rejeu.lab.runs.arguments import RunOptions
 from rejeu.lab.runs.config import RunConfig
 from rejeu.lab.studio.state import Studio
@@ -23,7 +23,7 @@ def read(folder, typed=None, **runs):
     for name, changes in runs.items():
         write(folder / name, {**CONFIG, **changes}, videos=False)
     studio = Studio(folder) if typed is None else Studio(folder, typed=typed)
-    reader = Rows(folder)
+    reader = RowReader(folder)
     studio.rows, studio.summaries = reader.read(), reader.summaries()
     return studio
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from rejeu.lab.reporting.rows import Rows
+from rejeu.lab.reporting.rows import RowReader
 from tests.lab.reporting.report.folders import CONFIG, write
 
 runs = pytest.importorskip("rejeu.lab.studio.runs", reason="needs nicegui, which is in the extra studio")
@@ -11,7 +11,7 @@ runs = pytest.importorskip("rejeu.lab.studio.runs", reason="needs nicegui, which
 def test_the_line_of_a_group_is_about_all_of_its_runs(tmp_path):
     for seed in range(3):
         write(tmp_path / "seeds" / f"seed_{seed}", {**CONFIG, "seed": seed}, videos=False)
-    rows = Rows(tmp_path).read()
+    rows = RowReader(tmp_path).read()
     best = [{**row, "best": {**row["best"], "mean_return": value}} for row, value in zip(rows, (1, 2, 6), strict=True)]
     [folded] = runs.lines(best, ["seeds"] * 3, set())
     assert (folded["name"], folded["best"]) == ("seeds (3)", "3.00")

@@ -19,7 +19,7 @@ PAPER, INK, FAINT = (246, 246, 243), (52, 58, 70), (214, 225, 240)
 AGENT, GOAL = (40, 104, 190), (38, 150, 96)
 
 
-class Original(Drawing):
+class GymnasiumDrawing(Drawing):
     """An environment of Gymnasium that draws our states."""
 
     def __init__(self, env: gym.Env) -> None:
@@ -40,7 +40,7 @@ def original(env_class: Callable[..., gym.Env], *fields: str) -> Callable[[Any, 
     """Returns the drawing of an environment by one of Gymnasium, which gets these fields of ours."""
 
     def make(env: Any, render_mode: str) -> Drawing:
-        return Original(env_class(render_mode=render_mode, **{name: getattr(env, name) for name in fields}))
+        return GymnasiumDrawing(env_class(render_mode=render_mode, **{name: getattr(env, name) for name in fields}))
 
     return make
 

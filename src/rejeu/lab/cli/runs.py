@@ -11,7 +11,7 @@ from rejeu.core.records import utf8
 from rejeu.core.types import JsonObject
 from rejeu.lab.cli.commands import Runs, Status
 from rejeu.lab.reporting import run_list
-from rejeu.lab.reporting.rows import COLUMNS, N_TEXT, Row, Rows, cells, describe, texts
+from rejeu.lab.reporting.rows import COLUMNS, N_TEXT, Row, RowReader, cells, describe, texts
 from rejeu.logs.formatting import console, show_table, table_of
 
 EXIT = {"running": 0, "finished": 0, "unknown": 0, "paused": 3, "interrupted": 3, "crashed": 4, "damaged": 4}
@@ -24,7 +24,7 @@ def run_runs(arguments: Runs) -> tuple[int, JsonObject]:
     """Prints a table of the runs in a folder, with ``--follow`` until Ctrl-C."""
     if not arguments.folder.exists():
         raise FileNotFoundError(f"there is no folder {arguments.folder}; rejeu train ENV makes runs in the folder runs")
-    reader = Rows(arguments.folder)
+    reader = RowReader(arguments.folder)
     if arguments.follow:
         follow(reader)
     rows = reader.read()
@@ -51,7 +51,7 @@ def show(rows: Sequence[Row], folder: Path) -> None:
     print("".join(f"note: {cells(row)['run']}: {note}\n" for row in rows for note in row["notes"]), end="")
 
 
-def follow(reader: Rows) -> None:
+def follow(reader: RowReader) -> None:
     """Shows the rows on a terminal, and when they change again, until Ctrl-C; elsewhere each time below the last."""
     from rich.live import Live
 

@@ -8,7 +8,7 @@ from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 from rejeu.lab.experiments.scheduler import Scheduler
-from rejeu.lab.reporting.rows import COLUMNS, N_TEXT, Row, Rows, best_text, steps_text, texts
+from rejeu.lab.reporting.rows import COLUMNS, N_TEXT, Row, RowReader, best_text, steps_text, texts
 from rejeu.logs.formatting import console, table_of
 
 REFRESH, LINES = 2.0, 30.0
@@ -29,7 +29,7 @@ def shown(scheduler: Scheduler, summary: Callable[[], str], progress: bool = Tru
     from rich.console import Group
     from rich.live import Live
 
-    to, reader = console(highlight=False), Rows(Path())
+    to, reader = console(highlight=False), RowReader(Path())
     table = Live(console=to, auto_refresh=False, transient=True) if progress and to.is_terminal else None
     due = time.monotonic() + (LINES if table is None else 0.0)
 
@@ -48,7 +48,7 @@ def shown(scheduler: Scheduler, summary: Callable[[], str], progress: bool = Tru
         yield watch
 
 
-def rows_of(scheduler: Scheduler, reader: Rows) -> list[Row]:
+def rows_of(scheduler: Scheduler, reader: RowReader) -> list[Row]:
     """Returns the rows of the runs that train."""
     works = [attempt.work for attempt in scheduler.running]
     return [{**reader.row(work.path), "run": work.name, "state": "running"} for work in works]

@@ -76,7 +76,7 @@ class Content:
     resources: Kwargs = field(default_factory=dict)
 
 
-class Environment(NamedTuple):
+class PlannedEnvironment(NamedTuple):
     """An environment of a plan, and its spaces."""
 
     label: str
@@ -169,7 +169,7 @@ def parse(content: Mapping[str, object], plan: str) -> Plan:
 
 
 def expanded(
-    environments: list[Environment], settings: Mapping[str, Kwargs], seeds: list[int], plan: str
+    environments: list[PlannedEnvironment], settings: Mapping[str, Kwargs], seeds: list[int], plan: str
 ) -> Iterator[Job]:
     """Yields the job of each combination, after all values were checked, and then that each agent can be built.
 
@@ -237,7 +237,7 @@ def read_algorithms(value: object) -> tuple[str, ...]:
     return algorithms
 
 
-def read_environments(content: Content, common: Kwargs, plan: str) -> Iterator[Environment]:
+def read_environments(content: Content, common: Kwargs, plan: str) -> Iterator[PlannedEnvironment]:
     """Yields the environments of a plan: a list of ids, or a table of tables with options of their own."""
     tables = content.environments
     with at(plan, "algorithms"):
@@ -267,7 +267,7 @@ def read_environments(content: Content, common: Kwargs, plan: str) -> Iterator[E
             options = {key: value for key, value in common.items() if key not in dropped} | table_options
             run, files = read_run(env_id, kwargs, options)
             env_algorithms = algorithms if entries.algorithms is None else read_algorithms(entries.algorithms)
-            yield Environment(label, run, files, env_algorithms, *find_spaces(run))
+            yield PlannedEnvironment(label, run, files, env_algorithms, *find_spaces(run))
 
 
 def seeds_of(content: Content) -> list[int]:
@@ -306,7 +306,7 @@ def read_hyperparameters(algorithm: str, base: Mapping[str, object], values: Map
     return build(config, merged(dict(flat(values)), base))
 
 
-def check_spaces(environment: Environment, config: Any) -> None:
+def check_spaces(environment: PlannedEnvironment, config: Any) -> None:
     """Builds the algorithm for the spaces of an environment.
 
     Raises:

@@ -481,12 +481,12 @@ def page_of(comparison: Comparison) -> str:
     envs = list(dict.fromkeys(group.env_id for group in comparison.groups))
     labels = list(dict.fromkeys(group.label for group in comparison.groups))
     charts: dict[str, Chart] = {}
-    entries: dict[str, list[page.Entry]] = {"curve": [], "profile": []}
+    entries: dict[str, list[page.ChartEntry]] = {"curve": [], "profile": []}
     for i, env in enumerate(envs):
         for form in entries:
             key = f"{form}{i}"
             charts[key] = group_chart(form, comparison, env)
-            entries[form].append(page.Entry(key, env or "unknown environment"))
+            entries[form].append(page.ChartEntry(key, env or "unknown environment"))
     names = {"algorithm": "algorithms", "setting": "settings", "env": "environments"}
     n_runs = sum(len(group.runs) for group in comparison.groups)
     title = f"Comparison of {len(labels)} {names[comparison.by]}" if len(labels) > 1 else labels[0]

@@ -51,7 +51,7 @@ class Known:
     """When it may be read again, by :func:`time.monotonic`."""
 
 
-class Rows:
+class RowReader:
     """The rows of all runs below a folder. Mutable; for one thread."""
 
     def __init__(self, folder: Path) -> None:

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path, PurePath
 
 from rejeu.envs.registry import are_plain, is_plain_id
-from rejeu.lab.reporting.rows import Row, Rows
+from rejeu.lab.reporting.rows import Row, RowReader
 from rejeu.lab.runs.arguments import RunOptions
 from rejeu.lab.runs.config import RunConfig, written
 from rejeu.lab.runs.environment import Environment
@@ -35,12 +35,12 @@ class Studio:
         self.guests = dict(guests or {})
         """Models that the command line named, with their environments; they may be elsewhere."""
         self.rows: list[Row] = []
-        """One a run, as :meth:`rejeu.lab.reporting.rows.Rows.read` returns them. Replaced when they change, never changed."""
+        """One a run, of :meth:`rejeu.lab.reporting.rows.RowReader.read`. Replaced when they change, never changed."""
         self.summaries: Mapping[str, RunSummary] = {}
         """The runs without their tables, by the names of their rows."""
         self.version = 0
         """Rises when the rows change."""
-        self._reader = Rows(folder)
+        self._reader = RowReader(folder)
         self._trusted = [typed]
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._follow, daemon=True)

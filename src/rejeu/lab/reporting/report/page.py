@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 TEMPLATES = Path(__file__).parent / "templates"
 
 
-class Entry(NamedTuple):
+class ChartEntry(NamedTuple):
     """A chart on a page."""
 
     id: str

@@ -14,7 +14,7 @@ import numpy as np
 from rejeu.checkpoints.run_folder import RunFolder
 from rejeu.core.records import shown
 from rejeu.core.types import JsonObject
-from rejeu.lab.reporting.report.page import Entry
+from rejeu.lab.reporting.report.page import ChartEntry
 from rejeu.lab.reporting.report.videos import BUDGET, Video, collect
 from rejeu.lab.runs.config import RunConfig
 from rejeu.lab.runs.read import MAX_WORD, RunSummary, best_row
@@ -48,7 +48,7 @@ class ChartGroup(NamedTuple):
     """The charts below a heading."""
 
     title: str
-    charts: list[Entry]
+    charts: list[ChartEntry]
 
 
 class Hyperparameter(NamedTuple):
@@ -136,11 +136,11 @@ def charts_of(run: RunSummary, prefix: str) -> tuple[dict[str, Chart], list[Char
     curves.append((GOALS, "goals", "Goals of the trained agent", chart_data.goal_chart(run.replays)))
     curves.append((TIME, "time", "Shares of the time", chart_data.time_chart(run.metrics)))
     charts: dict[str, Chart] = {}
-    groups: dict[str, list[Entry]] = {heading: [] for heading in (CURVES, GOALS, *chart_data.GROUPS, TIME)}
+    groups: dict[str, list[ChartEntry]] = {heading: [] for heading in (CURVES, GOALS, *chart_data.GROUPS, TIME)}
     for heading, key, title, chart in curves:
         if chart is not None:
             charts[f"{prefix}-{key}"] = chart
-            groups[heading].append(Entry(f"{prefix}-{key}", title, chart["note"]))
+            groups[heading].append(ChartEntry(f"{prefix}-{key}", title, chart["note"]))
     return charts, [ChartGroup(heading, entries) for heading, entries in groups.items() if entries]
 
 
