@@ -6,6 +6,7 @@ import pytest
 
 from rejeu.sb3 import A2C, DQN, PPO
 from rejeu.sb3.common.callbacks import BaseCallback
+from rejeu.sb3_contrib import ARS
 
 TINY = {"policy_kwargs": {"net_arch": [4]}, "seed": 0}
 FAST = {"train_freq": 8, "learning_starts": 8, "batch_size": 8, "target_update_interval": 10_000}
@@ -115,3 +116,8 @@ def test_attributes_of_ones_own_can_be_set_and_nearly_right_names_warn(dqn):
     assert dqn.best_so_far == 3
     with pytest.warns(UserWarning, match="is the hyperparameter batch_size meant"):
         dqn.batchsize = 3
+
+
+def test_a_function_for_the_noise_of_ars_takes_the_remaining_progress():
+    model = ARS("LinearPolicy", "Pendulum-v1", delta_std=lambda remaining: 0.1 * remaining)
+    assert (model.config.delta_std(1.0), model.delta_std(1.0)) == (0.0, 0.1)

@@ -6,7 +6,6 @@ callbacks are computed together, by ``jax.vmap`` over the runs.
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
@@ -17,12 +16,13 @@ import jax
 from rejeu.agents import device, training
 from rejeu.agents.agent import Agent
 from rejeu.agents.device import require_memory
+from rejeu.algorithms import config as configs
 from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.callbacks.base import Callback, in_order, listed
 from rejeu.callbacks.progress_bar import ProgressBar
 from rejeu.core import devices
 from rejeu.core.interrupt import Interrupt
-from rejeu.core.validation import is_number, whole, whole_seed
+from rejeu.core.validation import field_names, is_number, whole, whole_seed
 from rejeu.envs.functional.protocol import FunctionalEnv
 from rejeu.envs.make import make_vector
 from rejeu.exploration import explorer as exploration
@@ -255,12 +255,12 @@ def reason_against(agent: Agent, callbacks: Sequence[Callback]) -> str | None:
 
 def check_differing(agent: Agent, names: Iterable[str]) -> None:
     """Raises ``ValueError`` if hyperparameters cannot differ between the runs of one program."""
-    types = {field.name: str(field.type) for field in dataclasses.fields(agent.config)}
+    types = configs.value_types(type(agent.config))
     for name in names:
-        if name not in types:
+        if name not in field_names(type(agent.config)):
             raise ValueError(f"{name} is no hyperparameter of {agent.name} and is equal for all runs; give one value")
         in_replay = name in IN_REPLAY and isinstance(agent.config, OffPolicyConfig)
-        if "float" not in types[name] or in_replay:
+        if float not in types[name] or in_replay:
             raise ValueError(
                 f"{name} cannot differ between the runs of one program, which is compiled for its value; give one number, or "
                 "train one program for each"

@@ -10,8 +10,10 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from types import UnionType
+from typing import Any, ClassVar, Literal, Union, get_args, get_origin, get_type_hints
 
 import optax
 from gymnasium import spaces
@@ -311,6 +313,18 @@ def own_changes(saved: Mapping[str, object], changes: Mapping[str, object]) -> S
     modules = {key: policy[key] for key in OWN_MODULES if key in policy} if isinstance(policy, Mapping) else {}
     replacements = {key: value for key, value in changes.items() if key in mentioned}
     return replacements | ({"policy_kwargs": modules} if modules else {})
+
+
+@cache
+def value_types(config_class: type) -> dict[str, tuple[Any, ...]]:
+    """Returns the types that the values of each field of a configuration may have, such as ``(float, Schedule)``."""
+    hints = get_type_hints(config_class)
+    return {name: get_args(x) if get_origin(x) in (Union, UnionType) else (x,) for name, x in hints.items()}
+
+
+def takes_schedule(config_class: type, name: str) -> bool:
+    """Returns whether a hyperparameter may be a function of the progress."""
+    return Schedule in value_types(config_class).get(name, ())
 
 
 def is_own(value: object) -> bool:

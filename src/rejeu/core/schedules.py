@@ -124,7 +124,7 @@ SCHEDULES: dict[str, type[Linear] | type[Exponential] | type[TableSchedule]] = {
 
 def at(value: float | Schedule, progress: Scalar) -> Any:
     """Returns the value of a number or of a schedule at ``progress``."""
-    return value if isinstance(value, int | float) else value(progress)
+    return value(progress) if callable(value) else value
 
 
 def parse(name: str, value: object, least: float = -math.inf) -> float | Schedule:

@@ -204,7 +204,9 @@ class Original(Agent):
             value = getattr(config, name)
             if isinstance(value, schedules.Live):
                 return value.value
-            return utils.of_remaining(value) if name in arguments.SCHEDULED and callable(value) else value
+            return (
+                utils.of_remaining(value) if configs.takes_schedule(type(config), name) and callable(value) else value
+            )
         if name in policies.NETWORKS:
             return getattr(self.policy, name)
         if name in RUN:
@@ -236,7 +238,7 @@ class Original(Agent):
                 finite.settle(self)
                 old.value = number
             elif "run" in self.__dict__ and new != config:
-                if self.is_learning and name in arguments.SCHEDULED and isinstance(number, int | float):
+                if self.is_learning and configs.takes_schedule(type(config), name) and isinstance(number, int | float):
                     with suppress(TypeError, ValueError):  # what is set once may be set at every step
                         new = dataclasses.replace(config, **{name: schedules.Live(number)})
                 self.change(new)

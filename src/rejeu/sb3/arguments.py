@@ -8,6 +8,7 @@ from typing import Any
 
 from rejeu.agents import Agent
 from rejeu.agents.base import AGENT_ARGUMENTS
+from rejeu.algorithms import config as configs
 from rejeu.algorithms.config import REPLAY_BUFFERS
 from rejeu.core import validation
 from rejeu.core.types import Arguments, Settings
@@ -15,8 +16,6 @@ from rejeu.sb3.common import buffers, utils
 from rejeu.sb3.common.noise import VectorizedActionNoise
 from rejeu.sb3.common.torch_layers import encoder_of, is_torch
 
-SCHEDULED = ("learning_rate", "clip_range", "clip_range_vf", "ent_coef", "critic_learning_rate", "beta")
-"""The hyperparameters that can be schedules."""
 WITHOUT_EFFECT = (
     "_init_setup_model",
     "optimize_memory_usage",
@@ -66,14 +65,15 @@ POSITIONAL = {
 
 def converted(agent_class: type[Agent], settings: Mapping[str, object]) -> Settings:
     """Returns keyword arguments of the constructor or of ``load`` as rejeu's agent takes them."""
-    setting_names = {*validation.field_names(agent_class.algorithm.Config), *AGENT_ARGUMENTS}
+    config = agent_class.algorithm.Config
+    setting_names = {*validation.field_names(config), *AGENT_ARGUMENTS}
     result: Settings = {}
     for key, value in settings.items():
         if key in WITHOUT_EFFECT or (key not in setting_names and value in NEUTRAL.get(key, ())):
             if value not in NEUTRAL.get(key, (value,)):
                 unsupported(key, value)
             continue
-        result[key] = utils.of_progress(value) if key in SCHEDULED else value
+        result[key] = utils.of_progress(value) if configs.takes_schedule(config, key) else value
     if isinstance(result.get("priorities"), Mapping):
         result["priorities"] = {key: utils.of_progress(value) for key, value in result["priorities"].items()}
     if isinstance(noise := result.get("action_noise"), VectorizedActionNoise):
