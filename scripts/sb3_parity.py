@@ -103,7 +103,7 @@ def described(one: Any, package: str) -> dict[str, list[str]]:
 
 def accepted(one: Any) -> set[str]:
     """Returns the arguments that a class or function of rejeu takes by name."""
-    from rejeu.agents.base import AGENT_ARGUMENTS
+    from rejeu.checkpoints.agent_state import AGENT_ARGUMENTS
     from rejeu.core import validation
     from rejeu.sb3 import algorithms, arguments
 

@@ -5,8 +5,9 @@
 SRC is the folder that contains ``rejeu`` (default: ``src``). The layers are the list under "Layout" in docs/design.md, and the
 limits the table under "Size". A line counts if it holds code: not a comment, a docstring or a blank line. Every Python file of
 the package counts. Exits with status 1 if there is a cycle, an access to a private attribute, an import against the layers,
-more lines than a limit, the name of an algorithm as text outside of :data:`NAMES_ALGORITHMS`, or more placeholders, vague
-docstrings or ``Any`` than :data:`MAX_PLACEHOLDER_SHARE`, :data:`MAX_VAGUE_DOCSTRINGS` and :data:`MAX_ANY`.
+two folders that import each other, more lines than a limit, the name of an algorithm as text outside of
+:data:`NAMES_ALGORITHMS`, or more placeholders, vague docstrings or ``Any`` than :data:`MAX_PLACEHOLDER_SHARE`,
+:data:`MAX_VAGUE_DOCSTRINGS` and :data:`MAX_ANY`.
 """
 
 from __future__ import annotations
@@ -30,7 +31,8 @@ from scipy.sparse.csgraph import connected_components
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = "rejeu"
-ENFORCED = ("cycles", "private_accesses", "private_imports", "layering_violations", "over_the_limit", "algorithm_names")
+ENFORCED = ("cycles", "private_accesses", "private_imports", "layering_violations", "both_ways", "over_the_limit")
+ENFORCED += ("algorithm_names",)
 """Lists that must be empty."""
 PUBLIC_IN_SPITE_OF_ITS_NAME = {"_replace", "_asdict", "_fields", "_field_defaults", "_make", "_exit", "_getframe"}
 """Documented methods of named tuples, and of ``os`` and ``sys``."""
@@ -196,6 +198,16 @@ def layering_violations(found: list[tuple[str, str, int]], order: list[str]) -> 
     return violations
 
 
+def both_ways(found: list[tuple[str, str, int]]) -> list[str]:
+    """Returns the pairs of rooms, which are the folders of the package, that import each other."""
+    arrows = {
+        (importer.split(".")[1], imported.split(".")[1])
+        for importer, imported, _ in found
+        if "." in importer and "." in imported
+    }
+    return sorted(f"{a} and {b}" for a, b in arrows if a < b and (b, a) in arrows)
+
+
 def algorithm_names(src: Path, modules: dict[str, tuple[Path, ast.Module]]) -> list[str]:
     """Returns the places outside of :data:`NAMES_ALGORITHMS` where a string is the name of an algorithm."""
     names = tomllib.loads((src / PACKAGE / "algorithms" / "catalog.toml").read_text(encoding="utf-8"))
@@ -334,6 +346,7 @@ def measure(src: Path) -> dict[str, Any]:
         ],
         "private_imports": [f"{m}:{line} {text}" for m, (_, t) in modules.items() for line, text in private_imports(t)],
         "layering_violations": layering_violations(found, layers()),
+        "both_ways": both_ways(found),
         "over_the_limit": over_the_limit(lines) + over_the_share(modules, placeholders, vague, n_any),
         "placeholders": placeholders,
         "vague_docstrings": vague,

@@ -13,7 +13,7 @@ from unittest import mock
 
 import gymnasium as gym
 
-from rejeu.agents import Agent, base
+from rejeu.agents import Agent, agent as agent_module
 from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.core import spaces
 from rejeu.training.learner import Learner
@@ -46,7 +46,7 @@ def _build_or_share(agent: Agent, observation_space: gym.Space, action_space: gy
     if key not in _learners:
         _build(agent, observation_space, action_space)
         _learners[key] = agent.learner
-    with mock.patch.object(base, "Learner", return_value=copy.copy(_learners[key])):
+    with mock.patch.object(agent_module, "Learner", return_value=copy.copy(_learners[key])):
         _build(agent, observation_space, action_space)
 
 

@@ -24,3 +24,9 @@ def test_the_name_of_an_algorithm_stands_in_its_room_alone():
         for room in ("agents.agent", "lab.cli", "algorithms_too")
         for place in ("2 SAC", "4 TQC")
     ]
+
+
+def test_two_folders_that_import_each_other_are_named_once():
+    arrows = [("checkpoints.resume", "agents.policy"), ("agents.agent", "checkpoints.resume"), ("agents.agent", "core")]
+    imports = [(f"rejeu.{importer}", f"rejeu.{imported}", 1) for importer, imported in arrows]
+    assert structure().both_ways([*imports, ("rejeu.agents.agent", "rejeu", 1)]) == ["agents and checkpoints"]

@@ -104,4 +104,4 @@ def test_the_checkpoint_at_the_start_of_a_resumed_run_contains_the_restored_stat
     stop = lambda agent, progress: progress.step < 21  # noqa: E731
     agent.learn(callback=[Counting(), Checkpoint(tmp_path / "two", every=1000), stop])
     again = type(agent).resume(tmp_path / "two")
-    assert again.saved_callbacks == [("Counting", {"n": 21})]
+    assert again.call.saved_callbacks == [("Counting", {"n": 21})]

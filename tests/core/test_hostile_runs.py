@@ -51,7 +51,7 @@ def resumed(run, tmp_path, change, **hyperparameters):
     header, arrays = checkpoint.read(path, "run")
     change(header, header["run"]["dict"], arrays)
     checkpoint.write(path, "run", arrays, {k: v for k, v in header.items() if k not in checkpoint.RESERVED})
-    with mock.patch.object(rejeu.agents.base, "Learner", return_value=copy.copy(compiled)):
+    with mock.patch.object(rejeu.agents.agent, "Learner", return_value=copy.copy(compiled)):
         return kind.resume(folder, **hyperparameters)
 
 
@@ -152,7 +152,7 @@ def replaced(run, folder, path, content, size=None):
 def trained_further(run, folder):
     """Resumes the run in a folder and trains it for some steps."""
     kind, _, compiled = run
-    shared = mock.patch.object(rejeu.agents.base, "Learner", return_value=copy.copy(compiled))
+    shared = mock.patch.object(rejeu.agents.agent, "Learner", return_value=copy.copy(compiled))
     with shared, warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # that it is not exact
         agent = kind.resume(folder)

@@ -1,37 +1,532 @@
-"""The methods of every agent that users call, under the names of Stable-Baselines3."""
+"""The class of all agents: what they consist of, what subclasses override, and what users call."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+import dataclasses
+import difflib
+import inspect
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, Self, TypeVar, overload
 
+import gymnasium as gym
 import jax
 import numpy as np
 
-from rejeu.agents import policy, summary, training
-from rejeu.agents.base import BaseAgent
+from rejeu.agents import policy as playing, summary, training
+from rejeu.agents.signature import Documentation, Signature
+from rejeu.algorithms import config as configs, contract
+from rejeu.algorithms.config import AlgorithmConfig
+from rejeu.algorithms.rnd import with_rnd
 from rejeu.callbacks.base import Callback
 from rejeu.checkpoints import model_files, resume
+from rejeu.checkpoints.agent_state import (
+    AGENT_ARGUMENTS,
+    BEST_WINDOW,
+    Best,
+    CallState,
+    Files,
+    Identity,
+    Outputs,
+    Resumed,
+    Statistics,
+)
 from rejeu.checkpoints.run_files import CheckpointFolder, folder_of
 from rejeu.checkpoints.run_folder import find_model
-from rejeu.core import algorithm as core, checkpoint, devices, spaces
-from rejeu.core.types import AnyArray, Observation, PyTree
+from rejeu.core import checkpoint, devices, hardware, spaces, validation, xla
+from rejeu.core.algorithm import Algorithm, Masked, names
+from rejeu.core.failed_writes import FailedWrites
+from rejeu.core.normalization import normalized
+from rejeu.core.types import AnyArray, Observation, PyTree, Settings
 from rejeu.core.validation import as_path, number, whole
 from rejeu.envs.base import seed_of_run
-from rejeu.envs.masks import split
+from rejeu.envs.make import Backend, VectorEnv, make_vector
+from rejeu.envs.masks import make_masked, mask_leaf, n_choices, split
+from rejeu.exploration import explorer as exploration
+from rejeu.exploration.noise import Noise, check_fits
 from rejeu.logs.evaluation import Evaluation, evaluate
-from rejeu.logs.formatting import counted
-from rejeu.logs.logging import Logger, Sink
+from rejeu.logs.formatting import counted, html_table
+from rejeu.logs.history import History
+from rejeu.logs.logging import Logger, Sink, check_logs
+from rejeu.training import finite
+from rejeu.training.compiled import Stops
+from rejeu.training.learner import Learner, PackedState
+from rejeu.training.run import Progress, Run, TrainingCall, initial_run
 
 if TYPE_CHECKING:
     from rejeu.agents.exporting import Exported
 
+T = TypeVar("T")
+READ_ONCE = ("seed", "stats_window_size", "device")
+"""Arguments that cannot be set later."""
+IN_BUFFER = {"buffer_size", "demonstration_share", "demonstrations", "frame_stack", "n_episodes", "n_steps", "offline"}
+IN_BUFFER |= {"priorities", "replay_buffer_class", "replay_buffer_kwargs"}
+"""Hyperparameters that a buffer which holds steps depends on."""
 
-class Agent(BaseAgent):
-    """The base class of all agents. Abstract: use SAC, PPO or another algorithm."""
 
-    q_values = policy.q_values
+class PartOf(Generic[T]):
+    """An attribute of an agent that is one of the values that it consists of, such as its ``identity``."""
+
+    def __init__(self, owner: str) -> None:
+        self.owner = owner
+
+    def __set_name__(self, agent_class: type, name: str) -> None:
+        self.name = name
+
+    @overload
+    def __get__(self, agent: None, agent_class: type) -> Self: ...
+    @overload
+    def __get__(self, agent: Agent, agent_class: type) -> T: ...
+    def __get__(self, agent: Agent | None, agent_class: type) -> Any:
+        return self if agent is None else getattr(getattr(agent, self.owner), self.name)
+
+    def __set__(self, agent: Agent, value: T) -> None:
+        setattr(getattr(agent, self.owner), self.name, value)
+
+
+class ClassOnly:
+    """Makes ``load`` raise an error on an instance, where it would silently leave that instance as it was."""
+
+    def __init__(self, method: Any) -> None:
+        self.method = method
+        self.__doc__ = method.__func__.__doc__
+
+    def __get__(self, instance: Any, owner: type) -> Any:
+        if instance is not None:
+            raise TypeError(
+                f"load is called on the class and returns a new agent: agent = {owner.__name__}.load(path); "
+                "to change this one in place use agent.set_parameters(path)"
+            )
+        return self.method.__get__(None, owner)
+
+
+class Agent(ABC):
+    """The base class of all agents. Abstract: use SAC, PPO or another algorithm.
+
+    To add an algorithm, subclass :class:`rejeu.OffPolicyAgent` or :class:`rejeu.OnPolicyAgent`. Values that belong together
+    are one: ``identity``, ``outputs``, the ``call`` of ``learn``, the ``record`` of training, ``files``.
+    """
+
+    algorithm: ClassVar[Any]
+    """The object with ``Config`` and ``make``: a module, or a ``types.SimpleNamespace(Config=Config, make=make)``."""
+    config: Any
+    """Its hyperparameters."""
+    identity: Identity
+    """Arguments that tell it from other agents of the same hyperparameters, which training does not change."""
+    observation_space: gym.Space
+    action_space: gym.Space
+    obs_leaves: tuple[spaces.Leaf, ...]
+    """The arrays of an observation."""
+    learner: Learner
+    """The compiled functions of the algorithm."""
+    run: Run
+    """The state that every step changes: environments, buffer, counters, and the state of the algorithm."""
+    on_device: bool | None = None
+    """Whether ``learn`` trains in one program on the device: True requires it, False uses the loop of the host. None uses the
+    device where the environments are JAX environments and the settings allow it; see ``docs/device.md``."""
+    outputs: Outputs
+    """Where rows of statistics go."""
+    logger: Logger
+    """Accepts further numbers for the rows of statistics."""
+    call: CallState
+    """The current or last call of ``learn``, and what it counts from."""
+    record: Statistics
+    """The episodes of training, the speed, and the best weights."""
+    files: Files
+    """The files that training writes, and those that it could not write."""
+    resumed: Resumed | None = None
+    """Where :meth:`resume` continued the run; None for a new or loaded agent."""
+    notes: list[str]
+    """The notes of :func:`rejeu.sb3.load_zip` about the file; only of agents that it read."""
+    n_predictions: int = 0
+    """Calls of ``predict`` that drew from the policy; each draws with a key of its own."""
+
+    policy_name = PartOf[str]("identity")
+    """The argument ``policy``."""
+    seed = PartOf[int]("identity")
+    """Of networks, exploration, batches and environments."""
+    stats_window_size = PartOf[int]("identity")
+    """Episodes over which reported means are taken."""
+    success_threshold = PartOf[float | None]("identity")
+    """Least return of a successful episode where the environment does not report success."""
+    best_window = PartOf[int]("identity")
+    """Training episodes over whose mean return the best weights are chosen."""
+    device = PartOf[str]("identity")
+    """Where it computes: ``"auto"``, ``"cpu"`` or ``"gpu"``."""
+    run_id = PartOf[str]("identity")
+    """Identifies the run in its checkpoints."""
+    made_from_id = PartOf[bool]("identity")
+    """Whether the environments were made from an id."""
+    trained_on = PartOf[tuple[str, Mapping[str, Any]] | None]("identity")
+    """Id and keyword arguments of the environments a loaded agent was trained on, if its file contains them."""
+    verbose = PartOf[int]("outputs")
+    """Whether a table of statistics is printed while it learns."""
+    log = PartOf[tuple[str, ...]]("outputs")
+    """Names of the logs to which rows of statistics are written."""
+    tensorboard_log = PartOf[str | Path | None]("outputs")
+    """Folder of the folders of these logs; None for ``logs``."""
+    training_call = PartOf[TrainingCall | None]("call")
+    """The current or last call of ``learn``: its limits and progress."""
+    is_learning = PartOf[bool]("call")
+    """Whether ``learn`` is running."""
+    interrupted_by = PartOf[int | None]("call")
+    """The number of the signal that ended the last ``learn``, of Ctrl-C or SIGTERM."""
+    stops = PartOf[Stops | None]("call")
+    """During a ``learn`` on the device: where the program returns to the host. None with the loop of the host."""
+    n_together = PartOf[int]("call")
+    """Runs in the program of the current or last ``learn``."""
+    history = PartOf[History]("record")
+    """Every episode of training."""
+    ep_info_buffer = PartOf[deque[dict[str, float]]]("record")
+    """The last episodes, each ``{"r": return, "l": length, "t": seconds}``."""
+    ep_success_buffer = PartOf[deque[float]]("record")
+    """Whether the last episodes succeeded, of those for which that is known."""
+    steps_per_second = PartOf[float]("record")
+    """Environment steps per second in the current or last ``learn``."""
+    best = PartOf[Best | None]("record")
+    """The best weights so far, by mean training return or by evaluation."""
+    failed_writes = PartOf[FailedWrites]("files")
+    """The files that ``learn`` could not write, such as checkpoints and log rows when the disk is full."""
+    last_saved = PartOf[Path | None]("files")
+    """The newest file that :meth:`save` wrote."""
+    report_folder = PartOf[str | Path | None]("files")
+    """Where batches that led to a non-finite number are saved; None: see :func:`rejeu.training.finite.folder_of`."""
+
+    @classmethod
+    def converted(cls, settings: Mapping[str, object]) -> Settings:
+        """Converts keyword arguments of the constructor and of ``load`` from another form, such as Stable-Baselines3's."""
+        return dict(settings)
+
+    def __init__(
+        self,
+        policy: str,
+        env: Any,
+        *,
+        seed: int | None = None,
+        verbose: int = 0,
+        log: str | Sequence[str] = (),
+        tensorboard_log: str | Path | None = None,
+        stats_window_size: int = 100,
+        success_threshold: float | None = None,
+        best_window: int = BEST_WINDOW,
+        device: str = "auto",
+        **hyperparameters: Any,
+    ) -> None:
+        hyperparameters = self.converted(hyperparameters)
+        names = [*validation.field_names(self.algorithm.Config), *AGENT_ARGUMENTS]
+        shape = validation.field_names(self.algorithm.Config.policy_kwargs_class)
+        validation.check_names(hyperparameters, names, self.name, shape)
+        config = self.algorithm.Config(**hyperparameters)
+        self.configure(config, Identity.of(policy, seed, stats_window_size, success_threshold, best_window, device))
+        self.set_outputs(verbose, log, tensorboard_log)
+        self.made_from_id = isinstance(env, str)
+        vector = self.make_envs(env, 1, seed=self.seed)
+        spaces.check_policy(policy, vector.observation_space, self.config.policy_kwargs.normalize_images)
+        self.build(vector.observation_space, vector.action_space)
+        xla.start_device(self.n_threads(vector.n_envs))
+        self.start_run(vector)
+
+    def configure(self, config: Any, identity: Identity) -> None:
+        """Sets what does not depend on the environment."""
+        contract.check_config(config)
+        self.config, self.identity = config, identity
+        self.logger, self.call, self.files = Logger(), CallState(), Files()
+        self.record = Statistics(identity.stats_window_size)
+        xla.enable_cache()
+
+    def set_outputs(
+        self, verbose: int = 0, log: str | Sequence[str] = (), tensorboard_log: str | Path | None = None
+    ) -> None:
+        """Sets where rows of statistics go; raises ``ValueError`` for an unknown log."""
+        logs = check_logs("log", log) if tensorboard_log is None else (*check_logs("log", log), "tensorboard")
+        self.outputs = Outputs(verbose, tuple(dict.fromkeys(logs)), tensorboard_log)
+
+    def build(self, observation_space: gym.Space, action_space: gym.Space) -> None:
+        """Makes the algorithm for these spaces, and its learner."""
+        self.observation_space, self.action_space = observation_space, action_space
+        self.obs_leaves = spaces.leaves(observation_space)
+        self.config = configs.with_widths(self.config, self.obs_leaves)
+        noise = self.make_noise()
+        if noise is not None:
+            check_fits(noise, action_space)
+        self.learner = Learner(self.algorithm_of(self.config), noise, self.config.nonfinite == "skip")
+
+    if not TYPE_CHECKING:  # so that a misspelt name is found by a type checker
+
+        def __getattr__(self, name: str) -> Any:
+            """Returns a hyperparameter."""
+            hyperparameters = validation.field_names(type(self).algorithm.Config)
+            if name in hyperparameters and "config" in self.__dict__:
+                return getattr(self.config, name)
+            public = [attribute for attribute in dir(type(self)) if not attribute.startswith("_")]
+            near = difflib.get_close_matches(name, [*hyperparameters, *public], 1)
+            hint = f"; did you mean {near[0]}?" if near else ""
+            raise AttributeError(f"{type(self).__name__} has no attribute {name!r}{hint}")
+
+    def __setattr__(self, name: str, value: object) -> None:
+        """Sets an attribute; one that agents do not have by :meth:`assign`."""
+        has_it = name not in READ_ONCE and (name in self.__dict__ or hasattr(type(self), name))
+        if has_it or "run" not in self.__dict__:
+            object.__setattr__(self, name, value)
+        else:
+            Agent.assign(self, name, value)
+
+    def assign(self, name: str, value: object) -> None:
+        """Sets a hyperparameter, which counts from the next update on, or an attribute of a class of your own.
+
+        Raises:
+            AttributeError: for a name that agents do not have, or that only the constructor takes.
+            ValueError: for a hyperparameter that networks or buffer depend on.
+        """
+        if name in READ_ONCE:
+            raise AttributeError(f"{name} of {self.name} is read when it is made; give it to the constructor or load")
+        if name in validation.field_names(self.algorithm.Config):
+            self.change(dataclasses.replace(self.config, **self.converted({name: value})))
+        elif type(self).__module__.startswith("rejeu."):
+            getattr(self, name)  # raises
+        else:
+            object.__setattr__(self, name, value)
+
+    def change(self, new: AlgorithmConfig) -> None:
+        """Replaces the hyperparameters; the new ones count from the next update on, also within ``learn``, and are compiled.
+
+        Args:
+            new: its configuration with other values, from ``dataclasses.replace``.
+
+        Raises:
+            ValueError: if one does not fit the networks, the optimizers or what the buffer holds; nothing has changed then.
+        """
+        finite.settle(self)
+        old, learner, run = self.config, self.learner, self.run
+        changed = {key for key in validation.field_names(type(old)) if getattr(old, key) != getattr(new, key)}
+        try:
+            self.config = new
+            self.build(self.observation_space, self.action_space)
+            arrays, others = (
+                dict(zip(names(x), jax.tree.leaves(x), strict=True)) for x in (learner.shapes, self.learner.shapes)
+            )
+            if arrays != others or "action_masks" in changed:
+                raise ValueError(
+                    f"{', '.join(changed)} cannot be set on a {self.name} whose networks were made without"
+                )
+            if changed & IN_BUFFER and run.replay is not None:
+                if run.replay.size():
+                    raise ValueError(f"{', '.join(changed)} cannot be set on a {self.name} whose buffer holds steps")
+                run.replay, run.obs, run.action = self.make_buffer(run.env), None, None
+        except ValueError as error:
+            self.config, self.learner = old, learner
+            raise ValueError(f"{error}; give it to the constructor or load") from None
+        if "gamma" in changed and run.replay is not None:
+            run.replay.set_gamma(self.config.gamma)
+        if "action_noise" in changed:
+            run.carry = self.learner.initial_carry(self.n_envs)
+        if "learning_starts" in changed:
+            run.learn_from += self.config.learning_starts - old.learning_starts
+
+    def algorithm_of(self, config: Any) -> Algorithm:
+        """Returns the algorithm for the agent's spaces and a configuration, on raw observations and rewards."""
+        unchecked = self.algorithm.make(config, self.observation_space, self.action_space)
+        algorithm = contract.checked(unchecked, self.action_space)
+        if config.rnd is not None:
+            algorithm = with_rnd(algorithm, self.obs_leaves, config.rnd)
+        if config.normalize is None:
+            return algorithm
+        explorer = exploration.make(algorithm, None if algorithm.recall else self.make_noise())
+        return normalized(algorithm, explorer, self.obs_leaves, config.normalize, config.gamma)
+
+    def n_threads(self, n_envs: int) -> int:
+        """Returns how many threads JAX should use: all for images and large layers, else one."""
+        if any(leaf.kind == "image" for leaf in self.obs_leaves):
+            return hardware.cores()
+        weights = [leaf.size for leaf in jax.tree.leaves(self.learner.shapes) if len(leaf.shape) > 1]
+        return xla.threads_for(self.gradient_batch_size(n_envs) * max(weights, default=0))
+
+    def start_run(self, env: VectorEnv | None, state: PackedState | None = None) -> None:
+        """Starts a run on ``env`` with an empty buffer; without ``env`` the agent only predicts.
+
+        Args:
+            env: the environments.
+            state: the state of the algorithm, packed; None initializes it from the seed.
+        """
+        buffer, learn_from = (None, 0) if env is None else (self.make_buffer(env), self.first_learning_step(0))
+        with devices.chosen(self.device):
+            self.run = initial_run(env, buffer, self.learner, learn_from, self.seed, state)
+
+    def make_envs(self, env: Any, n_envs: int = 1, backend: Backend = "auto", seed: int | None = None) -> VectorEnv:
+        """Returns vector environments for this agent; the arguments are those of :func:`rejeu.make_vector`."""
+        return (make_masked if self.takes_masks else make_vector)(env, n_envs, backend, seed)
+
+    @abstractmethod
+    def make_noise(self) -> Noise | None:
+        """Returns the exploration noise, None for none."""
+
+    @abstractmethod
+    def gradient_batch_size(self, n_envs: int) -> int:
+        """Returns the number of transitions in the batch of one gradient step."""
+
+    @abstractmethod
+    def make_buffer(self, env: VectorEnv) -> Any:
+        """Returns an empty buffer for transitions of ``env``."""
+
+    @abstractmethod
+    def keep_buffer(self, env: VectorEnv) -> None:
+        """Called when ``env`` replaces the environments, with as many of the same spaces; the buffer is kept."""
+
+    @abstractmethod
+    def drop_rollout(self) -> None:
+        """Discards transitions that only the policy that collected them can learn from."""
+
+    @abstractmethod
+    def first_learning_step(self, step: int) -> int:
+        """Returns the environment step of the first gradient step, for a run that starts at ``step``."""
+
+    @abstractmethod
+    def steps_to_take(self, n_steps: int) -> int:
+        """Returns after how many environment steps a ``learn`` of ``n_steps`` ends."""
+
+    @abstractmethod
+    def loop(self, n_steps: int | None, progress: Callable[[int], float]) -> Iterator[Progress]:
+        """Trains until ``n_steps`` environment steps are taken (None: without end), and yields after every turn.
+
+        Args:
+            n_steps: over all environments.
+            progress: returns the progress of schedules, in [0, 1], after that many steps.
+        """
+
+    @abstractmethod
+    def start_episodes(self) -> None:
+        """Starts a new episode in every environment."""
+
+    def abandon_episodes(self) -> None:
+        """Abandons the running episodes, because their environments were used for something else.
+
+        During ``learn`` new episodes start at once, so that a checkpoint of this step contains them; otherwise they start
+        with the next ``learn``.
+        """
+        self.run.obs = self.run.action = None
+        if self.is_learning:
+            self.start_episodes()
+
+    @property
+    def interrupted(self) -> bool:
+        """Whether Ctrl-C or SIGTERM ended the last ``learn``."""
+        return self.call.interrupted_by is not None
+
+    @property
+    def name(self) -> str:
+        """The algorithm's name."""
+        return self.algorithm.Config.name
+
+    @property
+    def policy(self) -> Any:
+        """The name of its policy."""
+        return self.policy_name
+
+    @property
+    def env(self) -> VectorEnv | None:
+        """The environments it trains on; None after ``load`` without one."""
+        return self.run.env
+
+    @property
+    def origin(self) -> tuple[str, Mapping[str, Any]] | None:
+        """Id and keyword arguments of its environments or those it was trained on; None if they were not made from an id."""
+        return self.trained_on if self.run.env is None else self.run.env.made_from
+
+    @property
+    def _place(self) -> str:
+        """The id of its environments; of a loaded agent, that of the environments it was trained on, if it is known."""
+        if self.run.env is not None:
+            return self.run.env.env_id
+        return "no environment" if self.trained_on is None else f"no environment, trained on {self.trained_on[0]}"
+
+    @property
+    def n_envs(self) -> int:
+        """Number of environments."""
+        return self.run.env.n_envs if self.run.env is not None else 1
+
+    @property
+    def state(self) -> Any:
+        """A copy of the algorithm's state. Waits for pending updates."""
+        finite.settle(self)
+        return self.learner.state(self.run.state)
+
+    @property
+    def num_timesteps(self) -> int:
+        """Environment steps since the last ``learn`` with ``reset_num_timesteps=True`` started."""
+        return self.run.step - self.call.reset_step
+
+    @property
+    def n_updates(self) -> int:
+        """Total gradient steps."""
+        return self.run.n_updates
+
+    @property
+    def seconds(self) -> dict[str, float]:
+        """Wall time spent training, in seconds: ``total``, and of it ``env``, ``replay`` and ``update``."""
+        return dict(self.run.seconds)
+
+    @property
+    def takes_masks(self) -> bool:
+        """Whether its policy takes masks of the allowed actions."""
+        return self.config.action_masks
+
+    def with_masks(self, obs: Observation, masks: AnyArray) -> Any:
+        """Returns a batch of observations together with action masks, if the agent takes any; None allows all actions.
+
+        Raises:
+            TypeError: if masks are given to an agent that takes none.
+            ValueError: if their shape is not that of the actions.
+        """
+        if not self.takes_masks:
+            if masks is not None:
+                raise TypeError(f"{self.name}.predict takes no action_masks; it was made without action_masks=True")
+            return obs
+        n, size = len(jax.tree.leaves(obs)[0]), n_choices(self.action_space, self.name)
+        mask = np.ones((n, size), bool) if masks is None else np.asarray(masks, bool)
+        if mask.size != n * size:
+            raise ValueError(f"action_masks has shape {mask.shape}, expected {(n, size)}")
+        return Masked(obs, mask.reshape(n, size))
+
+    def observed(self, env: VectorEnv) -> tuple[tuple[spaces.Leaf, ...], Any]:
+        """Returns the leaves and the structure of what it acts on in ``env``: observations, and masks if it takes any."""
+        structure = spaces.structure(env.observation_space)
+        if not self.takes_masks:
+            return self.obs_leaves, structure
+        structure = jax.tree.structure(Masked(jax.tree.unflatten(structure, self.obs_leaves), 0))
+        return (*self.obs_leaves, mask_leaf(env.action_space, env.env_id)), structure
+
+    def get_vec_normalize_env(self) -> Any:
+        """Returns the ``VecNormalize`` around the training environments, or None."""
+        env = self.run.env
+        return None if env is None else env.vec_normalize
+
+    def check_spaces(self, vector: VectorEnv, source: str) -> None:
+        """Raises ``ValueError`` if environments, called ``source`` in the message, have other spaces than the agent."""
+        for name in ("observation", "action"):
+            ours, theirs = getattr(self, f"{name}_space"), getattr(vector, f"{name}_space")
+            if not spaces.same(ours, theirs, bounds=name == "action"):
+                raise ValueError(f"{source} has the {name} space {theirs}, and this agent was made for {ours}")
+
+    def __repr__(self) -> str:
+        return f"<rejeu.{self.name} on {self._place}, {self.run.step} steps, {self.run.n_updates} updates>"
+
+    def _repr_html_(self) -> str:
+        """Returns a table for notebooks."""
+        counts = f"{counted(self.run.step, 'step')}, {counted(self.run.n_updates, 'update')}"
+        rows = [(self.name, self._place), ("seed", str(self.seed)), ("trained", counts)]
+        if len(self.history):
+            rows.append(("episodes", repr(self.history).removeprefix("<History: ").removesuffix(">")))
+        return html_table(rows)
+
+    def __init_subclass__(cls) -> None:
+        """Adds the hyperparameters of the configuration to docstring and signature, which are made when asked for."""
+        if "algorithm" in cls.__dict__:
+            cls.__doc__ = Documentation(cls.__doc__)  # type: ignore[assignment]
+            cls.__signature__ = Signature(inspect.signature(Agent.__init__))  # type: ignore[attr-defined]
+
+    q_values = playing.q_values
 
     def learn(
         self,
@@ -133,7 +628,7 @@ class Agent(BaseAgent):
         n = len(jax.tree.leaves(batch)[0])
         ended = np.zeros(n, bool) if episode_start is None else np.asarray(episode_start, bool).reshape(n)
         with devices.chosen(self.device):
-            action, memory = policy.act(self, batch, deterministic, state, ended)
+            action, memory = playing.act(self, batch, deterministic, state, ended)
         scaled = spaces.scale_action(self.action_space, action)
         scaled = jax.tree.map(lambda array: array[0], scaled) if single else scaled
         return scaled, state if memory is None else memory
@@ -169,11 +664,11 @@ class Agent(BaseAgent):
         """
         threshold = self.success_threshold if success_threshold is None else success_threshold
         if episodes is None and minutes is None:
-            episodes = policy.USUAL_EPISODES
+            episodes = playing.USUAL_EPISODES
         episodes = None if episodes is None else whole("episodes", episodes, least=1)
         seconds = None if minutes is None else 60 * number("minutes", minutes, above=0)
-        with devices.chosen(self.device), policy.evaluation_env(self, env, episodes, seed) as (vector, again):
-            return evaluate(policy.policy(self, deterministic), vector, episodes, threshold, again, seconds)
+        with devices.chosen(self.device), playing.evaluation_env(self, env, episodes, seed) as (vector, again):
+            return evaluate(playing.policy(self, deterministic), vector, episodes, threshold, again, seconds)
 
     def report(self, path: str | Path, evaluations: Iterable[tuple[int, Evaluation]] = ()) -> Path:
         """Writes a page about the training so far, one HTML file that needs no network, and returns its path.
@@ -262,7 +757,10 @@ class Agent(BaseAgent):
         """
         with checkpoint.opened(find_model(path), "agent") as file:
             agent = model_files.load(
-                cls, file, lambda agent: None if env is None else agent.make_envs(env, seed=agent.seed), changes
+                cls,
+                file,
+                lambda agent: None if env is None else agent.make_envs(env, seed=agent.identity.seed),
+                changes,
             )
         agent.made_from_id = isinstance(env, str)
         return agent
@@ -367,7 +865,7 @@ class Agent(BaseAgent):
             path = source
             with checkpoint.opened(path, "agent") as file:
                 shapes = self.learner.shapes
-                defaults = {} if exact_match else dict(zip(core.names(shapes), jax.tree.leaves(shapes), strict=True))
+                defaults = {} if exact_match else dict(zip(names(shapes), jax.tree.leaves(shapes), strict=True))
                 checkpoint.match(shapes, {**defaults, **file.specs}, path)
                 source = file.read()
             checkpoint.require_finite(source, path)
@@ -381,22 +879,6 @@ class Agent(BaseAgent):
     def summary(self) -> str:
         """Returns a table of the networks, their layers and numbers of parameters; see :mod:`rejeu.agents.summary`."""
         return summary.describe(self.learner.shapes, self.obs_leaves)
-
-
-class ClassOnly:
-    """Makes ``load`` raise an error on an instance, where it would silently leave that instance as it was."""
-
-    def __init__(self, method: Any) -> None:
-        self.method = method
-        self.__doc__ = method.__func__.__doc__
-
-    def __get__(self, instance: Any, owner: type) -> Any:
-        if instance is not None:
-            raise TypeError(
-                f"load is called on the class and returns a new agent: agent = {owner.__name__}.load(path); "
-                "to change this one in place use agent.set_parameters(path)"
-            )
-        return self.method.__get__(None, owner)
 
 
 Agent.load = ClassOnly(Agent.__dict__["load"])  # type: ignore[method-assign,assignment]

@@ -10,9 +10,9 @@ from typing import Any
 import jax
 import numpy as np
 
-from rejeu.agents.base import BaseAgent
 from rejeu.algorithms.config import OffPolicyConfig
 from rejeu.callbacks.base import Periodic, TrainingCallback
+from rejeu.checkpoints.agent_state import AnyAgent
 from rejeu.core import devices
 from rejeu.envs.functional.vector import reset_all
 from rejeu.replay.hindsight import HerReplayBuffer
@@ -30,7 +30,7 @@ COPIES = 3
 """How often networks and optimizers are in memory during an update: before it, after it, and the gradients."""
 
 
-def stops_of(agent: BaseAgent, call: TrainingCall, callbacks: Sequence[object]) -> Stops | None:
+def stops_of(agent: AnyAgent, call: TrainingCall, callbacks: Sequence[object]) -> Stops | None:
     """Returns where the program returns to the host in a ``learn``, None if the agent trains with the loop of the host.
 
     Raises:
@@ -55,13 +55,13 @@ def stops_of(agent: BaseAgent, call: TrainingCall, callbacks: Sequence[object]) 
     return None
 
 
-def require_memory(agent: BaseAgent, n_runs: int = 1) -> None:
+def require_memory(agent: AnyAgent, n_runs: int = 1) -> None:
     """Checks that the device has room for so many runs like that of an agent, whose training has not begun.
 
     Raises:
         MemoryError: if it has not, with the numbers and what to lower.
     """
-    run, on = agent.run, devices.local(agent.device)[0]
+    run, on = agent.run, devices.local(agent.identity.device)[0]
     free = devices.room(on)
     if free is None:
         return
@@ -125,22 +125,16 @@ def stops_at(call: TrainingCall, callbacks: Sequence[object]) -> Stops:
     return Stops(every, at_episodes=call.n_episodes is not None)
 
 
-def reason_against(agent: BaseAgent, callbacks: Sequence[object]) -> str | None:
+def reason_against(agent: AnyAgent, callbacks: Sequence[object]) -> str | None:
     """Returns why an agent cannot train on the device, None if it can."""
     run, config = agent.run, agent.config
     if run.env.backend != "jax":
         return f"the backend of {run.env.env_id} is {run.env.backend!r}, not 'jax'"
-    if reason := reason_against_callbacks(callbacks):
-        return reason
+    if names := [type(c).__name__ for c in callbacks if isinstance(c, TrainingCallback) and c.every_step]:
+        return f"the callback {names[0]} must be called after every step"
     if isinstance(config, OffPolicyConfig):
         return reason_against_replay(run.replay, config)
     return None if config.n_episodes is None else "rollouts of n_episodes whole episodes exist on the host only"
-
-
-def reason_against_callbacks(callbacks: Sequence[object]) -> str | None:
-    """Returns which callback must be called after every step, None if there is none."""
-    names = [type(c).__name__ for c in callbacks if isinstance(c, TrainingCallback) and c.every_step]
-    return f"the callback {names[0]} must be called after every step" if names else None
 
 
 def reason_against_replay(buffer: Any, config: OffPolicyConfig) -> str | None:
@@ -164,16 +158,16 @@ def reason_against_replay(buffer: Any, config: OffPolicyConfig) -> str | None:
     return None
 
 
-def episodes_to_judge(agent: BaseAgent, call: TrainingCall, turn: Progress) -> int:
+def episodes_to_judge(agent: AnyAgent, call: TrainingCall, turn: Progress) -> int:
     """Returns the number of newest episodes whose returns decide now whether the weights are the best so far.
 
     On the host these are the episodes that have just ended. On the device the weights are looked at once in ``MAX_TURNS``
     turns and at the end of ``learn``, since chunks end elsewhere at times that depend on the speed of the machine.
     """
-    if agent.stops is None:
+    if agent.call.stops is None:
         return len(turn.episodes)
     period = MAX_TURNS * agent.n_envs
     n_periods = (turn.step - agent.n_envs) // period  # of which the episodes were judged
     if turn.step // period == n_periods and not call.is_over(agent.run):
         return 0
-    return int(np.count_nonzero(agent.history["step"] > n_periods * period))
+    return int(np.count_nonzero(agent.record.history["step"] > n_periods * period))

@@ -14,7 +14,7 @@ import gymnasium as gym
 import jax
 import numpy as np
 
-from rejeu.agents.base import BaseAgent
+from rejeu.checkpoints.agent_state import AnyAgent
 from rejeu.core import atomic, spaces, xla
 from rejeu.core.algorithm import Masked
 from rejeu.core.types import JsonObject, Observation
@@ -58,7 +58,7 @@ class Exported(NamedTuple):
 
 
 def export(
-    agent: BaseAgent,
+    agent: AnyAgent,
     path: str | Path,
     to: str | None,
     noise: bool,
@@ -107,7 +107,7 @@ def export(
     return Exported(path, card_path, target, len(contents[0]), result, note)
 
 
-def stack_of(agent: BaseAgent, n: int | None) -> FrameStack | None:
+def stack_of(agent: AnyAgent, n: int | None) -> FrameStack | None:
     """Returns of which frames the observations of an agent are made; None if they are no stacks."""
     n_frames = getattr(agent.config, "frame_stack", None)
     if n is None and n_frames is not None:
@@ -117,7 +117,7 @@ def stack_of(agent: BaseAgent, n: int | None) -> FrameStack | None:
     return None if n is None else frame_stack_of(agent.obs_leaves, n)
 
 
-def policy_for(agent: BaseAgent, noise: bool, batch: int | None, stack: FrameStack | None = None) -> Policy:
+def policy_for(agent: AnyAgent, noise: bool, batch: int | None, stack: FrameStack | None = None) -> Policy:
     """Returns the policy of an agent as a program.
 
     Raises:
@@ -131,7 +131,7 @@ def policy_for(agent: BaseAgent, noise: bool, batch: int | None, stack: FrameSta
     return policy_of(algorithm, actor, agent.observation_space, agent.action_space, mask, batch, noise, stack)
 
 
-def numpy_policy(agent: BaseAgent, source: str) -> NumpyPolicy:
+def numpy_policy(agent: AnyAgent, source: str) -> NumpyPolicy:
     """Returns the policy of an agent in NumPy, without a file; ``source`` is for the card."""
     policy = policy_for(agent, False, None)
     card = card_of(agent, policy, "npz", source, None)
@@ -139,7 +139,7 @@ def numpy_policy(agent: BaseAgent, source: str) -> NumpyPolicy:
     return NumpyPolicy(*npz_file.content_of(exportable), spaces.MAX_NUMBERS)
 
 
-def card_of(agent: BaseAgent, policy: Policy, target: str, source: str, duration: float | None) -> JsonObject:
+def card_of(agent: AnyAgent, policy: Policy, target: str, source: str, duration: float | None) -> JsonObject:
     """Returns the contract of a policy in JSON values."""
     finite.settle(agent)
     weights = hashlib.sha256()
@@ -153,9 +153,9 @@ def card_of(agent: BaseAgent, policy: Policy, target: str, source: str, duration
         "rejeu": metadata.version("rejeu"),
         "target": target,
         "algorithm": agent.name,
-        "env_id": env.env_id if env is not None else agent.trained_on and agent.trained_on[0],
+        "env_id": env.env_id if env is not None else agent.identity.trained_on and agent.identity.trained_on[0],
         "source": source,
-        "seed": agent.seed,
+        "seed": agent.identity.seed,
         "steps": agent.run.step,
         "weights": weights.hexdigest(),
         "seconds_per_step": duration,
@@ -167,7 +167,7 @@ def card_of(agent: BaseAgent, policy: Policy, target: str, source: str, duration
 
 
 def record(
-    agent: BaseAgent, policy: Policy, make_env: Callable[[], Any] | None, stack: FrameStack | None = None
+    agent: AnyAgent, policy: Policy, make_env: Callable[[], Any] | None, stack: FrameStack | None = None
 ) -> tuple[SeenSteps, float | None, FrameStack | None]:
     """Returns observations with the actions of ``predict``, the duration of a step in seconds if it is known, and the stack.
 
@@ -216,7 +216,7 @@ def record(
     return SeenSteps(inputs, np.stack(actions), "sampled" if vector is None else vector.env_id), duration, stack
 
 
-def environment(agent: BaseAgent, make_env: Callable[[], Any] | None) -> tuple[VectorEnv | None, float | None]:
+def environment(agent: AnyAgent, make_env: Callable[[], Any] | None) -> tuple[VectorEnv | None, float | None]:
     """Returns a new environment like those of training, None if none can be made, and the duration of its steps."""
     origin = agent.origin
     if make_env is None and origin is not None and register(origin[0]):
@@ -240,7 +240,7 @@ def seconds_per_step(env: Any) -> float | None:
 
 
 def _restacked(
-    agent: BaseAgent, stack: FrameStack, obs: Observation, before: list[np.ndarray] | None, starts: bool
+    agent: AnyAgent, stack: FrameStack, obs: Observation, before: list[np.ndarray] | None, starts: bool
 ) -> Any:
     """Returns an observation whose newest frames are those of a sample, and the others those before."""
     masked = obs if isinstance(obs, Masked) else None
@@ -258,7 +258,7 @@ def moderate(x: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return np.where(np.abs(x) < 1e6, x, rng.normal(size=x.shape)).astype(x.dtype) if x.dtype.kind == "f" else x
 
 
-def _sample(agent: BaseAgent, policy: Policy, rng: np.random.Generator) -> Any:
+def _sample(agent: AnyAgent, policy: Policy, rng: np.random.Generator) -> Any:
     """Returns a batch of one sample of the observation space, with a mask if the agent takes masks."""
     obs = jax.tree.map(
         lambda array: moderate(np.asarray(array)[None], rng),

@@ -10,7 +10,7 @@ import gymnasium as gym
 import jax
 import numpy as np
 
-from rejeu.agents.base import BaseAgent
+from rejeu.checkpoints.agent_state import AnyAgent
 from rejeu.core import devices, spaces
 from rejeu.core.types import Action, Observation, PyTree
 from rejeu.core.validation import choice
@@ -30,7 +30,7 @@ CRITICS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 
 
 def act(
-    agent: BaseAgent, obs: Observation, deterministic: bool, memory: PyTree, ended: np.ndarray
+    agent: AnyAgent, obs: Observation, deterministic: bool, memory: PyTree, ended: np.ndarray
 ) -> tuple[np.ndarray, PyTree]:
     """Returns actions in the algorithm's range, and the next state of a recurrent policy, else None.
 
@@ -60,7 +60,7 @@ def act(
 
 
 def q_values(
-    agent: BaseAgent, observation: Observation, action: Action = None, critics: Literal["min", "mean", "all"] = "min"
+    agent: AnyAgent, observation: Observation, action: Action = None, critics: Literal["min", "mean", "all"] = "min"
 ) -> np.ndarray:
     """Returns the critics' values of actions, that is, the expected discounted return, as ``float32``.
 
@@ -104,7 +104,7 @@ def q_values(
     if action is None and not is_discrete:
         raise ValueError(f"q_values needs actions of {space}; only for Discrete actions it returns the values of all")
     actions = None if action is None else _actions(space, action, single, n)
-    with devices.chosen(agent.device):
+    with devices.chosen(agent.identity.device):
         finite.settle(agent)
         values = np.asarray(agent.learner.action_values(agent.run.state, obs, None if is_discrete else actions))
     if is_discrete and actions is not None:
@@ -132,7 +132,7 @@ def _actions(space: gym.Space, action: Action, single: bool, n: int) -> np.ndarr
     return spaces.unscale_action(space, array)
 
 
-def memory_of(agent: BaseAgent, memory: PyTree, n: int) -> Any:
+def memory_of(agent: AnyAgent, memory: PyTree, n: int) -> Any:
     """Returns the state of the agent's policy for ``n`` episodes: what was given, else that at their start.
 
     Raises:
@@ -140,10 +140,8 @@ def memory_of(agent: BaseAgent, memory: PyTree, n: int) -> Any:
     """
     if memory is None or agent.learner.algorithm.recall is None:
         return agent.learner.initial_memory(n)
-    if agent.carry_shapes is None:  # once: it takes longer than a prediction
-        agent.carry_shapes = jax.eval_shape(lambda: agent.learner.initial_memory(1))
     shapes = jax.tree.map(np.shape, memory)
-    expected = jax.tree.map(lambda x: (n, *x.shape[1:]), agent.carry_shapes)
+    expected = jax.tree.map(lambda x: (n, *x.shape[1:]), agent.learner.memory_shapes)
     if shapes != expected:
         raise ValueError(
             f"{agent.name}.predict was given a state of the shapes {shapes}, expected {expected}; give what its last call "
@@ -158,15 +156,15 @@ MOST_ENVS = 16
 """Upper limit on the environments that are made for an evaluation."""
 
 
-def trained_on(agent: BaseAgent) -> str | Callable[[], gym.Env]:
+def trained_on(agent: AnyAgent) -> str | Callable[[], gym.Env]:
     """Returns the environment that a loaded agent was trained on, as an id or a function that makes it.
 
     Raises:
         ValueError: if its file does not name it, or it is not registered.
     """
-    if agent.trained_on is None:
+    if agent.identity.trained_on is None:
         raise ValueError("this agent has no environment; give one: evaluate(env=...)")
-    env_id, env_kwargs = agent.trained_on
+    env_id, env_kwargs = agent.identity.trained_on
     if not register(env_id) and not envpool_knows(env_id):
         raise ValueError(
             f"this agent was trained on {env_id}, which is not registered here; import the module that registers it, or give "
@@ -177,7 +175,7 @@ def trained_on(agent: BaseAgent) -> str | Callable[[], gym.Env]:
 
 @contextmanager
 def evaluation_env(
-    agent: BaseAgent, env: Any, episodes: int | None, seed: int | None
+    agent: AnyAgent, env: Any, episodes: int | None, seed: int | None
 ) -> Iterator[tuple[VectorEnv, int | None]]:
     """Context in which episodes may be played; returns the environments, and the seed that they must still be given.
 
@@ -188,12 +186,14 @@ def evaluation_env(
     """
     run = agent.run
     n_envs = MOST_ENVS if episodes is None else min(episodes, MOST_ENVS)
-    made_here = isinstance(env, str) or callable(env) or (env is None and (run.env is None or agent.made_from_id))
+    made_here = (
+        isinstance(env, str) or callable(env) or (env is None and (run.env is None or agent.identity.made_from_id))
+    )
     if env is not None:
         vector = agent.make_envs(env, n_envs if isinstance(env, str) else 1, seed=seed)
     elif run.env is None:
         vector = agent.make_envs(trained_on(agent), n_envs, seed=seed)
-    elif agent.made_from_id:
+    elif agent.identity.made_from_id:
         vector = agent.make_envs(run.env.env_id, n_envs, run.env.backend, seed)
     else:
         vector = run.env
@@ -209,7 +209,7 @@ def evaluation_env(
 
 
 @contextmanager
-def lent(agent: BaseAgent, vector: VectorEnv, seeded: bool = False) -> Iterator[None]:
+def lent(agent: AnyAgent, vector: VectorEnv, seeded: bool = False) -> Iterator[None]:
     """Context in which episodes may be played in ``vector``, which may share environments with the agent's own.
 
     If it does, the running episodes of training are abandoned, and training continues in new ones. If the environments
@@ -222,11 +222,11 @@ def lent(agent: BaseAgent, vector: VectorEnv, seeded: bool = False) -> Iterator[
     yield
     if shared:
         if seeded:
-            run.seed = int(np.random.SeedSequence([agent.seed, run.step]).generate_state(1)[0])
+            run.seed = int(np.random.SeedSequence([agent.identity.seed, run.step]).generate_state(1)[0])
         agent.abandon_episodes()
 
 
-def policy(agent: BaseAgent, deterministic: bool) -> Callable[[Any, np.ndarray], np.ndarray]:
+def policy(agent: AnyAgent, deterministic: bool) -> Callable[[Any, np.ndarray], np.ndarray]:
     """Returns the policy as a function for :func:`rejeu.logs.evaluation.evaluate`, which keeps a recurrent state."""
     memory: Any = None
 
@@ -238,7 +238,7 @@ def policy(agent: BaseAgent, deterministic: bool) -> Callable[[Any, np.ndarray],
     return choose
 
 
-def check_scaled(agent: BaseAgent, vector: VectorEnv) -> None:
+def check_scaled(agent: AnyAgent, vector: VectorEnv) -> None:
     """Raises ``ValueError`` if the agent trains in a ``VecNormalize`` and ``vector`` has none."""
     if agent.get_vec_normalize_env() is not None and vector.vec_normalize is None:
         raise ValueError(

@@ -6,7 +6,9 @@ callbacks are computed together, by ``jax.vmap`` over the runs.
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
+import secrets
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from typing import Any, TypeVar
@@ -149,10 +151,8 @@ def is_list_of_numbers(value: object) -> bool:
 def sibling(agent: A, env: Any, seed: int) -> A:
     """Returns an agent with the same settings and compiled functions, other environments and another seed."""
     twin = object.__new__(type(agent))
-    same = ("config", "stats_window_size", "success_threshold", "best_window", "device")
-    twin.configure(agent.policy_name, seed=seed, **{name: getattr(agent, name) for name in same})
-    twin.set_outputs(agent.verbose, agent.log, agent.tensorboard_log)
-    twin.made_from_id = agent.made_from_id
+    twin.configure(agent.config, dataclasses.replace(agent.identity, seed=seed, run_id=secrets.token_hex(8)))
+    twin.outputs = dataclasses.replace(agent.outputs)
     twin.observation_space, twin.action_space = agent.observation_space, agent.action_space
     twin.obs_leaves, twin.learner = agent.obs_leaves, agent.learner
     twin.start_run(twin.make_envs(env, seed=seed))
@@ -217,7 +217,7 @@ def learn_together(
                     if not active or interrupt.requested:
                         break
             for agent in agents:
-                agent.interrupted, agent.interrupted_by = interrupt.requested, interrupt.signal
+                agent.interrupted_by = interrupt.signal
         except NonFiniteSteps as broken:
             culprit = agents[broken.which]
             values = [f"{name}={getattr(culprit.config, name):g}" for name in differing]
@@ -255,12 +255,12 @@ def reason_against(agent: Agent, callbacks: Sequence[Callback]) -> str | None:
 
 def check_differing(agent: Agent, names: Iterable[str]) -> None:
     """Raises ``ValueError`` if hyperparameters cannot differ between the runs of one program."""
-    types = configs.value_types(type(agent.config))
+    config_class: Any = type(agent.config)
     for name in names:
-        if name not in field_names(type(agent.config)):
+        if name not in field_names(config_class):
             raise ValueError(f"{name} is no hyperparameter of {agent.name} and is equal for all runs; give one value")
         in_replay = name in IN_REPLAY and isinstance(agent.config, OffPolicyConfig)
-        if float not in types[name] or in_replay:
+        if float not in configs.value_types(config_class)[name] or in_replay:
             raise ValueError(
                 f"{name} cannot differ between the runs of one program, which is compiled for its value; give one number, or "
                 "train one program for each"

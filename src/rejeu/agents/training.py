@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from functools import partial
 
 import gymnasium as gym
 import numpy as np
 
 from rejeu.agents import device
-from rejeu.agents.base import BaseAgent, Best
 from rejeu.algorithms import config as configs
 from rejeu.algorithms.catalog import CATALOG
 from rejeu.callbacks.base import Callback, called, in_order, listed, listening, runs_last, stateful
 from rejeu.callbacks.progress_bar import ProgressBar
+from rejeu.checkpoints.agent_state import AnyAgent, Best
 from rejeu.core import schedules, xla
 from rejeu.core.interrupt import Interrupt
 from rejeu.core.types import JsonObject
@@ -24,7 +24,7 @@ from rejeu.exploration.noise import warn_without_noise
 from rejeu.logs.logging import Console, GuardedSink, Sink, guarded, next_folder, open_log
 from rejeu.training import finite
 from rejeu.training.finite import NonFiniteSteps, NonFiniteUpdate
-from rejeu.training.run import Episode, Progress, TrainingCall, checked_limits, time_shares
+from rejeu.training.run import Progress, TrainingCall, checked_limits, time_shares
 
 TABLE_SECONDS = 2.0
 """Least time between two tables that ``verbose=1`` prints; other outputs get every row."""
@@ -38,44 +38,44 @@ LOGGED_AS = {"exploration_rate": "rollout/exploration_rate"}
 
 
 def open_outputs(
-    agent: BaseAgent, sinks: Iterable[Sink], tb_log_name: str | None, stack: ExitStack
+    agent: AnyAgent, sinks: Iterable[Sink], tb_log_name: str | None, stack: ExitStack
 ) -> Sequence[GuardedSink]:
     """Returns the outputs for rows of statistics; ``stack`` closes those that are opened here."""
     passed, opened = [*sinks, *agent.logger.outputs], list[Sink]()
-    if agent.verbose and not agent.logger.outputs:
+    if agent.outputs.verbose and not agent.logger.outputs:
         opened.append(Console(TABLE_SECONDS))
-    if agent.log and not agent.logger.outputs:
-        folder = next_folder(agent.tensorboard_log or LOG_FOLDER, tb_log_name or agent.name)
-        opened += [open_log(name, folder, run_name(agent), tracker_id(agent)) for name in agent.log]
-    outputs = [guarded(sink, agent.failed_writes) for sink in passed]
+    if agent.outputs.log and not agent.logger.outputs:
+        folder = next_folder(agent.outputs.tensorboard_log or LOG_FOLDER, tb_log_name or agent.name)
+        opened += [open_log(name, folder, run_name(agent), tracker_id(agent)) for name in agent.outputs.log]
+    outputs = [guarded(sink, agent.files.failed_writes) for sink in passed]
     for sink, output in zip(passed, outputs, strict=True):
         if output.in_background and output is not sink:
             stack.callback(output.close)
     for sink in opened:
-        outputs.append(guarded(sink, agent.failed_writes, closes=True))
+        outputs.append(guarded(sink, agent.files.failed_writes, closes=True))
         stack.callback(outputs[-1].close)
     return outputs
 
 
-def run_name(agent: BaseAgent) -> str:
+def run_name(agent: AnyAgent) -> str:
     """Returns a name for the run in a tracker: environment, algorithm, seed and :func:`tracker_id`."""
-    return f"{agent.run.env.env_id}-{agent.name}-seed{agent.seed}-{tracker_id(agent)}"
+    return f"{agent.run.env.env_id}-{agent.name}-seed{agent.identity.seed}-{tracker_id(agent)}"
 
 
-def tracker_id(agent: BaseAgent) -> str:
+def tracker_id(agent: AnyAgent) -> str:
     """Returns the id of the run in a tracker. A ``learn`` that counts steps from 0 starts another run."""
-    return agent.run_id + (f"-{agent.reset_step}" if agent.reset_step else "")
+    return agent.identity.run_id + (f"-{agent.call.reset_step}" if agent.call.reset_step else "")
 
 
-def run_config(agent: BaseAgent, call: TrainingCall) -> JsonObject:
+def run_config(agent: AnyAgent, call: TrainingCall) -> JsonObject:
     """Returns the configuration of a run for trackers: environment, algorithm, limits, hyperparameters."""
     return {
         "algorithm": agent.name,
         "env_id": agent.run.env.env_id,
         "n_envs": agent.n_envs,
         "backend": agent.run.env.backend,
-        "policy": agent.policy_name,
-        "seed": agent.seed,
+        "policy": agent.identity.policy_name,
+        "seed": agent.identity.seed,
         "total_timesteps": call.n_steps,
         "episodes": call.n_episodes,
         "minutes": None if call.seconds is None else call.seconds / 60,
@@ -83,19 +83,19 @@ def run_config(agent: BaseAgent, call: TrainingCall) -> JsonObject:
     }
 
 
-def statistics_row(agent: BaseAgent) -> dict[str, float]:
+def statistics_row(agent: AnyAgent) -> dict[str, float]:
     """Returns the numbers of one log row: means over the last episodes, losses, rates. Waits for the device."""
     numbers: dict[str, float] = {}
-    if agent.ep_info_buffer:
-        numbers["rollout/ep_len_mean"] = float(np.mean([e["l"] for e in agent.ep_info_buffer]))
-        numbers["rollout/ep_rew_mean"] = float(np.mean([e["r"] for e in agent.ep_info_buffer]))
-    if len(agent.history):
-        numbers["rollout/ep_rew_best"] = agent.history.best_return
-    if agent.ep_success_buffer:
-        numbers["rollout/success_rate"] = float(np.mean(agent.ep_success_buffer))
+    if agent.record.ep_info_buffer:
+        numbers["rollout/ep_len_mean"] = float(np.mean([e["l"] for e in agent.record.ep_info_buffer]))
+        numbers["rollout/ep_rew_mean"] = float(np.mean([e["r"] for e in agent.record.ep_info_buffer]))
+    if len(agent.record.history):
+        numbers["rollout/ep_rew_best"] = agent.record.history.best_return
+    if agent.record.ep_success_buffer:
+        numbers["rollout/success_rate"] = float(np.mean(agent.record.ep_success_buffer))
     run = agent.run
     numbers["time/episodes"] = run.episode
-    numbers["time/fps"] = float(agent.steps_per_second)
+    numbers["time/fps"] = float(agent.record.steps_per_second)
     numbers["time/time_elapsed"] = run.seconds["total"]
     numbers["time/total_timesteps"] = agent.num_timesteps
     for phase, share in time_shares(run.seconds).items():
@@ -104,8 +104,8 @@ def statistics_row(agent: BaseAgent) -> dict[str, float]:
     numbers["train/n_updates"] = run.n_updates
     if agent.learner.skips:
         numbers["train/skipped_updates"] = run.monitor.n_skipped
-    if agent.training_call is not None:
-        progress = agent.training_call.progress(run.step, run.episode)
+    if agent.call.training_call is not None:
+        progress = agent.call.training_call.progress(run.step, run.episode)
         numbers["train/learning_rate"] = float(schedules.at(agent.config.learning_rate, progress))
     for key, value in (run.metrics or {}).items():
         numbers[LOGGED_AS.get(key, f"train/{key}")] = float(value)
@@ -117,7 +117,7 @@ STEPS_OF_A_ROW = 250
 
 
 def start_call(
-    agent: BaseAgent,
+    agent: AnyAgent,
     total_timesteps: int | None,
     episodes: int | None,
     minutes: float | None,
@@ -130,7 +130,7 @@ def start_call(
         ValueError: without an environment; without a limit, unless the agent resumes an unfinished ``learn``.
         RuntimeError: if the agent is learning.
     """
-    if agent.is_learning:
+    if agent.call.is_learning:
         raise RuntimeError(
             "this agent is learning already, in another thread or around a callback; let that learn return first, or "
             "give each thread an agent of its own"
@@ -146,17 +146,17 @@ def start_call(
     else:
         limits = checked_limits(total_timesteps, episodes, minutes)
         if reset_num_timesteps:
-            agent.reset_step, agent.reset_episode = run.step, run.episode
-            agent.reset_seconds = run.seconds["total"]
+            agent.call.reset_step, agent.call.reset_episode = run.step, run.episode
+            agent.call.reset_seconds = run.seconds["total"]
         call = TrainingCall(
             *limits,
             first_step=run.step,
             first_episode=run.episode,
             log_interval=log_interval,
-            logged=run.step // STEPS_OF_A_ROW if is_offline(agent) else len(agent.history),
-            steps_before=run.step - agent.reset_step,
-            episodes_before=run.episode - agent.reset_episode,
-            seconds_before=run.seconds["total"] - agent.reset_seconds,
+            logged=run.step // STEPS_OF_A_ROW if is_offline(agent) else len(agent.record.history),
+            steps_before=run.step - agent.call.reset_step,
+            episodes_before=run.episode - agent.call.reset_episode,
+            seconds_before=run.seconds["total"] - agent.call.reset_seconds,
             last_step=None if limits[0] is None else run.step + agent.steps_to_take(limits[0]),
         )
     is_touched = run.fingerprint is not None and run.fingerprint != snapshot.fingerprint(run.env)
@@ -165,13 +165,13 @@ def start_call(
     return call
 
 
-def unfinished_call(agent: BaseAgent) -> TrainingCall:
+def unfinished_call(agent: AnyAgent) -> TrainingCall:
     """Returns the ``learn`` that a resumed agent was in when it was saved.
 
     Raises:
         ValueError: if there is none, or if it is complete.
     """
-    call = agent.training_call if agent.resumed is not None else None
+    call = agent.call.training_call if agent.resumed is not None else None
     if call is None:
         raise ValueError("learn needs total_timesteps, episodes or minutes (or an agent from resume(), to continue)")
     if call.is_over(agent.run):
@@ -182,7 +182,7 @@ def unfinished_call(agent: BaseAgent) -> TrainingCall:
 
 
 def train(
-    agent: BaseAgent,
+    agent: AnyAgent,
     call: TrainingCall,
     callback: Callback | Iterable[Callback] | None,
     tb_log_name: str | None,
@@ -197,8 +197,8 @@ def train(
         warn_without_noise(agent)
     bar = [ProgressBar.of(call, steps_before=agent.run.step - call.first_step)] if progress_bar else []
     callbacks = in_order([*listed(callback), *bar])
-    agent.stops, agent.n_together = device.stops_of(agent, call, callbacks), 1
-    if agent.stops is not None:
+    agent.call.stops, agent.call.n_together = device.stops_of(agent, call, callbacks), 1
+    if agent.call.stops is not None:
         device.require_memory(agent)
     with session(agent, call, callbacks, tb_log_name, sinks) as record:
         try:
@@ -209,7 +209,7 @@ def train(
                     for turn in agent.loop(*horizon(agent, call)):
                         if (is_over := record(turn) or interrupt.requested) or learner is not agent.learner:
                             break
-            agent.interrupted, agent.interrupted_by = interrupt.requested, interrupt.signal
+            agent.call.interrupted_by = interrupt.signal
             finite.settle(agent)
         except NonFiniteUpdate as broken:
             raise finite.reported(agent, broken) from None
@@ -219,7 +219,7 @@ def train(
 
 @contextmanager
 def session(
-    agent: BaseAgent,
+    agent: AnyAgent,
     call: TrainingCall,
     callbacks: Sequence[Callback],
     tb_log_name: str | None = None,
@@ -230,16 +230,17 @@ def session(
     Yields a function that is called after every turn of the loop. It records the turn, calls the callbacks, and returns
     whether training is over.
     """
-    agent.training_call, agent.callbacks = call, stateful(callbacks)
-    agent.interrupted, agent.interrupted_by = False, None
-    agent.run.success_threshold = agent.success_threshold
+    agent.call.training_call, agent.call.callbacks, agent.call.interrupted_by = call, stateful(callbacks), None
+    agent.run.success_threshold = agent.identity.success_threshold
     with ExitStack() as stack:
         stack.callback(lambda: setattr(agent.run, "fingerprint", snapshot.fingerprint(agent.run.env)))
         outputs = open_outputs(agent, sinks, tb_log_name, stack)
-        stack.callback(agent.failed_writes.retry)
+        stack.callback(agent.files.failed_writes.retry)
         for output in outputs:
             output.write_config(run_config(agent, call))
-        stack.enter_context(marked_as_learning(agent, outputs))
+        stack.callback(partial(setattr, agent.logger, "outputs", agent.logger.outputs))
+        stack.callback(partial(setattr, agent.call, "is_learning", False))
+        agent.logger.outputs, agent.call.is_learning = [*outputs], True
         stack.enter_context(listening(agent, callbacks))
 
         def record(turn: Progress) -> bool:
@@ -253,15 +254,15 @@ def session(
         try:
             yield record
         except BaseException:  # perhaps of an environment, some of which have taken a step that was not stored
-            if agent.stops is None:  # a chunk on the device is completed
+            if agent.call.stops is None:  # a chunk on the device is completed
                 agent.run.obs = agent.run.action = None
             raise
 
 
-def hint_at_more_environments(agent: BaseAgent) -> None:
+def hint_at_more_environments(agent: AnyAgent) -> None:
     """Warns if a run waits for a single registered environment, and names the call that makes eight; Python shows it once."""
     env, seconds = agent.run.env, agent.run.seconds
-    is_slow = seconds["total"] > HINT_SECONDS and agent.steps_per_second < HINT_RATE
+    is_slow = seconds["total"] > HINT_SECONDS and agent.record.steps_per_second < HINT_RATE
     if (
         is_slow
         and env is not None
@@ -276,36 +277,25 @@ def hint_at_more_environments(agent: BaseAgent) -> None:
         warnings.warn(hint, UserWarning, stacklevel=2)
 
 
-def horizon(agent: BaseAgent, call: TrainingCall) -> tuple[int | None, Callable[[int], float]]:
+def horizon(agent: AnyAgent, call: TrainingCall) -> tuple[int | None, Callable[[int], float]]:
     """Returns the number of steps that are left to take, and the progress of schedules after a number of them."""
     run, first = agent.run, agent.run.step
     remaining = None if call.last_step is None else call.last_step - first
     return remaining, lambda n_steps: call.progress(first + n_steps, run.episode)
 
 
-@contextmanager
-def marked_as_learning(agent: BaseAgent, outputs: Sequence[Sink]) -> Iterator[None]:
-    """While entered, the agent counts as learning, and its logger writes to ``outputs``."""
-    loggers = agent.logger.outputs
-    agent.logger.outputs, agent.is_learning = [*outputs], True
-    try:
-        yield
-    finally:
-        agent.logger.outputs, agent.is_learning = loggers, False
-
-
-def record_turn(agent: BaseAgent, call: TrainingCall, turn: Progress) -> None:
+def record_turn(agent: AnyAgent, call: TrainingCall, turn: Progress) -> None:
     """Adds what one turn of the loop did to the statistics, and keeps the best weights."""
-    agent.steps_per_second = (turn.step - call.first_step) / max(call.elapsed, 1e-9)
+    agent.record.steps_per_second = (turn.step - call.first_step) / max(call.elapsed, 1e-9)
     for episode in turn.episodes:
-        record_episode(agent, episode)
+        agent.record.add(episode)
     if ended := device.episodes_to_judge(agent, call, turn):
         note_training_return(agent, ended)
 
 
-def write_row(agent: BaseAgent, call: TrainingCall, turn: Progress, outputs: Sequence[Sink]) -> None:
+def write_row(agent: AnyAgent, call: TrainingCall, turn: Progress, outputs: Sequence[Sink]) -> None:
     """Writes a row of statistics if one is due."""
-    counted = turn.step // STEPS_OF_A_ROW if is_offline(agent) else len(agent.history)
+    counted = turn.step // STEPS_OF_A_ROW if is_offline(agent) else len(agent.record.history)
     if counted - call.logged >= call.log_interval and outputs:
         call.logged = counted
         row = statistics_row(agent) | agent.logger.take()
@@ -314,40 +304,32 @@ def write_row(agent: BaseAgent, call: TrainingCall, turn: Progress, outputs: Seq
         hint_at_more_environments(agent)
 
 
-def is_offline(agent: BaseAgent) -> bool:
+def is_offline(agent: AnyAgent) -> bool:
     """Returns whether an agent learns without an environment, so that no episodes end."""
     return isinstance(agent.config, configs.OffPolicyConfig) and agent.config.offline
 
 
-def note_training_return(agent: BaseAgent, ended: int) -> None:
+def note_training_return(agent: AnyAgent, ended: int) -> None:
     """Keeps the current weights if the mean return of the last ``best_window`` episodes is the best so far.
 
     Each of the ``ended`` episodes that have just finished is the last of a window.
     """
-    window = agent.best_window
-    returns = [episode.episode_return for episode in agent.history.last(window + ended - 1)]
-    if len(returns) >= window and (agent.best is None or agent.best.by == "training"):
+    window = agent.identity.best_window
+    returns = [episode.episode_return for episode in agent.record.history.last(window + ended - 1)]
+    if len(returns) >= window and (agent.record.best is None or agent.record.best.by == "training"):
         means = np.lib.stride_tricks.sliding_window_view(returns, window).mean(axis=-1)
         remember_best(agent, float(means.max()), "training")
 
 
-def remember_best(agent: BaseAgent, score: float | tuple[float, ...], by: str = "evaluation") -> bool:
+def remember_best(agent: AnyAgent, score: float | tuple[float, ...], by: str = "evaluation") -> bool:
     """Keeps the current weights for :meth:`Agent.restore_best` if ``score`` is the best so far; returns whether it is.
 
     ``learn`` calls it with the mean return of the last ``best_window`` training episodes, and
     :class:`rejeu.callbacks.Evaluate` with success rate and mean return. After the first evaluation only evaluations count.
     Scores of one kind must be comparable.
     """
-    if agent.best is not None and agent.best.by == by and score <= agent.best.score:  # type: ignore[operator]
+    if agent.record.best is not None and agent.record.best.by == by and score <= agent.record.best.score:  # type: ignore[operator]
         return False
     finite.settle(agent)
-    agent.best = Best(score, by, agent.run.step, agent.learner.copy(agent.run.state))
+    agent.record.best = Best(score, by, agent.run.step, agent.learner.copy(agent.run.state))
     return True
-
-
-def record_episode(agent: BaseAgent, episode: Episode) -> None:
-    """Adds an episode to the history and to the buffers of recent episodes."""
-    agent.history.append(episode)
-    agent.ep_info_buffer.append({"r": episode.episode_return, "l": episode.length, "t": episode.seconds})
-    if not math.isnan(episode.success):
-        agent.ep_success_buffer.append(episode.success)

@@ -21,6 +21,7 @@ import numpy as np
 from rejeu.agents import BUILT_IN, zoo
 from rejeu.agents.agent import Agent
 from rejeu.agents.conversion import EXTRACTORS, OriginalPolicy, action_layers, converted, parts_of, shares_extractor
+from rejeu.checkpoints.agent_state import Identity
 from rejeu.checkpoints.pickled import (
     MOST_FIELD,
     UNREADABLE,
@@ -514,7 +515,7 @@ def load_zip(
         cls.algorithm.Config(**settings)  # what the file says is judged apart from what the user says
     agent: Agent = cls.__new__(cls)
     agent.notes = notes  # before it is built, when only known attributes can be set
-    agent.configure(name_of(policy), build(cls.algorithm.Config, settings | changes), **arguments)
+    agent.configure(build(cls.algorithm.Config, settings | changes), Identity.of(name_of(policy), **arguments))
     agent.set_outputs(**outputs)
     vector = None if env is None else agent.make_envs(env, 1, seed=agent.seed)
     env_space = None if vector is None else vector.observation_space

@@ -316,7 +316,7 @@ def own_changes(saved: Mapping[str, object], changes: Mapping[str, object]) -> S
 
 
 @cache
-def value_types(config_class: type) -> dict[str, tuple[Any, ...]]:
+def value_types(config_class: Any) -> dict[str, tuple[Any, ...]]:
     """Returns the types that the values of each field of a configuration may have, such as ``(float, Schedule)``."""
     hints = get_type_hints(config_class)
     return {name: get_args(x) if get_origin(x) in (Union, UnionType) else (x,) for name, x in hints.items()}

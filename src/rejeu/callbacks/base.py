@@ -122,7 +122,7 @@ def listening(agent: Any, callbacks: Sequence[Callback]) -> Iterator[None]:
     """Tells callbacks that training starts and, on exit, that it has ended; restores their state in a resumed run."""
     started: list[TrainingCallback] = []
     error: BaseException | None = None
-    saved = None if agent.saved_callbacks is None else [*agent.saved_callbacks]
+    saved = None if agent.call.saved_callbacks is None else [*agent.call.saved_callbacks]
     try:
         for callback in callbacks:
             if isinstance(callback, TrainingCallback):
@@ -130,7 +130,7 @@ def listening(agent: Any, callbacks: Sequence[Callback]) -> Iterator[None]:
                 started.append(callback)
             if saved is not None and isinstance(callback, Stateful):
                 restore_one(callback, saved)
-        agent.saved_callbacks = None
+        agent.call.saved_callbacks = None
         if saved is not None:
             for training_callback in started:
                 training_callback.resumed(agent)
@@ -153,7 +153,7 @@ def restore(agent: Any, callbacks: Sequence[Callback]) -> None:
     Raises:
         CheckpointError: if a saved state is damaged.
     """
-    saved = [*(agent.saved_callbacks or ())]
+    saved = [*(agent.call.saved_callbacks or ())]
     for callback in callbacks:
         if isinstance(callback, Stateful):
             restore_one(callback, saved)

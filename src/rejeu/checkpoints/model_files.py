@@ -10,8 +10,8 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from rejeu.agents.base import AGENT_ARGUMENTS, BaseAgent
 from rejeu.algorithms import config as configs
+from rejeu.checkpoints.agent_state import AGENT_ARGUMENTS, AnyAgent, Identity
 from rejeu.core import checkpoint, devices, spaces, xla
 from rejeu.core.errors import CheckpointError, MissingObjectError
 from rejeu.core.records import WRONG, Positive, Seed, brief, convert
@@ -115,28 +115,28 @@ def check_space(description: object, ours: gym.Space, name: str) -> None:
         raise ValueError(f"it is of the {name} space {theirs}, and this agent was made for {ours}")
 
 
-A = TypeVar("A", bound=BaseAgent)
+A = TypeVar("A", bound=AnyAgent)
 
 
-def header(agent: BaseAgent) -> JsonObject:
+def header(agent: AnyAgent) -> JsonObject:
     """Returns the header of an agent's model file: everything except arrays, as JSON values."""
     run = agent.run
     return {
         "algorithm": agent.name,
         "config": configs.to_json(agent.config),
-        "policy": agent.policy_name,
+        "policy": agent.identity.policy_name,
         "observation_space": spaces.describe(agent.observation_space),
         "action_space": spaces.describe(agent.action_space),
-        "env_id": run.env.env_id if run.env is not None else agent.trained_on and agent.trained_on[0],
+        "env_id": run.env.env_id if run.env is not None else agent.identity.trained_on and agent.identity.trained_on[0],
         "made_from": made_from(agent),
-        "seed": agent.seed,
-        "stats_window_size": agent.stats_window_size,
-        "success_threshold": agent.success_threshold,
-        "best_window": agent.best_window,
+        "seed": agent.identity.seed,
+        "stats_window_size": agent.identity.stats_window_size,
+        "success_threshold": agent.identity.success_threshold,
+        "best_window": agent.identity.best_window,
         "counters": {
             "step": run.step,
-            "steps_before": agent.reset_step,
-            "episodes_before": agent.reset_episode,
+            "steps_before": agent.call.reset_step,
+            "episodes_before": agent.call.reset_episode,
             "episode": run.episode,
             "n_updates": run.n_updates,
         },
@@ -144,7 +144,7 @@ def header(agent: BaseAgent) -> JsonObject:
     }
 
 
-def made_from(agent: BaseAgent) -> JsonObject | None:
+def made_from(agent: AnyAgent) -> JsonObject | None:
     """Returns id and keyword arguments of an agent's environments for a header; None if a file may not hold them."""
     source = agent.origin
     if source is None or not is_plain_id(source[0]) or not are_plain(dict(source[1])):
@@ -192,7 +192,12 @@ def load(
     except CheckpointError as error:
         raise CheckpointError(f"{path}: {error}") from None
     agent = cls.__new__(cls)
-    _set_up(agent, saved, arguments)
+    outputs = {key: arguments.pop(key) for key in OUTPUTS if key in arguments}
+    agent.configure(saved.config, Identity.of(**{key: getattr(saved.header, key) for key in ARGUMENTS} | arguments))
+    agent.set_outputs(**outputs)
+    spaces.check_policy(
+        agent.identity.policy_name, saved.observation_space, agent.config.policy_kwargs.normalize_images
+    )
     try:
         agent.build(saved.observation_space, saved.action_space)
     except WRONG as error:
@@ -201,13 +206,13 @@ def load(
     arrays = checkpoint.within(file.read(prefix), prefix)
     checkpoint.require_finite(arrays, path)
     state = checkpoint.arrays_to_tree(agent.learner.shapes, arrays, path)
-    agent.trained_on = trained_on(header)
+    agent.identity.trained_on = trained_on(header)
     vector = make_env(agent)
     if vector is not None:
         agent.check_spaces(vector, "the given environment")
     n_envs = 1 if vector is None else vector.n_envs
     xla.start_device(agent.n_threads(n_envs) if threads is None else threads)
-    devices.find(agent.device)  # an error of its own
+    devices.find(agent.identity.device)  # an error of its own
     try:
         agent.start_run(vector, agent.learner.pack(state))
         _restore_counters(agent, saved.header)
@@ -218,24 +223,11 @@ def load(
     return agent
 
 
-def _set_up(agent: BaseAgent, saved: Saved, arguments: Mapping[str, Any]) -> None:
-    """Sets the attributes of an agent from a model file, and from the user's changes.
-
-    Raises:
-        ValueError: if ``arguments`` are invalid.
-    """
-    outputs = {key: arguments[key] for key in OUTPUTS if key in arguments}
-    settings = {key: value for key, value in arguments.items() if key not in OUTPUTS}
-    agent.configure(config=saved.config, **{key: getattr(saved.header, key) for key in ARGUMENTS} | settings)
-    agent.set_outputs(**outputs)
-    spaces.check_policy(agent.policy_name, saved.observation_space, agent.config.policy_kwargs.normalize_images)
-
-
-def _restore_counters(agent: BaseAgent, saved: AgentHeader) -> None:
+def _restore_counters(agent: AnyAgent, saved: AgentHeader) -> None:
     """Sets the counters and random numbers of a loaded agent; its replay buffer is empty until one is loaded."""
     run, counters = agent.run, saved.counters
     run.step, run.episode, run.n_updates = counters.step, counters.episode, counters.n_updates
     run.rng.bit_generator.state = {**run.rng.bit_generator.state, "state": msgspec.structs.asdict(saved.rng)}
     run.learn_from = agent.first_learning_step(run.step)
-    run.seed = int(np.random.SeedSequence([agent.seed, run.step]).generate_state(1)[0])
-    agent.reset_step, agent.reset_episode = counters.steps_before, counters.episodes_before
+    run.seed = int(np.random.SeedSequence([agent.identity.seed, run.step]).generate_state(1)[0])
+    agent.call.reset_step, agent.call.reset_episode = counters.steps_before, counters.episodes_before

@@ -15,8 +15,8 @@ import numpy as np
 from jax import Array
 from numpy.typing import DTypeLike
 
-from rejeu.agents.base import BaseAgent, Best, Resumed, fill_windows
 from rejeu.checkpoints import model_files
+from rejeu.checkpoints.agent_state import AnyAgent, Best, Resumed
 from rejeu.checkpoints.run_files import PER_ENV, SCALARS, RowFiles, RunHeader, SavedBest, SavedRun, folder_of, versions
 from rejeu.checkpoints.run_folder import checkpoint_files
 from rejeu.core import checkpoint, devices, records, spaces, xla
@@ -33,7 +33,7 @@ from rejeu.replay.rollout import RolloutBuffer
 from rejeu.training.learner import Readings
 from rejeu.training.run import Run, TrainingCall
 
-A = TypeVar("A", bound=BaseAgent)
+A = TypeVar("A", bound=AnyAgent)
 
 
 def resume(cls: type[A], folder: Path, env: Any, changes: Settings) -> A:
@@ -44,7 +44,9 @@ def resume(cls: type[A], folder: Path, env: Any, changes: Settings) -> A:
     skipped: list[str] = []
     for i, path in enumerate(paths):
         try:
-            agent = _resume(cls, path, env, dict(changes))
+            with checkpoint.opened(path, "run") as file, ExitStack() as stack:
+                agent = _resume_within(stack, file, cls, env, dict(changes))
+                stack.pop_all()
         except CheckpointError as error:
             settings = changes.keys() - model_files.AGENT_ARGUMENTS
             if settings and is_whole(path):  # an older one might fit, and lose what was trained since
@@ -56,6 +58,8 @@ def resume(cls: type[A], folder: Path, env: Any, changes: Settings) -> A:
         else:
             assert agent.resumed is not None
             agent.resumed = agent.resumed._replace(skipped=tuple(skipped))
+            if not agent.resumed.exact:
+                warnings.warn(str(agent.resumed), UserWarning, stacklevel=3)
             return agent
     raise AssertionError
 
@@ -73,16 +77,6 @@ def is_whole(path: Path) -> bool:
     return True
 
 
-def _resume(cls: type[A], path: Path, env: Any, changes: Settings) -> A:
-    with checkpoint.opened(path, "run") as file, ExitStack() as stack:
-        agent = _resume_within(stack, file, cls, env, changes)
-        stack.pop_all()
-    assert agent.resumed is not None
-    if not agent.resumed.exact:
-        warnings.warn(str(agent.resumed), UserWarning, stacklevel=4)
-    return agent
-
-
 def _resume_within(stack: ExitStack, file: checkpoint.Contents, cls: type[A], env: Any, changes: Settings) -> A:
     """Returns the agent; ``stack`` closes the environments made for it if the checkpoint is refused."""
     path = file.path
@@ -91,15 +85,15 @@ def _resume_within(stack: ExitStack, file: checkpoint.Contents, cls: type[A], en
     except WRONG as error:
         raise refusal(path, error) from error
 
-    def make_env(agent: BaseAgent) -> VectorEnv:
+    def make_env(agent: AnyAgent) -> VectorEnv:
         if env is not None:
-            vector = agent.make_envs(env, seed=seed_of_run(agent.seed))
+            vector = agent.make_envs(env, seed=seed_of_run(agent.identity.seed))
             if vector.n_envs != header.n_envs:
                 raise CheckpointError(f"the run had {header.n_envs} environments, and {vector.n_envs} are given")
             return vector
         env_id, backend = environment(path, header)
         try:
-            vector = agent.make_envs(env_id, header.n_envs, backend, seed_of_run(agent.seed))
+            vector = agent.make_envs(env_id, header.n_envs, backend, seed_of_run(agent.identity.seed))
             stack.callback(vector.close)
             agent.check_spaces(vector, f"{env_id} as it is here")
         except (ValueError, TypeError, gym.error.Error) as error:
@@ -115,10 +109,10 @@ def _resume_within(stack: ExitStack, file: checkpoint.Contents, cls: type[A], en
         saved = convert(records.decode(header.run, file.read("run.")), SavedRun)
         best = checkpoint.within(file.read("best."), "best.")
         parts = [read_rows(path.parent / name, agent) for name in header.rows]
-        with devices.chosen(agent.device):
+        with devices.chosen(agent.identity.device):
             reason = restore(agent, saved, parts, best, path)
         agent.resumed = Resumed(agent.run.step, not reason, reason) if reason else compared(agent, header)
-        agent.run_id, agent.made_from_id = header.run_id, env is None
+        agent.identity.run_id, agent.identity.made_from_id = header.run_id, env is None
     except FileNotFoundError as error:
         raise CheckpointError(f"{path} needs a file that is missing: {error}") from None
     except WRONG as error:
@@ -132,7 +126,7 @@ def _resume_within(stack: ExitStack, file: checkpoint.Contents, cls: type[A], en
     return agent
 
 
-def check_specs(agent: BaseAgent, file: checkpoint.Contents) -> None:
+def check_specs(agent: AnyAgent, file: checkpoint.Contents) -> None:
     """Checks the arrays of a run's file before they are read; those of the agent's state were checked before.
 
     Raises:
@@ -145,7 +139,7 @@ def check_specs(agent: BaseAgent, file: checkpoint.Contents) -> None:
             raise CheckpointError(f"{file.path} has {checkpoint.shown(name)}, which no checkpoint of a run has")
 
 
-def read_rows(path: Path, agent: BaseAgent) -> dict[str, np.ndarray]:
+def read_rows(path: Path, agent: AnyAgent) -> dict[str, np.ndarray]:
     """Returns the arrays of a file of rows, after checking that they fit the agent's buffer.
 
     Raises:
@@ -156,7 +150,7 @@ def read_rows(path: Path, agent: BaseAgent) -> dict[str, np.ndarray]:
         return file.read()
 
 
-def compared(agent: BaseAgent, header: RunHeader) -> Resumed:
+def compared(agent: AnyAgent, header: RunHeader) -> Resumed:
     """Returns how a run resumes whose environments were restored."""
     here = xla.threads()
     if header.versions != versions():
@@ -198,7 +192,7 @@ def environment(path: Path, header: RunHeader) -> tuple[str, Backend]:
 
 
 def restore(
-    agent: BaseAgent, saved: SavedRun, rows: Sequence[dict[str, np.ndarray]], best: dict[str, np.ndarray], path: Path
+    agent: AnyAgent, saved: SavedRun, rows: Sequence[dict[str, np.ndarray]], best: dict[str, np.ndarray], path: Path
 ) -> str:
     """Restores the run of an agent that was loaded from the same checkpoint.
 
@@ -223,19 +217,18 @@ def restore(
         reason = reason or put_envs_back(run, saved, getattr(agent.config, "n_episodes", None))
     elif saved.seed is not None:
         run.seed = whole_seed(saved.seed)
-    agent.history.replace(saved.history)
-    fill_windows(agent)
+    agent.record.restore(saved.history)
     if saved.best is not None:
         restore_best(agent, saved.best, best, path)
-    agent.training_call = None if saved.call is None else TrainingCall.from_json(saved.call)
-    agent.saved_callbacks = list(saved.callbacks)
+    agent.call.training_call = None if saved.call is None else TrainingCall.from_json(saved.call)
+    agent.call.saved_callbacks = list(saved.callbacks)
     statistics = agent.get_vec_normalize_env()
     if statistics is not None and saved.vec_normalize is not None:
         statistics.put_statistics(saved.vec_normalize)
     return f"at the start of new episodes: {reason}" if reason else ""
 
 
-def restore_counters(agent: BaseAgent, saved: SavedRun) -> None:
+def restore_counters(agent: AnyAgent, saved: SavedRun) -> None:
     """Restores counters, durations, random numbers and the logger of a run."""
     run = agent.run
     if saved.steps_since_update > run.step:
@@ -248,13 +241,13 @@ def restore_counters(agent: BaseAgent, saved: SavedRun) -> None:
     run.rng.bit_generator.state = saved.rng
     run.monitor.n_skipped = saved.n_skipped
     run.seconds = {key: saved.seconds[key] for key in run.seconds}
-    agent.reset_seconds = number("before", saved.seconds["before"], least=0, most=run.seconds["total"])
+    agent.call.reset_seconds = number("before", saved.seconds["before"], least=0, most=run.seconds["total"])
     values, agent.logger.name_to_count = saved.logger
     agent.logger.name_to_value = {key: number(key, value) for key, value in values.items()}
     agent.n_predictions = saved.n_predictions
 
 
-def restore_best(agent: BaseAgent, saved: SavedBest, arrays: dict[str, np.ndarray], path: Path) -> None:
+def restore_best(agent: AnyAgent, saved: SavedBest, arrays: dict[str, np.ndarray], path: Path) -> None:
     """Restores the best weights.
 
     Raises:
@@ -262,7 +255,7 @@ def restore_best(agent: BaseAgent, saved: SavedBest, arrays: dict[str, np.ndarra
     """
     packed = agent.learner.pack(checkpoint.arrays_to_tree(agent.learner.shapes, arrays, path))
     checkpoint.require_finite(arrays, path)
-    agent.best = Best(saved.score, saved.by, saved.step, packed)
+    agent.record.best = Best(saved.score, saved.by, saved.step, packed)
 
 
 def put_envs_back(run: Run, saved: SavedRun, n_episodes: int | None) -> str:

@@ -29,8 +29,8 @@ import optax
 from filelock import Timeout
 from msgspec import Meta
 
-from rejeu.agents.base import BaseAgent
 from rejeu.checkpoints import model_files
+from rejeu.checkpoints.agent_state import AnyAgent
 from rejeu.checkpoints.run_folder import checkpoint_files, step_of
 from rejeu.core import atomic, checkpoint, records, xla
 from rejeu.core.algorithm import PyTree
@@ -76,19 +76,19 @@ class RowFiles:
         self.files = [(file, head) for file, head in self.files if (head >= oldest).any()]
 
 
-def folder_of(agent: BaseAgent, folder: Path) -> CheckpointFolder:
+def folder_of(agent: AnyAgent, folder: Path) -> CheckpointFolder:
     """Returns the folder of an agent's checkpoints, always the same object for the same path."""
     path = folder.resolve()
-    if path not in agent.checkpoint_folders:
-        agent.checkpoint_folders[path] = CheckpointFolder(agent, folder)
-    checkpoint_folder: CheckpointFolder = agent.checkpoint_folders[path]
+    if path not in agent.files.checkpoint_folders:
+        agent.files.checkpoint_folders[path] = CheckpointFolder(agent, folder)
+    checkpoint_folder: CheckpointFolder = agent.files.checkpoint_folders[path]
     return checkpoint_folder
 
 
 class CheckpointFolder:
     """A folder with the checkpoints of an agent's run. Mutable; see :meth:`Agent.checkpoint_folder`."""
 
-    def __init__(self, agent: BaseAgent, folder: Path) -> None:
+    def __init__(self, agent: AnyAgent, folder: Path) -> None:
         self.agent = agent
         self.folder = folder
         self.row_files = RowFiles()
@@ -120,8 +120,8 @@ class CheckpointFolder:
             self.close()
             raise
         self.agent.run.env.record()
-        if self.agent.report_folder is None:
-            self.agent.report_folder = self.folder
+        if self.agent.files.report_folder is None:
+            self.agent.files.report_folder = self.folder
 
     def close(self) -> None:
         """Releases the lock."""
@@ -151,7 +151,7 @@ class CheckpointFolder:
             header, arrays = content(agent, reason)
             header["rows"] = [name for name, _ in self.row_files.files]
             path = checkpoint.write(self.folder / f"run_{run.step:012d}.safetensors", "run", arrays, header)
-            self._named[path], agent.last_saved = header["rows"], path
+            self._named[path], agent.files.last_saved = header["rows"], path
         except OSError as error:
             remaining = checkpoint_files(self.folder)
             raise OSError(
@@ -168,7 +168,7 @@ class CheckpointFolder:
                 header = checkpoint.read_header(path, "run")
             except CheckpointError:
                 continue
-            if header.get("run_id") != self.agent.run_id:
+            if header.get("run_id") != self.agent.identity.run_id:
                 raise FileExistsError(
                     f"{self.folder} contains the checkpoints of another run; continue it with "
                     f"{self.agent.name}.resume(folder), or give Checkpoint another folder"
@@ -281,7 +281,7 @@ class SavedRun(msgspec.Struct, kw_only=True):
     vec_normalize: Any
 
 
-def content(agent: BaseAgent, reason: str) -> tuple[JsonObject, dict[str, np.ndarray]]:
+def content(agent: AnyAgent, reason: str) -> tuple[JsonObject, dict[str, np.ndarray]]:
     """Returns header and arrays of a run, without the rows of its replay buffer."""
     run = agent.run
     states = None if reason or run.obs is None else run.env.snapshot()
@@ -290,9 +290,9 @@ def content(agent: BaseAgent, reason: str) -> tuple[JsonObject, dict[str, np.nda
         reason = "none was under way" if run.obs is None else f"the state of {where} cannot be carried"
     arrays = {f"state.{name}": array for name, array in checkpoint.tree_to_arrays(agent.state).items()}
     best = None
-    if agent.best is not None:
-        best = {"score": agent.best.score, "by": agent.best.by, "step": agent.best.step}
-        whole_state = agent.learner.state(agent.best.state)
+    if agent.record.best is not None:
+        best = {"score": agent.record.best.score, "by": agent.record.best.by, "step": agent.record.best.step}
+        whole_state = agent.learner.state(agent.record.best.state)
         arrays |= {f"best.{name}": array for name, array in checkpoint.tree_to_arrays(whole_state).items()}
     statistics = agent.get_vec_normalize_env()
     everything = {
@@ -308,24 +308,24 @@ def content(agent: BaseAgent, reason: str) -> tuple[JsonObject, dict[str, np.nda
         "metrics": None if run.metrics is None else {key: np.asarray(value) for key, value in run.metrics.items()},
         "n_skipped": run.monitor.n_skipped,
         "td_errors": leaves([td_error for _, td_error in run.td_errors]),
-        "seconds": {**{key: float(value) for key, value in run.seconds.items()}, "before": agent.reset_seconds},
+        "seconds": {**{key: float(value) for key, value in run.seconds.items()}, "before": agent.call.reset_seconds},
         "buffer": buffer_content(run),
-        "history": agent.history.table(),
+        "history": agent.record.history.table(),
         "best": best,
         "logger": [dict(agent.logger.name_to_value), dict(agent.logger.name_to_count)],
         "n_predictions": agent.n_predictions,
-        "call": None if agent.training_call is None else agent.training_call.to_json(),
-        "callbacks": [[type(callback).__name__, callback.state_dict()] for callback in agent.callbacks],
+        "call": None if agent.call.training_call is None else agent.call.training_call.to_json(),
+        "callbacks": [[type(callback).__name__, callback.state_dict()] for callback in agent.call.callbacks],
         "vec_normalize": None if statistics is None else statistics.statistics(),
     }
     header = {
         **model_files.header(agent),
-        "run_id": agent.run_id,
+        "run_id": agent.identity.run_id,
         "n_envs": run.env.n_envs,
         "backend": run.env.backend,
-        "own_env": agent.made_from_id,
+        "own_env": agent.identity.made_from_id,
         "threads": xla.threads(),
-        "n_together": agent.n_together,
+        "n_together": agent.call.n_together,
         "versions": versions(),
         "run": records.encode(everything, arrays, "run"),
     }

@@ -29,6 +29,7 @@ import optax
 from gymnasium.envs.registration import EnvSpec
 
 from rejeu.algorithms.config import OffPolicyConfig
+from rejeu.checkpoints.agent_state import AnyAgent
 from rejeu.core import interrupt, spaces
 from rejeu.core.algorithm import Algorithm, Clock, Metrics, PyTree, averaged_fields, names
 from rejeu.core.errors import requires
@@ -148,7 +149,7 @@ def check_end(path: Path, name: str, rewards: np.ndarray, terminations: np.ndarr
 
 
 def record(
-    agent: Any, env: str | gym.Env, episodes: int, path: str | Path | None = None, seed: int | None = None
+    agent: AnyAgent, env: str | gym.Env, episodes: int, path: str | Path | None = None, seed: int | None = None
 ) -> Demonstrations:
     """Plays whole episodes with an agent, and returns them.
 
@@ -188,7 +189,7 @@ def one_of(env: Any) -> gym.Env:
 
 def play(
     env: gym.Env,
-    agent: Any,
+    agent: AnyAgent,
     label: Callable[[Any, Any], Any],
     seed: int | None = None,
     recording: Any = None,
@@ -238,7 +239,7 @@ def episode_of(steps: Sequence[tuple[Any, ...]]) -> Episode:
 
 
 def clone(
-    agent: Any,
+    agent: AnyAgent,
     demonstrations: Demonstrations,
     updates: int = 2000,
     *,
@@ -319,7 +320,7 @@ def imitation_loss(algorithm: Algorithm, actor: PyTree, obs: PyTree, action: Act
 
 
 def dagger(
-    agent: Any,
+    agent: AnyAgent,
     expert: Callable[[Any], Any],
     env: str | gym.Env,
     demonstrations: Demonstrations | None = None,
@@ -427,7 +428,7 @@ def learn_offline(
     return {name: float(value) for name, value in (run.metrics or {}).items()}
 
 
-def keeping_policy(agent: Any) -> Learner:
+def keeping_policy(agent: AnyAgent) -> Learner:
     """Returns the functions of an agent with updates that leave its policy as it is; raises as :func:`learn_offline`."""
     algorithm = agent.learner.algorithm
     if not any("critic" in name for name in names(agent.learner.shapes)):
@@ -455,7 +456,7 @@ def chunks(updates: int) -> Iterable[int]:
         yield min(STEPS_OFFLINE, updates - first)
 
 
-def check(agent: Any, demonstrations: Demonstrations) -> None:
+def check(agent: AnyAgent, demonstrations: Demonstrations) -> None:
     """Raises ``ValueError`` unless an agent can learn from demonstrations: these spaces, the bounds of observations aside."""
     if not isinstance(demonstrations, Demonstrations):
         raise TypeError(f"demonstrations={demonstrations!r} must be what read(FOLDER) or record(...) returns")
@@ -490,13 +491,13 @@ def check(agent: Any, demonstrations: Demonstrations) -> None:
             spaces.check_env_actions(space, np.asarray(episode.actions), episode.name)
 
 
-def arrays_of(agent: Any, episode: Episode) -> tuple[PyTree, np.ndarray]:
+def arrays_of(agent: AnyAgent, episode: Episode) -> tuple[PyTree, np.ndarray]:
     """Returns the observations of an episode that were acted on, and the actions in the algorithm's range."""
     obs = batch_of(agent, episode.observations, slice(0, len(episode)))
     return agent.with_masks(obs, None), spaces.unscale_action(agent.action_space, np.asarray(episode.actions))
 
 
-def batch_of(agent: Any, observations: Observation, rows: slice) -> PyTree:
+def batch_of(agent: AnyAgent, observations: Observation, rows: slice) -> PyTree:
     """Returns some observations of an episode as a batch."""
     return spaces.as_batch(
         jax.tree.map(lambda leaf: np.asarray(leaf)[rows], observations), agent.observation_space, agent.obs_leaves
@@ -542,7 +543,7 @@ def with_targets(state: PyTree) -> PyTree:
     return jax.tree.map(copied, state, is_leaf=is_state)
 
 
-def fill(replay: Any, agent: Any, demonstrations: Demonstrations) -> None:
+def fill(replay: Any, agent: AnyAgent, demonstrations: Demonstrations) -> None:
     """Adds the episodes to an empty replay buffer of one environment."""
     for episode in demonstrations.episodes:
         obs, action = arrays_of(agent, episode)

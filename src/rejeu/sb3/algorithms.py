@@ -24,8 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from rejeu import agents
-from rejeu.agents import Agent
-from rejeu.agents.base import AGENT_ARGUMENTS
+from rejeu.agents.agent import Agent
 from rejeu.agents.off_policy import OffPolicyAgent
 from rejeu.agents.zip_files import load_zip, restore_windows
 from rejeu.agents.zoo import statistics_beside
@@ -36,6 +35,7 @@ from rejeu.algorithms.catalog import CATALOG
 from rejeu.algorithms.config import REPLAY_BUFFERS
 from rejeu.callbacks.base import Callback, TrainingCallback
 from rejeu.checkpoints import model_files
+from rejeu.checkpoints.agent_state import AGENT_ARGUMENTS
 from rejeu.core import checkpoint, schedules, validation
 from rejeu.core.algorithm import Rollout
 from rejeu.core.errors import CheckpointError
@@ -179,7 +179,10 @@ class Original(Agent):
         by_space = "MultiInputPolicy" if isinstance(space, gym.spaces.Dict | gym.spaces.Tuple) else "MlpPolicy"
         return env, policy_class.policy_name or by_space, instance
 
-    converted = classmethod(arguments.converted)
+    @classmethod
+    def converted(cls, settings: Mapping[str, Any]) -> dict[str, Any]:
+        """Converts keyword arguments of Stable-Baselines3's classes."""
+        return arguments.converted(cls, settings)
 
     @property
     def policy(self) -> BasePolicy:
@@ -221,7 +224,7 @@ class Original(Agent):
         raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
 
     def __setattr__(self, name: str, value: Any) -> None:
-        """Sets an attribute; a hyperparameter from the next update on, see :meth:`rejeu.agents.base.BaseAgent.change`.
+        """Sets an attribute; a hyperparameter from the next update on, see :meth:`rejeu.agents.agent.Agent.change`.
 
         Attributes of your own can be set too. A name that is nearly that of a hyperparameter warns.
 
@@ -416,7 +419,7 @@ class Original(Agent):
 
     @num_timesteps.setter
     def num_timesteps(self, value: int) -> None:
-        self.run.step = self.reset_step + int(value)
+        self.run.step = self.call.reset_step + int(value)
 
     @property
     def _current_progress_remaining(self) -> float:

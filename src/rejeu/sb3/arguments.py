@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from typing import Any
 
 from rejeu.agents import Agent
-from rejeu.agents.base import AGENT_ARGUMENTS
 from rejeu.algorithms import config as configs
 from rejeu.algorithms.config import REPLAY_BUFFERS
+from rejeu.checkpoints.agent_state import AGENT_ARGUMENTS
 from rejeu.core import validation
 from rejeu.core.types import Arguments, Settings
 from rejeu.sb3.common import buffers, utils

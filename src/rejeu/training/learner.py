@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import jax
@@ -235,6 +235,11 @@ class Learner:
     def initial_memory(self, n: int) -> PyTree:
         """Returns the memory of the policy at the start of ``n`` episodes; ``()`` if it has none."""
         return exploration.plain(self.algorithm).init(self.algorithm.actor(self.shapes), n)
+
+    @cached_property
+    def memory_shapes(self) -> PyTree:
+        """The shapes of the memory of one episode. Computed once: it takes longer than a prediction."""
+        return jax.eval_shape(lambda: self.initial_memory(1))
 
     def initial_carry(self, n_envs: int) -> PyTree:
         """Returns the carry of the exploration of ``n_envs`` environments before their first episodes."""

@@ -67,7 +67,7 @@ def run_clone(arguments: Clone) -> tuple[int, JsonObject]:
                 learn_from_expert(session, expert, shown, arguments, seed)
             if arguments.critic_updates:
                 demonstrations.learn_offline(session.agent, shown, arguments.critic_updates, keep_policy=True)
-            session.agent.callbacks = stateful(learning.callbacks)
+            session.agent.call.callbacks = stateful(learning.callbacks)
         status, result = session.finish(learning, stop, stopwatch)
         checkpoint = Checkpoint(folder.checkpoints)
         checkpoint.before_training(session.agent)

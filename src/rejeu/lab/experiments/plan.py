@@ -18,6 +18,7 @@ import gymnasium as gym
 from msgspec import Meta
 
 from rejeu.agents import AGENTS, choose_algorithm, find_agent, find_preset, presets
+from rejeu.checkpoints.agent_state import Identity
 from rejeu.core import devices, spaces
 from rejeu.core.errors import one_line
 from rejeu.core.records import MAX_DEPTH, Seed, convert, is_deep, shown
@@ -315,7 +316,7 @@ def check_spaces(environment: PlannedEnvironment, config: Any) -> None:
     agent_class = AGENTS[config.name]
     nested = isinstance(environment.observation, gym.spaces.Dict | gym.spaces.Tuple)
     agent = agent_class.__new__(agent_class)
-    agent.configure("MultiInputPolicy" if nested else "MlpPolicy", config, seed=0)
+    agent.configure(config, Identity.of("MultiInputPolicy" if nested else "MlpPolicy", seed=0))
     agent.build(environment.observation, environment.action)
     if getattr(config, "hindsight", None) is not None:
         spaces.check_goal_space(environment.observation)
