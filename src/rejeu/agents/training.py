@@ -47,13 +47,10 @@ def open_outputs(
     if agent.outputs.log and not agent.logger.outputs:
         folder = next_folder(agent.outputs.tensorboard_log or LOG_FOLDER, tb_log_name or agent.name)
         opened += [open_log(name, folder, run_name(agent), tracker_id(agent)) for name in agent.outputs.log]
-    outputs = [guarded(sink, agent.files.failed_writes) for sink in passed]
-    for sink, output in zip(passed, outputs, strict=True):
-        if output.in_background and output is not sink:
+    outputs = [guarded(sink, agent.files.failed_writes, closes=sink in opened) for sink in [*passed, *opened]]
+    for sink, output in zip([*passed, *opened], outputs, strict=True):
+        if sink in opened or (output.in_background and output is not sink):
             stack.callback(output.close)
-    for sink in opened:
-        outputs.append(guarded(sink, agent.files.failed_writes, closes=True))
-        stack.callback(outputs[-1].close)
     return outputs
 
 

@@ -78,11 +78,10 @@ class RowFiles:
 
 def folder_of(agent: AnyAgent, folder: Path) -> CheckpointFolder:
     """Returns the folder of an agent's checkpoints, always the same object for the same path."""
-    path = folder.resolve()
-    if path not in agent.files.checkpoint_folders:
-        agent.files.checkpoint_folders[path] = CheckpointFolder(agent, folder)
-    checkpoint_folder: CheckpointFolder = agent.files.checkpoint_folders[path]
-    return checkpoint_folder
+    folders: dict[Path, CheckpointFolder] = agent.files.checkpoint_folders
+    if (path := folder.resolve()) not in folders:
+        folders[path] = CheckpointFolder(agent, folder)
+    return folders[path]
 
 
 class CheckpointFolder:
