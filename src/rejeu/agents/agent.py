@@ -31,7 +31,7 @@ from rejeu.checkpoints.agent_state import (
     Identity,
     Outputs,
     Resumed,
-    Statistics,
+    TrainingRecord,
 )
 from rejeu.checkpoints.run_files import CheckpointFolder, folder_of
 from rejeu.checkpoints.run_folder import find_model
@@ -132,7 +132,7 @@ class Agent(ABC):
     """Accepts further numbers for the rows of statistics."""
     call: CallState
     """The current or last call of ``learn``, and what it counts from."""
-    record: Statistics
+    record: TrainingRecord
     """The episodes of training, the speed, and the best weights."""
     files: Files
     """The files that training writes, and those that it could not write."""
@@ -233,7 +233,7 @@ class Agent(ABC):
         contract.check_config(config)
         self.config, self.identity = config, identity
         self.logger, self.call, self.files = Logger(), CallState(), Files()
-        self.record = Statistics(identity.stats_window_size)
+        self.record = TrainingRecord(identity.stats_window_size)
         xla.enable_cache()
 
     def set_outputs(

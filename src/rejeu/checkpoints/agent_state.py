@@ -19,12 +19,10 @@ import numpy as np
 
 from rejeu.callbacks.base import Stateful
 from rejeu.core import devices
-from rejeu.core.algorithm import Algorithm
 from rejeu.core.failed_writes import FailedWrites
 from rejeu.core.spaces import Leaf
 from rejeu.core.validation import coerce, number, whole, whole_seed
 from rejeu.envs.make import Backend, VectorEnv
-from rejeu.exploration.noise import Noise
 from rejeu.logs.history import History
 from rejeu.logs.logging import Logger
 from rejeu.training.compiled import Stops
@@ -157,7 +155,7 @@ class CallState:
     """Total training time at that time, in seconds."""
 
 
-class Statistics:
+class TrainingRecord:
     """The episodes of training, the speed, and the best weights. Mutable.
 
     Args:
@@ -221,7 +219,7 @@ class AnyAgent(Protocol):
     outputs: Outputs
     logger: Logger
     call: CallState
-    record: Statistics
+    record: TrainingRecord
     files: Files
     resumed: Resumed | None
     n_predictions: int
@@ -243,11 +241,9 @@ class AnyAgent(Protocol):
     def configure(self, config: Any, identity: Identity) -> None: ...
     def set_outputs(self, verbose: int = 0, log: str | Sequence[str] = (), tensorboard_log: Any = None) -> None: ...
     def build(self, observation_space: gym.Space, action_space: gym.Space) -> None: ...
-    def algorithm_of(self, config: Any) -> Algorithm: ...
     def n_threads(self, n_envs: int) -> int: ...
     def start_run(self, env: VectorEnv | None, state: PackedState | None = None) -> None: ...
     def make_envs(self, env: Any, n_envs: int = 1, backend: Backend = "auto", seed: int | None = None) -> VectorEnv: ...
-    def make_noise(self) -> Noise | None: ...
     def gradient_batch_size(self, n_envs: int) -> int: ...
     def first_learning_step(self, step: int) -> int: ...
     def steps_to_take(self, n_steps: int) -> int: ...

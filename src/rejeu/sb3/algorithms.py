@@ -99,7 +99,7 @@ OUTPUTS = {"verbose": int, "tensorboard_log": str}
 """Attributes that say where statistics go, which every file has, with their types."""
 
 
-class Refused(ValueError, AssertionError):
+class InvalidSetting(ValueError, AssertionError):
     """A setting or a space that an algorithm does not take: scripts catch either error."""
 
 
@@ -146,7 +146,7 @@ class Original(Agent):
         try:
             super().__init__(name, env, **settings)
         except ValueError as error:
-            raise (Refused(*error.args) if type(error) is ValueError else error) from None
+            raise (InvalidSetting(*error.args) if type(error) is ValueError else error) from None
         self.device = utils.Device(self.device)
         if instance is not None:
             instance.model, instance.observation_space = self, self.observation_space
