@@ -1,6 +1,9 @@
 """The comparison of runs that were chosen in the table of runs, in headless Chromium."""
 
-from tests.lab.studio.conftest import HOSTILE, check_widths, opened
+from rejeu.lab.studio.compare import MOST_DRAWN
+from tests.lab.reporting.test_comparison import write_run
+from tests.lab.studio.conftest import HOSTILE, check_widths, opened, serving
+from tests.tiers import exhaustive
 
 
 def test_rows_that_are_chosen_are_compared_in_groups(browser, common):
@@ -26,3 +29,19 @@ def test_rows_that_are_chosen_are_compared_in_groups(browser, common):
 def test_what_cannot_be_compared_is_one_line(browser, common):
     with opened(browser, common, "/compare?run=no-such-run") as page:
         page.wait_for_selector("text=there is nothing to compare")
+
+
+@exhaustive
+def test_of_many_environments_some_are_drawn_and_others_on_demand(browser, tmp_path):
+    for i in range(MOST_DRAWN + 2):
+        write_run(tmp_path / f"run{i:02}", env=f"Env{i:02}-v0")
+    with serving(tmp_path) as served, opened(browser, served, "/compare") as page:
+        page.wait_for_selector(f".plot.js-plotly-plot >> nth={2 * MOST_DRAWN - 1}")
+        assert page.locator(".plot.js-plotly-plot").count() == 2 * MOST_DRAWN
+        last = f"Env{MOST_DRAWN + 1:02}-v0"
+        assert page.get_by_text(f"{last}: returns").count() == 0
+        page.get_by_role("combobox", name="environments drawn").click()
+        page.get_by_role("option", name="Env00-v0").click()
+        page.get_by_role("option", name=last).click()
+        page.wait_for_selector(f"text={last}: returns")
+        assert page.locator(".plot.js-plotly-plot").count() == 2 * MOST_DRAWN

@@ -25,6 +25,8 @@ CHOICES: dict[str, dict[str | None, str]] = {
     "normalize": {None: "returns", "range": "scaled to the range"},
 }
 """Arguments of a comparison that people choose, the default first."""
+MOST_DRAWN, ROWS = 8, 50
+"""Environments drawn at once, and rows of a table: browsers are slow with hundreds."""
 BETTER = ("group", "better than", "environment", "probability (95 % interval)")
 
 
@@ -74,12 +76,25 @@ def show(comparison: Comparison) -> None:
     ui.label(f"{comparison.definition.capitalize()}. Intervals are 95 % stratified bootstrap intervals.").classes(
         "quiet"
     )
-    with ui.element("div").classes("w-full charts"):
-        for env in dict.fromkeys(group.env_id for group in comparison.groups):
-            for form, title in (("curve", "returns"), ("profile", "performance profile")):
-                with ui.column().classes("gap-0"):
-                    ui.label(f"{env or 'unknown environment'}: {title}")
-                    Figure(group_chart(form, comparison, env), "300px")
+    names = {group.env_id: group.env_id or "unknown environment" for group in comparison.groups}
+
+    def draw(env_ids: Sequence[str]) -> None:
+        charts.clear()
+        with charts:
+            for env_id in env_ids[:MOST_DRAWN]:
+                for form, title in (("curve", "returns"), ("profile", "performance profile")):
+                    with ui.column().classes("gap-0"):
+                        ui.label(f"{names[env_id]}: {title}")
+                        Figure(group_chart(form, comparison, env_id), "300px")
+
+    if len(names) > MOST_DRAWN:
+        label = f"environments drawn, {MOST_DRAWN} of {len(names)} at most"
+        first = [*names][:MOST_DRAWN]
+        ui.select(
+            names, label=label, value=first, multiple=True, with_input=True, on_change=lambda event: draw(event.value)
+        )
+    charts = ui.element("div").classes("w-full charts")
+    draw([*names])
     if comparison.improvements:
         ui.label("Probability that a run of the group has a higher final score than a run of the other")
         table(BETTER, [improvement.cells for improvement in comparison.improvements[:MAX_LISTED]])
@@ -89,4 +104,6 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     """Shows a table of texts."""
     columns = [{"name": str(i), "label": text, "field": str(i), "align": "left"} for i, text in enumerate(head)]
     cells = [{str(i): text for i, text in enumerate(row)} for row in rows]
-    ui.table(rows=cells, columns=columns).classes("w-full").props("flat bordered dense")
+    ui.table(rows=cells, columns=columns, pagination=ROWS if len(rows) > ROWS else None).classes("w-full").props(
+        "flat bordered dense"
+    )
