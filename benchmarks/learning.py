@@ -3,11 +3,12 @@
     python benchmarks/learning.py Pendulum-v1 SAC --seeds 0 1 2 3 4
 
 Training is the same as with ``rejeu train``, but without periodic evaluations. The final weights are evaluated on 100
-new episodes. With ``--best``, the agent is also evaluated during training, as often as the preset specifies. The best
-weights of these evaluations are then evaluated on new episodes. The results are written to
-``benchmarks/results/learning/ENV-ALGO.json``, with the command, the commit, the versions and the hyperparameters. ``--shown``
-leaves of the observations only some components, which makes Pendulum partially observable, and ``--set`` changes
-hyperparameters of the preset::
+new episodes. In goal environments ``success_rate`` is the share of those that are at their goal in the last step, and
+``reached_rate`` of those that were there in any step, as D4RL counts. With ``--best``, the agent is also evaluated during
+training, as often as the preset specifies. The best weights of these evaluations are then evaluated on new episodes. The
+results are written to ``benchmarks/results/learning/ENV-ALGO.json``, with the command, the commit, the versions and the
+hyperparameters. ``--shown`` leaves of the observations only some components, which makes Pendulum partially observable, and
+``--set`` changes hyperparameters of the preset::
 
     python benchmarks/learning.py Pendulum-v1 SAC --shown 0 1 --set '{"policy_kwargs": {"lstm_hidden_size": 64}}' --name NAME
 
@@ -45,6 +46,7 @@ from rejeu.callbacks.evaluate import Evaluate, Evaluated
 from rejeu.core import validation
 from rejeu.core.records import convert
 from rejeu.envs import make_vector
+from rejeu.envs.base import Step
 from rejeu.envs.make import VectorEnv
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -87,7 +89,9 @@ def train_one(preset: presets.Preset, seed: int, arguments: argparse.Namespace) 
         arguments.keep.mkdir(parents=True, exist_ok=True)
         agent.save(arguments.keep / f"{preset.env_id.replace('/', '-')}-{arguments.algorithm}-{seed}.safetensors")
     evaluation_env = environments(10, 1_000_000 + 100 * seed, arguments.evaluation_backend or backend)
+    reached = record_reached(evaluation_env)
     evaluation = agent.evaluate(arguments.episodes, env=evaluation_env)
+    counted = [flag for i, flags in enumerate(reached) for flag in flags[: (arguments.episodes + i) // 10]]
     return {
         "seed": seed,
         "steps": agent.num_timesteps,
@@ -97,9 +101,27 @@ def train_one(preset: presets.Preset, seed: int, arguments: argparse.Namespace) 
         "std_return": evaluation.std_return,
         "mean_length": evaluation.mean_length,
         "success_rate": None if math.isnan(evaluation.success_rate) else evaluation.success_rate,
+        **({"reached_rate": float(np.mean(counted))} if nested and not math.isnan(evaluation.success_rate) else {}),
         "episodes": arguments.episodes,
         **(curves_of(callback) if callback else {}),
     }
+
+
+def record_reached(env: VectorEnv) -> list[list[bool]]:
+    """Returns a list for each environment, to which every episode adds whether it reached its goal at any of its steps."""
+    step_all, episodes, running = env.step, [[] for _ in range(env.n_envs)], [False] * env.n_envs
+
+    def step(action: np.ndarray, active: np.ndarray | None = None) -> Step:
+        result = step_all(action, active)
+        for i, ended in enumerate(result.terminated | result.truncated):
+            running[i] |= env.success(result, i) == 1.0
+            if ended:
+                episodes[i].append(running[i])
+                running[i] = False
+        return result
+
+    env.step = step  # type: ignore[method-assign]
+    return episodes
 
 
 def print_evaluation(seed: int, one: Evaluated, is_best: bool) -> None:

@@ -206,14 +206,17 @@ def goals(folder: str = "") -> str:
                 words[3],
                 *(success([curve[mark] for curve in curves if mark in curve]) for mark in marks),
                 f"{success([run['success_rate'] for run in runs])} at {runs[0]['steps']:,}",
+                success([run["reached_rate"] for run in runs if "reached_rate" in run]),
                 " to ".join(dict.fromkeys(f"{one:.1f}" for one in (min(minutes), max(minutes)))),
                 str(len(runs)),
                 content["commit"],
                 code(re.sub(r" *--(out|keep) \S+", "", options).strip()),
             ]
         )
-    columns = ["environment", "algorithm", *(f"at {mark:,}" for mark in marks), "at the end", "minutes", "seeds"]
-    return table([*columns, "commit", "options"], rows)
+    columns = ["environment", "algorithm", *(f"at {mark:,}" for mark in marks), "at the end", "reached once"]
+    header = [*columns, "minutes", "seeds", "commit", "options"]
+    kept = [i for i in range(len(header)) if header[i] != "reached once" or any(row[i] for row in rows)]
+    return table([header[i] for i in kept], [[row[i] for i in kept] for row in rows])
 
 
 def other_goals() -> str:

@@ -54,6 +54,7 @@ CASES = {
     "episodes": ("TD3", vector("rejeu/Ball-v0", 2), {**OFF, "train_freq": (1, "episode"), "gradient_steps": -1}),
     "every 7 steps": ("SAC", vector("Pendulum-v1", 2), {**OFF, "train_freq": 7, "gradient_steps": 3}),
     "normalised": ("SAC", vector("Pendulum-v1", 2), {**OFF, "normalize": True}),
+    "held, limited": ("SAC", vector("Pendulum-v1", 2), {**OFF, "action_repeat": 3, "action_share": 0.5}),
     "schedule": ("SAC", vector("Pendulum-v1", 1), {**OFF, "learning_rate": rejeu.Linear(1e-2, 0.0)}),
     **{f"{n} noise": ("DDPG", vector("Pendulum-v1", 2), {**OFF, "action_noise": x}) for n, x in NOISES.items()},
     "EnvPool": ("SAC", vector("Pendulum-v1", 2, "envpool"), OFF),

@@ -307,7 +307,7 @@ class Agent(ABC):
             arrays, others = (
                 dict(zip(names(x), jax.tree.leaves(x), strict=True)) for x in (learner.shapes, self.learner.shapes)
             )
-            if arrays != others or "action_masks" in changed:
+            if arrays != others or changed & {"action_masks", "action_repeat", "action_share"}:
                 raise ValueError(
                     f"{', '.join(changed)} cannot be set on a {self.name} whose networks were made without"
                 )
@@ -356,7 +356,10 @@ class Agent(ABC):
 
     def make_envs(self, env: Any, n_envs: int = 1, backend: Backend = "auto", seed: int | None = None) -> VectorEnv:
         """Returns vector environments for this agent; the arguments are those of :func:`rejeu.make_vector`."""
-        return (make_masked if self.takes_masks else make_vector)(env, n_envs, backend, seed)
+        vector = (make_masked if self.takes_masks else make_vector)(env, n_envs, backend, seed)
+        if self.config.action_share != 1.0 or vector.own_action_space is not None:
+            vector.limit_actions(self.config.action_share)
+        return vector
 
     @abstractmethod
     def make_noise(self) -> Noise | None:
@@ -605,14 +608,16 @@ class Agent(ABC):
         deterministic: bool = False,
         action_masks: AnyArray = None,
     ) -> tuple[np.ndarray, PyTree]:
-        """Returns actions in the environment's own range, and the next state of a recurrent policy (else ``state``).
+        """Returns actions in the environment's own range, and the next state of a policy that has one (else ``state``).
+
+        Recurrent policies have a state, and those with ``action_repeat``, which hold their last action in it.
 
         Args:
             observation: one observation of the environment's space, or a batch of them with a leading axis; the action
                 has a leading axis if and only if the observation has.
-            state: what the last call returned, for a recurrent policy; None at the start of episodes.
+            state: what the last call returned, for a policy that has one; None at the start of episodes.
             episode_start: whether an episode starts with this observation, ``bool (batch,)``; the state of a recurrent
-                policy is reset there. None for nowhere.
+                policy is reset there, and a new action chosen. None for nowhere.
             deterministic: return the mode of the policy; False samples from it, which gives the same action if the policy
                 is deterministic (DDPG, TD3). ``action_noise`` is used in training only.
             action_masks: which actions are allowed, ``bool (batch, n)`` or ``(n,)``, for agents that take masks; None

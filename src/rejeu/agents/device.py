@@ -132,6 +132,8 @@ def reason_against(agent: AnyAgent, callbacks: Sequence[object]) -> str | None:
         return f"the backend of {run.env.env_id} is {run.env.backend!r}, not 'jax'"
     if names := [type(c).__name__ for c in callbacks if isinstance(c, TrainingCallback) and c.every_step]:
         return f"the callback {names[0]} must be called after every step"
+    if config.action_repeat > 1:
+        return f"action_repeat={config.action_repeat}: actions are held on the host only"
     if isinstance(config, OffPolicyConfig):
         return reason_against_replay(run.replay, config)
     return None if config.n_episodes is None else "rollouts of n_episodes whole episodes exist on the host only"

@@ -121,8 +121,12 @@ def policy_for(agent: AnyAgent, noise: bool, batch: int | None, stack: FrameStac
     """Returns the policy of an agent as a program.
 
     Raises:
-        ValueError: if its actions are a Dict or Tuple.
+        ValueError: if its actions are a Dict or Tuple, or held for several steps.
     """
+    if (repeat := agent.config.action_repeat) > 1:
+        raise ValueError(
+            f"a policy with action_repeat={repeat} cannot be exported: files hold no action; use rejeu.load"
+        )
     if isinstance(agent.action_space, gym.spaces.Dict | gym.spaces.Tuple):
         raise ValueError("policies with Dict or Tuple actions cannot be exported; load the model with rejeu.load")
     algorithm = agent.learner.algorithm

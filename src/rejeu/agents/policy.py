@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import gymnasium as gym
 import jax
@@ -29,7 +29,43 @@ CRITICS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 """How :func:`q_values` reduces the values of several critics, ``(n_critics, ...)``."""
 
 
+class Held(NamedTuple):
+    """The state of a policy that holds its actions (``action_repeat``)."""
+
+    action: Action
+    """In the algorithm's range, ``(batch, ...)``."""
+    steps_left: np.ndarray
+    """For how many more steps, ``int (batch,)``."""
+    memory: PyTree
+    """The state of a recurrent policy, else None."""
+
+
 def act(
+    agent: AnyAgent, obs: Observation, deterministic: bool, memory: PyTree, ended: np.ndarray
+) -> tuple[np.ndarray, PyTree]:
+    """Returns actions in the algorithm's range, and the next state of a policy that is recurrent or holds actions, else None.
+
+    The arguments are those of :func:`decide`.
+    """
+    repeat = agent.config.action_repeat
+    if repeat == 1:
+        return decide(agent, obs, deterministic, memory, ended)
+    held = Held(None, np.zeros(len(ended), int), None) if memory is None else memory
+    if not isinstance(held, Held) or len(held.steps_left) != len(ended):
+        raise ValueError(
+            f"a policy with action_repeat={repeat} was given a state that is not of {len(ended)} episodes; give what its last "
+            "call returned for as many observations, or None where episodes begin"
+        )
+    due = ended | (held.steps_left == 0)
+    if due.any():
+        chosen = decide(agent, obs, deterministic, held.memory, ended)
+        where_due = lambda new, old: np.where(due.reshape(-1, *[1] * (np.ndim(new) - 1)), new, old)  # noqa: E731
+        action, following = chosen if memory is None else jax.tree.map(where_due, chosen, (held.action, held.memory))
+        held = Held(action, np.where(due, repeat, held.steps_left), following)
+    return held.action, held._replace(steps_left=held.steps_left - 1)
+
+
+def decide(
     agent: AnyAgent, obs: Observation, deterministic: bool, memory: PyTree, ended: np.ndarray
 ) -> tuple[np.ndarray, PyTree]:
     """Returns actions in the algorithm's range, and the next state of a recurrent policy, else None.

@@ -94,6 +94,12 @@ class AlgorithmConfig:
     action_masks: bool = False
     """Take masks of the allowed actions from the environment (``info["action_mask"]`` or ``action_masks()``) and choose
     among these only. For Discrete actions; PPO, A2C, TRPO and RecurrentPPO take MultiDiscrete and MultiBinary too."""
+    action_share: float = 1.0
+    """Share of the range of each action that the policy uses, around its middle, in (0, 1]. A smaller one keeps strong motors
+    from throwing a robot over. For Box actions."""
+    action_repeat: int = 1
+    """Environment steps for which each action is held. Training then counts such decisions as steps; a reward is the sum over
+    them, or with hindsight that of the last one. Larger values make episodes shorter and exploration go farther."""
     rnd: RndConfig | None = None
     """Adds a bonus for new observations to the rewards that are learned from (random network distillation, arXiv
     1810.12894): its weight such as 0.5, or a dict with ``coefficient``, ``learning_rate``, ``n_features``, ``batch_size``."""
@@ -134,13 +140,24 @@ class AlgorithmConfig:
         coerce(self, "policy_kwargs", nested, config_class=self.policy_kwargs_class)
         coerce(self, "rnd", RndConfig.parse)
         coerce(self, "action_masks", flag)
-        if self.action_masks and not self.can_mask:
-            raise ValueError(
-                f"action_masks=True: {self.name} takes no masks; use PPO, A2C, TRPO, RecurrentPPO, DQN, QRDQN, IQN or SAC"
-            )
+        coerce(self, "action_share", number, above=0, most=1)
+        coerce(self, "action_repeat", whole, least=1)
+        if self.action_masks:
+            self._check_masks()
         if self.policy_kwargs.dropout and not self.can_drop:
             raise ValueError(f"policy_kwargs: {self.name} has no critics with dropout; leave it out, or use SAC or TQC")
         assign(self, is_checked=True)
+
+    def _check_masks(self) -> None:
+        """Raises ``ValueError`` if the algorithm cannot take masks, or not with these settings."""
+        if not self.can_mask:
+            raise ValueError(
+                f"action_masks=True: {self.name} takes no masks; use PPO, A2C, TRPO, RecurrentPPO, DQN, QRDQN, IQN or SAC"
+            )
+        if self.action_repeat > 1:
+            raise ValueError(
+                f"action_repeat={self.action_repeat} holds an action that later masks may forbid; leave it or action_masks out"
+            )
 
     def doubts(self, n_envs: int) -> str:
         """Returns why these settings are unlikely to learn well with ``n_envs`` environments; empty if that is not known."""
@@ -219,12 +236,8 @@ class OffPolicyConfig(AlgorithmConfig):
         coerce(self, "priorities", nested, config_class=PriorityConfig, optional=True)
         coerce(self, "demonstration_share", number, least=0, most=1)
         coerce(self, "offline", flag)
-        if not isinstance(self.demonstrations, str | Path | None):
-            raise TypeError(f"demonstrations={self.demonstrations!r} must be the folder of record(..., path=FOLDER)")
-        if self.demonstrations is not None:  # a run may be resumed from another folder
-            assign(self, demonstrations=str(Path(self.demonstrations).absolute()))
-        if self.demonstrations is not None and self.priorities is not None:
-            raise ValueError("demonstrations are drawn uniformly and cannot be combined with priorities; leave one out")
+        if self.demonstrations is not None:
+            self._check_demonstrations()
         if self.offline and self.demonstrations is None:
             raise ValueError("offline=True learns from demonstrations alone; give demonstrations=FOLDER too")
         if self.action_noise is not None:
@@ -233,6 +246,20 @@ class OffPolicyConfig(AlgorithmConfig):
         coerce(self, "replay_buffer_kwargs", buffer_settings, buffer=self.replay_buffer_class)
         if self.has_memory:
             self._check_memory()
+
+    def _check_demonstrations(self) -> None:
+        """Makes the folder absolute, because a run may be resumed from another one.
+
+        Raises:
+            TypeError, ValueError: if it is no path, or with these settings nothing can be learned from it.
+        """
+        if not isinstance(self.demonstrations, str | Path):
+            raise TypeError(f"demonstrations={self.demonstrations!r} must be the folder of record(..., path=FOLDER)")
+        assign(self, demonstrations=str(Path(self.demonstrations).absolute()))
+        if self.priorities is not None:
+            raise ValueError("demonstrations are drawn uniformly and cannot be combined with priorities; leave one out")
+        if self.action_repeat > 1:
+            raise ValueError(f"demonstrations are single steps, not {self.action_repeat}; leave action_repeat out")
 
     def _check_memory(self) -> None:
         """Raises ``ValueError`` if the networks cannot have a memory, or with these settings cannot learn with it."""

@@ -96,7 +96,11 @@ def interpret(header: Mapping[str, object], room: int, config_class: Any, change
     except WRONG as error:
         raise CheckpointError(f"the header is damaged or of another version: {brief(error)}") from None
     if changes:
-        config = configs.rebuild(config_class, saved.config, changes)
+        before, config = config, configs.rebuild(config_class, saved.config, changes)
+        if config.action_share != before.action_share:
+            raise ValueError(
+                f"action_share={config.action_share} cannot replace {before.action_share}; train a new agent"
+            )
     return Saved(saved, config, observation_space, action_space)
 
 

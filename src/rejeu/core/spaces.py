@@ -477,6 +477,24 @@ def box_scaler(
     return lambda action: (middle + action.reshape(shape) * half).clip(*ends).astype(dtype)
 
 
+def limited(space: spaces.Space, share: float) -> spaces.Space:
+    """Returns the middle ``share`` of the range of each component of Box actions; with 1 the space itself.
+
+    Raises:
+        ValueError: if a range has no middle, because it is not that of a Box of finite floats.
+
+    >>> limited(spaces.Box(-1.0, 3.0, (1,)), 0.5)
+    Box(0.0, 2.0, (1,), float32)
+    """
+    if share == 1.0:
+        return space
+    if not isinstance(space, spaces.Box) or space.dtype.kind != "f" or not bounded(space).all():
+        raise ValueError(f"action_share={share} needs Box actions with finite bounds, got {space}; leave it out")
+    low, high = space.low.astype(np.float64), space.high.astype(np.float64)
+    middle, half = 0.5 * (low + high), 0.5 * share * (high - low)
+    return spaces.Box((middle - half).astype(space.dtype), (middle + half).astype(space.dtype), dtype=space.dtype.type)
+
+
 def unscale_action(space: spaces.Space, action: np.ndarray) -> np.ndarray:
     """Returns actions of an algorithm from those in the range of the environment: the inverse of :func:`scale_action`.
 

@@ -26,7 +26,7 @@ MOST = {
         ("n_atoms", "n_bins", "n_cosines", "n_quantiles", "n_policy_quantiles", "n_target_quantiles"), MOST_OUTPUTS
     ),
     **dict.fromkeys(("width", "cnn_features", "lstm_hidden_size", "n_features"), MOST_WIDTH),
-    **dict.fromkeys(("n_critics", "n_epochs", "noise_repeat", "target_subset"), 10_000),
+    **dict.fromkeys(("action_repeat", "n_critics", "n_epochs", "noise_repeat", "target_subset"), 10_000),
     **dict.fromkeys(("sequence_length", "burn_in", "n_delta", "n_eval_episodes", "n_critic_updates"), 1_000_000),
     **dict.fromkeys(("cg_max_steps", "line_search_max_iter", "sub_sampling_factor"), 1_000_000),
     "n_blocks": MOST_LAYERS,

@@ -16,6 +16,7 @@ import jax
 import numpy as np
 
 from rejeu.core.errors import BadEnvironmentError
+from rejeu.core.spaces import limited
 from rejeu.core.types import Info, Observation, PyTree
 from rejeu.envs.goals import GoalFunctions
 
@@ -102,7 +103,9 @@ class VectorEnv(ABC):
     observation_space: gym.Space
     """Of one environment."""
     action_space: gym.Space
-    """Of one environment."""
+    """Of one environment; see :meth:`limit_actions`."""
+    own_action_space: gym.Space | None = None
+    """The environment's own if ``action_space`` is a part of it, else None."""
     backend: str
     """Name of the backend."""
     env_id: str
@@ -126,6 +129,15 @@ class VectorEnv(ABC):
 
     seeds: Seed = None
     """One seed for each environment, which a run uses instead of its own seed; None if there are none."""
+
+    def limit_actions(self, share: float) -> None:
+        """Makes ``action_space`` the middle ``share`` of the environment's own range, whatever share it was before.
+
+        Raises:
+            ValueError: if the actions are not a Box with finite bounds.
+        """
+        self.own_action_space = self.action_space if self.own_action_space is None else self.own_action_space
+        self.action_space = limited(self.own_action_space, share)
 
     @abstractmethod
     def reset(self, seed: Seed = None) -> Observation:

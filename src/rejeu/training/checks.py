@@ -8,6 +8,7 @@ import warnings
 import jax
 import numpy as np
 
+from rejeu.algorithms.config import AlgorithmConfig
 from rejeu.core.algorithm import Masked, PyTree
 from rejeu.core.errors import BadEnvironmentError, NonFiniteError
 from rejeu.core.spaces import is_finite, leaves
@@ -18,7 +19,7 @@ from rejeu.training.run import Run, restart, timed
 
 
 @timed("env")
-def checked_step(run: Run, action: np.ndarray, active: np.ndarray | None = None) -> Step:
+def checked_step(run: Run, action: np.ndarray, config: AlgorithmConfig, active: np.ndarray | None = None) -> Step:
     """Steps the environments, or those that are ``active``, and checks what they return, bounds from time to time.
 
     Raises:
@@ -26,8 +27,26 @@ def checked_step(run: Run, action: np.ndarray, active: np.ndarray | None = None)
     """
     step = run.env.step(action, active)
     check_finite(run, step, run.step)
+    if config.action_repeat > 1:
+        step = held(run, action, config, active, step)
     if run.step >= run.next_look:
         check_bounds(run, step.obs)
+    return step
+
+
+def held(run: Run, action: np.ndarray, config: AlgorithmConfig, active: np.ndarray | None, step: Step) -> Step:
+    """Holds an action after its first ``step``, until ``action_repeat`` are taken or an episode ends in any environment.
+
+    Returns the last step. Its reward is the sum over all; with hindsight its own, as those of relabeled goals are.
+    """
+    for _ in range(config.action_repeat - 1):
+        if (step.terminated | step.truncated).any():
+            break
+        reward = step.reward.copy()
+        step = run.env.step(action, active)
+        check_finite(run, step, run.step)
+        if getattr(config, "hindsight", None) is None:
+            step = step._replace(reward=reward + step.reward)
     return step
 
 

@@ -67,7 +67,7 @@ def off_policy(
         if run.action is None:
             run.action = np.array(choose(run, learner, config, clock_of(run, progress(run.step - first)))[0])
         action = scale(run.action)
-        step = checked_step(run, action)
+        step = checked_step(run, action, config)
         episodes = store(run, learner, config, step)
         last_obs = begin_where_ended(run, step)
         if learner.observe is not None:

@@ -55,7 +55,7 @@ def on_policy(
         run.action = act(run, learner, clock_of(run, progress(run.step - first)))
         stepped = None if config.n_episodes is None or run.playing.all() else run.playing > 0
         action = scale(run.action)
-        step = checked_step(run, action, stepped)
+        step = checked_step(run, action, config, stepped)
         episodes = store(run, config, step, stepped)
         is_done = rollout.full if config.n_episodes is None else not run.playing.any()
         last_obs = jax.tree.map(np.copy, step.obs) if run.ended.any() else None

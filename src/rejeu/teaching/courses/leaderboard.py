@@ -272,6 +272,7 @@ def evaluated(
     end = xla.clock() + seconds
     agent = load(path)
     try:
+        env.limit_actions(agent.config.action_share)
         agent.check_spaces(env, env_id)
     except ValueError as error:
         raise Unranked("its spaces are others: {0}", error, env_id) from None
