@@ -218,12 +218,6 @@ def masked(obs: dict[str, Observation]) -> Masked:
     return Masked(obs[OBSERVATION], obs[MASK].astype(bool))
 
 
-def functional_vector(env: VectorEnv) -> JaxVector | None:
-    """Returns the environments in JAX behind a vector environment with or without masks; None if it has others."""
-    inner = env.inner if isinstance(env, MaskedVector) else env
-    return inner if isinstance(inner, JaxVector) else None
-
-
 def for_agent(agent: Any, env: gym.Env) -> gym.Env:
     """Returns an environment with masks in its observations if the agent uses masks, else the environment itself."""
     return MaskInObservation(env) if getattr(agent, "takes_masks", False) else env

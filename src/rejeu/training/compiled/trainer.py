@@ -19,7 +19,7 @@ from rejeu.core.xla import for_runs
 from rejeu.envs.base import success_by
 from rejeu.envs.functional.protocol import FunctionalEnv
 from rejeu.envs.functional.vector import JaxVector, joined, split
-from rejeu.envs.masks import functional_vector
+from rejeu.envs.masks import MaskedVector
 from rejeu.training.checks import check_bounds
 from rejeu.training.compiled.program import Carry, ChunkReport, EpisodeLog, EpisodeState, Limits, Program
 from rejeu.training.finite import MAX_SKIPPED
@@ -196,9 +196,9 @@ def with_shared(tree: PyTree, of_one: PyTree) -> PyTree:
 
 
 def vector_of(run: Run) -> JaxVector:
-    """Returns the environments in JAX of a run."""
-    vector = functional_vector(run.env)
-    assert vector is not None
+    """Returns the environments in JAX of a run, those behind masks if it has masks."""
+    vector = run.env.inner if isinstance(run.env, MaskedVector) else run.env
+    assert isinstance(vector, JaxVector), vector
     return vector
 
 
