@@ -70,6 +70,7 @@ OPENED_ELSEWHERE = {
     ("atomic.py", "replacing"),  # a new file of a name of its own
     ("notebooks.py", "_write_new"),  # a new file
     ("logging.py", "__init__"),  # likewise
+    ("run_folder.py", "create"),
     ("hub.py", "lay_out"),  # in a new folder
     ("branch.py", "branch"),
     ("branch.py", "begin"),
