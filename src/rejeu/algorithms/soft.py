@@ -274,10 +274,10 @@ def entropy_target(key: str, value: object) -> float | str:
     """Returns a target entropy: ``"auto"``, ``"std_"`` and a positive number, or a number."""
     if isinstance(value, str) and value != "auto":
         try:
-            good = value.startswith("std_") and 0 < float(value.removeprefix("std_")) < math.inf
+            is_valid = value.startswith("std_") and 0 < float(value.removeprefix("std_")) < math.inf
         except ValueError:
-            good = False
-        if not good:
+            is_valid = False
+        if not is_valid:
             raise ValueError(f"{key}={value!r} must be 'auto', 'std_0.15' or a number")
     return value if isinstance(value, str) else number(key, value)
 

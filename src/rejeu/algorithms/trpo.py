@@ -235,9 +235,9 @@ def damped_product(function: Callable[[PyTree], Array], at_point: PyTree, dampin
     return product
 
 
-def dot(first: PyTree, right: PyTree) -> Array:
+def dot(first: PyTree, second: PyTree) -> Array:
     """Returns the sum of the products of all numbers of two trees, ``float32[]``."""
-    return jnp.sum(jnp.stack(jax.tree.leaves(jax.tree.map(lambda a, b: jnp.sum(a * b), first, right))))
+    return jnp.sum(jnp.stack(jax.tree.leaves(jax.tree.map(lambda a, b: jnp.sum(a * b), first, second))))
 
 
 def value_loss(network: ActorCritic, batch: Samples) -> tuple[Array, None]:

@@ -44,10 +44,10 @@ def whole(key: str, value: Any, least: int, most: int = 2**63 - 1) -> int:
     Raises:
         ValueError: if it is not a whole number from ``least`` to ``most``.
     """
-    good = is_number(value) and value == int(value)
-    if not good or not least <= value <= most:
+    is_whole = is_number(value) and value == int(value)
+    if not is_whole or not least <= value <= most:
         # A limit that nobody reaches is named to those who exceed it.
-        limit = f" and at most {most}" * (most < 2**62 or (good and value > most))
+        limit = f" and at most {most}" * (most < 2**62 or (is_whole and value > most))
         raise ValueError(f"{key}={value!r} must be a whole number of at least {least}{limit}")
     return int(value)
 

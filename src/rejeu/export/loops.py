@@ -318,16 +318,16 @@ def argmax(printer: Printer, operation: Operation) -> None:
 
 def product(printer: Printer, operation: Operation) -> None:
     """A product of matrices, row by row of the right one."""
-    first, right = (printer.view(value) for value in operation.inputs)
+    matrix, weights = (printer.view(value) for value in operation.inputs)
     out = printer.buffer(operation.outputs[0].shape, operation.outputs[0].dtype)
-    *outer, shared, width = right.shape
-    with printer.block([*outer, first.shape[-2]]) as rows:
+    *outer, shared, width = weights.shape
+    with printer.block([*outer, matrix.shape[-2]]) as rows:
         with printer.block([width]) as columns:
             printer.lines.append(f"{out.read([*rows, *columns])} = 0;")
         with printer.block([shared]) as inner:
-            printer.declare("x", first.dtype, first.read([*rows, *inner]))
+            printer.declare("x", matrix.dtype, matrix.read([*rows, *inner]))
             with printer.block([width]) as columns:
-                weight = right.read([*rows[:-1], *inner, *columns])
+                weight = weights.read([*rows[:-1], *inner, *columns])
                 printer.lines.append(f"{out.read([*rows, *columns])} += x * {weight};")
     printer.known[operation.outputs[0]] = out
 

@@ -44,10 +44,10 @@ def padded(params: Any, x: Any, value: Any) -> Any:
 
 def convolution(params: Any, x: Any, kernel: Any) -> Any:
     """A convolution, as the product of a matrix of patches."""
-    lhs, right, out = params["dimension_numbers"]
+    lhs, rhs, out = params["dimension_numbers"]
     x = x.transpose(lhs[0], *lhs[2:], lhs[1])
     x = jnp.pad(x, [(0, 0), *params["padding"], (0, 0)])
-    kernel = kernel.transpose(*right[2:], right[1], right[0])
+    kernel = kernel.transpose(*rhs[2:], rhs[1], rhs[0])
     steps, gaps = params["window_strides"], params["rhs_dilation"]
     patches = []
     for tap in np.ndindex(*kernel.shape[:-2]):
@@ -61,11 +61,11 @@ def convolution(params: Any, x: Any, kernel: Any) -> Any:
 
 def product(params: Any, x: Any, y: Any) -> Any:
     """A product along any axes, as one of matrices."""
-    (lhs_axes, right), (left_batch, right_batch) = params["dimension_numbers"]
+    (lhs_axes, rhs_axes), (left_batch, rhs_batch) = params["dimension_numbers"]
     n, n_shared = len(left_batch), len(lhs_axes)
     free = [i for i in range(x.ndim) if i not in (*left_batch, *lhs_axes)]
     x = x.transpose(*left_batch, *free, *lhs_axes)
-    y = y.transpose(*right_batch, *right, *(i for i in range(y.ndim) if i not in (*right_batch, *right)))
+    y = y.transpose(*rhs_batch, *rhs_axes, *(i for i in range(y.ndim) if i not in (*rhs_batch, *rhs_axes)))
     shape, rows, columns = x.shape[:n], x.shape[n : n + len(free)], y.shape[n + n_shared :]
     shared = math.prod(y.shape[n : n + n_shared])
     x, y = x.reshape(*shape, math.prod(rows), shared), y.reshape(*shape, shared, math.prod(columns))

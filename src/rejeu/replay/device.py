@@ -334,9 +334,9 @@ def uploaded(replay: DeviceReplay, ring: Ring) -> DeviceRing:
 def download(ring: Ring, source: DeviceRing) -> None:
     """Copies the content of a ring on the device into one of the host, which has as many rows."""
     head = np.asarray(source.head).astype(np.int64)
-    used = int(min(head.max() + 1, ring.rows))
+    n_used = int(min(head.max() + 1, ring.rows))
     pairs = zip([*ring.obs, ring.action, ring.reward, ring.kind], [*source.obs, *source[1:4]], strict=True)
     for store, values in pairs:
         by_env = (ring.n_envs, ring.rows, *store.shape[1:])
-        store.reshape(by_env)[:, :used] = np.asarray(values).reshape(by_env)[:, :used]
+        store.reshape(by_env)[:, :n_used] = np.asarray(values).reshape(by_env)[:, :n_used]
     ring.recount(head)

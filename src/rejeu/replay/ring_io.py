@@ -15,8 +15,8 @@ from rejeu.replay.ring import Ring
 
 def arrays(ring: Ring) -> dict[str, np.ndarray]:
     """Returns the rows in use as named arrays ``(n_envs, rows used, ...)``, and the counters of environments."""
-    used = int(min(ring.head.max() + 1, ring.rows))
-    split = lambda a: a.reshape(ring.n_envs, ring.rows, *a.shape[1:])[:, :used]  # noqa: E731
+    n_used = int(min(ring.head.max() + 1, ring.rows))
+    split = lambda a: a.reshape(ring.n_envs, ring.rows, *a.shape[1:])[:, :n_used]  # noqa: E731
     stored = {name: split(array) for name, array in ring.stored().items()}
     return stored | {"head": ring.head, "n_steps": ring.n_steps}
 
@@ -28,11 +28,11 @@ def restore(ring: Ring, arrays: Mapping[str, np.ndarray]) -> None:
         ValueError: if names, shapes or dtypes are not those of this ring.
     """
     check(ring, arrays)
-    head, used = arrays["head"], arrays["kind"].shape[1]
-    if head.min() < -1 or used != min(head.max() + 1, ring.rows):
+    head, n_used = arrays["head"], arrays["kind"].shape[1]
+    if head.min() < -1 or n_used != min(head.max() + 1, ring.rows):
         raise ValueError("the replay file's counters are damaged")
     for name, array in ring.stored().items():
-        array.reshape(ring.n_envs, ring.rows, *array.shape[1:])[:, :used] = arrays[name]
+        array.reshape(ring.n_envs, ring.rows, *array.shape[1:])[:, :n_used] = arrays[name]
     ring.recount(head.copy())
     ring.version += 1
 
@@ -53,8 +53,8 @@ def check(ring: Ring, saved: Mapping[str, Any]) -> None:
         )
     if head.dtype != np.int64 or n_steps.dtype != np.int64:
         raise ValueError("the replay file's counters are damaged")
-    n_envs, used = ring.n_envs, min((*saved["kind"].shape, 0, 0)[1], ring.rows)
-    expected = {name: ((n_envs, used, *array.shape[1:]), array.dtype) for name, array in stored.items()}
+    n_envs, n_used = ring.n_envs, min((*saved["kind"].shape, 0, 0)[1], ring.rows)
+    expected = {name: ((n_envs, n_used, *array.shape[1:]), array.dtype) for name, array in stored.items()}
     check_specs(saved, expected, "the replay file")
 
 

@@ -217,9 +217,9 @@ def permuted(key: Array, n: int, n_first: Array, n_epochs: int) -> Array:
     def encrypted(number: Array) -> Array:
         cell = [number // sizes[1], number % sizes[1]]
         for i, round_key in enumerate(round_keys):
-            here, size = i % 2, sizes[i % 2]
-            shifted = cell[here] + ((hashed(cell[1 - here] ^ round_key) >> 16) * size >> 16)
-            cell[here] = jnp.where(shifted < size, shifted, shifted - size)
+            half, size = i % 2, sizes[i % 2]
+            shifted = cell[half] + ((hashed(cell[1 - half] ^ round_key) >> 16) * size >> 16)
+            cell[half] = jnp.where(shifted < size, shifted, shifted - size)
         return cell[0] * sizes[1] + cell[1]
 
     def again(drawn: Array) -> Array:

@@ -130,11 +130,11 @@ def open_folder(path: Path, plan: Plan, text: str | None, typed: RunConfig) -> S
     return read_folder(path, typed)
 
 
-def difference(there: Plan, plan: Plan) -> str:
+def difference(old_plan: Plan, plan: Plan) -> str:
     """Returns the difference between the jobs of two plans, as text; empty if they are the same."""
-    if there.jobs == plan.jobs:
+    if old_plan.jobs == plan.jobs:
         return ""
-    old, new = ({job.name: job for job in jobs} for jobs in (there.jobs, plan.jobs))
+    old, new = ({job.name: job for job in jobs} for jobs in (old_plan.jobs, plan.jobs))
     differing = next((name for name in [*new, *old] if new.get(name) != old.get(name)), "their order")
     return f"the sweep of another plan: {differing} differs"
 
@@ -181,11 +181,11 @@ def begin(path: Path, name: str, plan: P, read: Callable[[Path], P], difference:
         if not (path / name).is_file():
             atomic.write(path / name, json_text(plan))
             return plan
-        there = read(path / name)
-    if differs := difference(there, plan):
+        old_plan = read(path / name)
+    if differs := difference(old_plan, plan):
         resume = f"rejeu resume {quoted(path)}"
         raise ValueError(f"{path} is {differs}; name another folder with --out, or continue that one with {resume}")
-    return there
+    return old_plan
 
 
 def read(path: Path, schema: type[P], limit: int = MAX_BYTES, check: Callable[[P], object] = lambda plan: None) -> P:

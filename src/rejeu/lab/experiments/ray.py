@@ -95,9 +95,9 @@ def train(spec: Spec) -> int:
         process.stop()
 
 
-def check_node(there: dict[str, str], is_seen: bool, where: str, versions: dict[str, str], marker: str) -> None:
+def check_node(node_versions: dict[str, str], is_seen: bool, where: str, versions: dict[str, str], marker: str) -> None:
     """Raises ``ClusterError`` if a machine, called ``where``, has other versions or does not see the folder of the sweep."""
-    cluster.check_versions(there, where, versions)
+    cluster.check_versions(node_versions, where, versions)
     if not is_seen:
         raise ClusterError(
             f"{where} does not see {Path(marker).parents[1]}, the folder of the sweep; name one with --out that all "
@@ -243,7 +243,7 @@ class RayLauncher:
         for node, reference in zip(nodes, references, strict=True):
             where = f"the node {node['NodeManagerHostname']}"
             try:
-                there, is_seen = ray.get(reference, timeout=ANSWER)
+                node_versions, is_seen = ray.get(reference, timeout=ANSWER)
             except ray.exceptions.GetTimeoutError:
                 raise ClusterError(f"{where} has not answered for {ANSWER:g} s; look at its raylet") from None
             except lost:
@@ -253,7 +253,7 @@ class RayLauncher:
                 raise ClusterError(
                     f"{where} cannot run rejeu: {brief(cause)}; install the same packages on all machines"
                 ) from None
-            check_node(there, is_seen, where, self._versions, self._marker)
+            check_node(node_versions, is_seen, where, self._versions, self._marker)
 
 
 def write_marker(folder: Path) -> str:
@@ -277,14 +277,14 @@ def wanted(resources: Resources) -> dict[str, float]:
     return {name: value for name, value in amounts.items() if value}
 
 
-def places(there: Mapping[str, float], resources: Resources) -> int:
+def places(available: Mapping[str, float], resources: Resources) -> int:
     """Returns how many runs a node has room for.
 
     >>> from rejeu.lab.experiments.folder import Resources
     >>> places({"CPU": 8.0, "GPU": 1.0}, Resources(cpus=2, gpus=0.5))
     2
     """
-    return min(math.floor(there.get(name, 0.0) / value + 1e-6) for name, value in wanted(resources).items())
+    return min(math.floor(available.get(name, 0.0) / value + 1e-6) for name, value in wanted(resources).items())
 
 
 def described(resources: Resources) -> str:

@@ -141,7 +141,7 @@ def notebook(source: str, language: Language, version: Version) -> JsonObject:
     """
     result = jupytext().reads(source, "md")
     result.metadata = {"kernelspec": KERNEL, "jupytext": {"cell_metadata_filter": "-all"}}
-    wanted = []
+    included_cells = []
     for cell in result.cells:
         options = {name: value for name, value in cell.metadata.items() if name != "lines_to_next_cell"}
         for name, value in options.items():
@@ -156,8 +156,8 @@ def notebook(source: str, language: Language, version: Version) -> JsonObject:
         elif language == "fr":
             cell.source = _with_french_spaces(cell.source)
         cell.metadata = {}
-        wanted.append(cell)
-    result.cells = wanted
+        included_cells.append(cell)
+    result.cells = included_cells
     return result
 
 
@@ -179,8 +179,8 @@ def _code(lines: list[str], language: Language, version: Version) -> Iterator[st
             where = "outside"
             continue
         line = _in_language(whole, language)
-        wanted = where == "outside" or (where == "hints") == (version == "exercise")
-        if line is not None and wanted:
+        is_included = where == "outside" or (where == "hints") == (version == "exercise")
+        if line is not None and is_included:
             yield line
     if where != "outside":
         raise ValueError(f"a cell has # SOLUTION without # END: {lines[0]!r}")
