@@ -23,6 +23,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import importlib
 import importlib.metadata
 import json
 import math
@@ -170,6 +171,7 @@ def main() -> None:
     parser.add_argument(
         "--preset", metavar="NAME", help="algorithm or preset whose settings are used; default: its own"
     )
+    parser.add_argument("--import", dest="imported", metavar="MODULE", help="that registers environments and presets")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
     parser.add_argument("--steps", type=int)
     parser.add_argument("--minutes", type=float, help="train at most so long, everything from making the agent counted")
@@ -189,6 +191,8 @@ def main() -> None:
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="save the trained agents there")
     parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the result file")
     arguments = parser.parse_args()
+    if arguments.imported:
+        importlib.import_module(arguments.imported)
     find = zoo if arguments.zoo else presets.find
     of = arguments.preset or arguments.algorithm
     if of == "default":

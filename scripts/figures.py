@@ -215,7 +215,7 @@ def goals(folder: str = "") -> str:
         )
     columns = ["environment", "algorithm", *(f"at {mark:,}" for mark in marks), "at the end", "reached once"]
     header = [*columns, "minutes", "seeds", "commit", "options"]
-    kept = [i for i in range(len(header)) if header[i] != "reached once" or any(row[i] for row in rows)]
+    kept = [i for i in range(len(header)) if any(row[i] for row in rows)]
     return table([header[i] for i in kept], [[row[i] for i in kept] for row in rows])
 
 
