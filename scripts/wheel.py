@@ -3,7 +3,8 @@
     python scripts/wheel.py [FOLDER]
 
 Both are saved in ``FOLDER``, or deleted if none is given. The wheel is built from the source distribution. The exit
-status is 0 if it contains only the package, installs, imports, runs its commands, and trains. Needs the package ``build``.
+status is 0 if it contains only the package, installs, imports, runs its commands, and trains, also in the notebooks of
+``examples``. Needs the package ``build``.
 """
 
 from __future__ import annotations
@@ -64,6 +65,26 @@ def try_out(wheel: Path, folder: Path) -> None:
     print(run(python, "-c", SCRIPT, cwd=folder))
 
 
+NOTEBOOKS = """
+import pathlib, re, sys
+import nbclient, nbformat
+for path in sorted(pathlib.Path(sys.argv[1]).glob("*.ipynb")):
+    notebook = nbformat.read(path, 4)
+    for cell in notebook.cells:  # the first one installs rejeu
+        cell.source = re.sub(r"^%pip .*", "", re.sub(r"\\b(\\d+)_000\\b", "1_024", cell.source))
+    nbclient.NotebookClient(notebook, timeout=600).execute()
+    print(path.name)
+"""
+
+
+def try_notebooks(wheel: Path, folder: Path) -> None:
+    """Executes the notebooks of ``examples`` with the wheel and the extra that their first cell names, in fewer steps."""
+    python = folder / "venv" / ("Scripts" if os.name == "nt" else "bin") / "python"
+    extra = "rejeu[plot] @ " + wheel.as_uri()
+    run(python, "-m", "pip", "install", "-q", "-c", ROOT / "constraints.txt", extra, "ipykernel", "nbclient")
+    print(run(python, "-c", NOTEBOOKS, ROOT / "examples" / "notebooks", cwd=folder))
+
+
 def try_without_jax(wheel: Path, folder: Path) -> None:
     """Does what docs/deployment.md says under "Python without JAX", with a policy that the full installation exported."""
     venv.create(folder / "light", with_pip=True)
@@ -94,6 +115,7 @@ def main() -> None:
         wheel = build(wheels)
         check_contents(wheel)
         try_out(wheel, folder)
+        try_notebooks(wheel, folder)
         try_without_jax(wheel, folder)
     print(f"{wheel.name} installs and runs")
 

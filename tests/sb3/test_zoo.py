@@ -342,7 +342,7 @@ FOLDERS = sorted(path.parent for path in ZOO.glob("*/*/*.zip") if path.stem != "
 
 
 @pytest.mark.skipif(not FOLDERS, reason="the collection is not beside the repository")
-@pytest.mark.parametrize("folder", FOLDERS, ids=lambda path: f"{path.parent.name}/{path.name}")
+@pytest.mark.parametrize("folder", FOLDERS, ids=[f"{path.parent.name}/{path.name}" for path in FOLDERS])
 def test_the_folders_of_the_collection_load(folder):
     """Their actions are compared by ``trials/zoo.py``."""
     agent = load_zip(folder)
