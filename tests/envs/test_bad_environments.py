@@ -401,10 +401,10 @@ def test_what_is_unbounded_or_little_outside_is_not_told():
 
 def test_the_command_prints_what_it_finds(capsys):
     assert main(["check", "MountainCar-v0"]) == 0
-    assert capsys.readouterr().out == "MountainCar-v0: no errors, no warnings\n"
+    assert capsys.readouterr().out == "MountainCar-v0: 0 errors, 0 warnings\n"
     assert main(["check", "tests.registered_badly:Bad-v0"]) == 1
     out = capsys.readouterr().out.splitlines()
     assert out[0].startswith("error: step returned the observation of shape (), expected (3,)")
-    assert out[-1] == "tests.registered_badly:Bad-v0: 1 error, no warnings"
+    assert out[-1] == "tests.registered_badly:Bad-v0: 1 error, 0 warnings"
     assert main(["check", "CartPole-v9000"]) == 2
     assert "did you mean CartPole" in capsys.readouterr().err

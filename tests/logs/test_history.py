@@ -122,9 +122,9 @@ def test_a_summary_shows_itself_as_a_table():
     assert text.splitlines() == [
         "2 episodes in 20 steps, 4.0 s",
         "          all            last 2",
-        "return    1.50 \N{PLUS-MINUS SIGN} 0.50    1.50 \N{PLUS-MINUS SIGN} 0.50",
+        "return     1.50 \N{PLUS-MINUS SIGN} 0.50    1.50 \N{PLUS-MINUS SIGN} 0.50",
         "length    10.00 \N{PLUS-MINUS SIGN} 0.00   10.00 \N{PLUS-MINUS SIGN} 0.00",
-        "success   50.0%          50.0%",
+        "success          50.0%          50.0%",
         "best return 2.00 at step 20 (2 records)",
     ]
     assert repr(History().summary()) == "0 episodes in 0 steps, 0.0 s"

@@ -12,6 +12,7 @@ from jax import Array
 from rejeu.core import algorithm as core, normalization
 from rejeu.core.spaces import Leaf
 from rejeu.core.types import PyTree
+from rejeu.logs.formatting import aligned
 
 
 def describe(state: PyTree, leaves: tuple[Leaf, ...]) -> str:
@@ -32,10 +33,8 @@ def describe(state: PyTree, leaves: tuple[Leaf, ...]) -> str:
             continue
         if jax.tree.leaves(network):
             rows += [(field.name, "", f"{n_parameters(network):,}"), *layers(network)]
-    widths = [max(len(row[column]) for row in rows) for column in range(3)] if rows else []
-    table = ["  ".join((a.ljust(widths[0]), b.ljust(widths[1]), c.rjust(widths[2]))) for a, b, c in rows]
     parts = [f"observation {leaf.path}".rstrip() + f": {leaf.kind} {leaf.shape}" for leaf in leaves]
-    return "\n".join([*table, "", *parts])
+    return "\n".join([aligned(rows), "", *parts])
 
 
 def layers(network: PyTree) -> list[tuple[str, str, str]]:

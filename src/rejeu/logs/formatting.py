@@ -51,6 +51,22 @@ def html_table(rows: Iterable[Iterable[str]]) -> str:
     return "<table>" + "".join(f"<tr>{line}</tr>" for line in lines) + "</table>"
 
 
+def aligned(rows: Iterable[Sequence[str]], gap: str = "  ") -> str:
+    """Returns rows of cells as lines with aligned columns; numbers, and what begins with one, are aligned to the right.
+
+    >>> print(aligned([("a", "10"), ("bcd", "-7")]))
+    a    10
+    bcd  -7
+    """
+    rows = [*rows]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return "\n".join(gap.join(map(_padded, row, widths)).rstrip() for row in rows)
+
+
+def _padded(text: str, width: int) -> str:
+    return text.rjust(width) if text.lstrip("-")[:1].isdigit() else text.ljust(width)
+
+
 def number(value: float) -> str:
     """Returns a number for a table, with four significant digits; ``-`` if it is not finite.
 
@@ -70,7 +86,7 @@ def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 def cell(value: str) -> str:
     """Returns text so that it shows literally in a cell of Markdown."""
-    for character in "\\|<>[]`*":
+    for character in "\\|<>[]`*_~&#":
         value = value.replace(character, "\\" + character)
     return shown(value, 400)
 

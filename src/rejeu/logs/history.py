@@ -17,7 +17,7 @@ from rejeu.core import atomic
 from rejeu.core.types import JsonObject
 from rejeu.core.validation import as_path, whole
 from rejeu.logs.evaluation import Evaluation
-from rejeu.logs.formatting import counted, html_table
+from rejeu.logs.formatting import aligned, counted, html_table
 from rejeu.training.run import Episode
 
 if TYPE_CHECKING:
@@ -264,12 +264,7 @@ class Summary:
     def __repr__(self) -> str:
         if self.best is None:
             return self._head()
-        rows = self._rows()
-        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-        table = [
-            "   ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
-        ]
-        return "\n".join([self._head(), *table, self._best()])
+        return "\n".join([self._head(), aligned(self._rows(), gap="   "), self._best()])
 
     def _repr_html_(self) -> str:
         return self.to_html()

@@ -190,7 +190,7 @@ def test_modules_are_found_in_the_current_folder(here, monkeypatch, capsys):
         sys, "path", [path for path in sys.path if path not in ("", str(here))]
     )  # as of a console script
     assert main(["check", "drift_env:Drift-v0"]) == 0
-    assert "Drift-v0: no errors" in capsys.readouterr().out
+    assert "Drift-v0: 0 errors" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -142,7 +142,7 @@ def test_a_leaderboard_in_french_which_the_setting_asks_for(folder, tmp_path, mo
 
 def test_names_are_escaped_in_markdown(folder, tmp_path):
     row = next(line for line in run(folder, tmp_path / "board.md").splitlines() if "second" in line)
-    assert r"second/&lt;script&gt;alert(1)&lt;\_script&gt; \| \*x\*" in row
+    assert r"second/\<script\>alert(1)\<\_script\> \| \*x\*" in row
 
 
 def test_a_model_whose_returns_are_not_finite_is_not_ranked(tmp_path):

@@ -9,7 +9,8 @@ import gymnasium as gym
 from rejeu.core.types import JsonObject
 from rejeu.lab.cli.commands import Check
 from rejeu.lab.runs import environment
-from rejeu.lab.runs.begin import counted, is_installed
+from rejeu.lab.runs.begin import is_installed
+from rejeu.logs.formatting import counted
 
 
 def run_check(arguments: Check) -> tuple[int, JsonObject]:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 from rejeu.agents import presets
 from rejeu.agents.presets import Preset
 from rejeu.algorithms.catalog import CATALOG
 from rejeu.core.types import JsonObject
 from rejeu.lab.cli.commands import List
+from rejeu.logs.formatting import aligned
 
 
 def run_list(arguments: List) -> tuple[int, JsonObject]:
@@ -22,7 +23,7 @@ def run_list(arguments: List) -> tuple[int, JsonObject]:
 def show(algorithms: Mapping[str, str]) -> None:
     """Prints the algorithms, and the presets by environment."""
     print("algorithms")
-    print(columns([*algorithms.items()]))
+    print(aligned(("", *entry) for entry in algorithms.items()))
     print("\nenvironments with tuned hyperparameters, the preset of rejeu train first; in brackets, names for --preset")
     rows: dict[str, list[tuple[str, ...]]] = {}
     for preset in presets.every():
@@ -33,8 +34,8 @@ def show(algorithms: Mapping[str, str]) -> None:
             shown += f", after {result.budget}"
         of_env = rows.setdefault(preset.env_id, [])
         algorithm = f"{preset.algorithm} ({preset.name})" if preset.name else preset.algorithm
-        of_env.append(("" if of_env else preset.env_id, algorithm, steps, shown))
-    print(columns([row for of_env in rows.values() for row in of_env]))
+        of_env.append(("", "" if of_env else preset.env_id, algorithm, steps, shown))
+    print(aligned(row for of_env in rows.values() for row in of_env))
     print("\nIn brackets: 95 % confidence interval of a mean return, lowest and highest success rate of a seed.")
     print("Any other Gymnasium or EnvPool id is trained without a preset.")
 
@@ -56,18 +57,3 @@ def as_dict(preset: Preset) -> JsonObject:
     """Returns a preset with its measured result, which is None if there is none."""
     fields = {name: value for name, value in vars(preset).items() if name not in ("backend", "success_threshold")}
     return {**fields, "result": presets.find_result(preset.env_id, preset.algorithm, preset.name)}
-
-
-def columns(rows: Sequence[tuple[str, ...]]) -> str:
-    """Returns a table with aligned columns; entries that begin with a digit are aligned to the right.
-
-    >>> print(columns([("a", "10"), ("bcd", "7")]))
-      a    10
-      bcd   7
-    """
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return "\n".join("  " + "  ".join(map(_padded, row, widths)).rstrip() for row in rows)
-
-
-def _padded(text: str, width: int) -> str:
-    return text.rjust(width) if text[:1].isdigit() else text.ljust(width)

@@ -32,6 +32,7 @@ from rejeu.lab.runs.arguments import Train
 from rejeu.lab.runs.config import DecidedRun, merged
 from rejeu.lab.runs.environment import Environment, from_arguments, module_of
 from rejeu.lab.runs.session import Report, Session, TrainingLimits, installed_logs, make_evaluation_env
+from rejeu.logs.formatting import counted
 
 MANY = 64
 """Number of environments from which an algorithm's values for many environments are used."""
@@ -199,12 +200,3 @@ def is_installed(module: str) -> bool:
         return True
     paths = [getattr(imported, "__file__", None), *getattr(imported, "__path__", ())]
     return any({"site-packages", "dist-packages"} & {*Path(path).resolve().parts} for path in paths if path)
-
-
-def counted(n: int, noun: str) -> str:
-    """Returns a number with its noun.
-
-    >>> counted(0, "error"), counted(1, "error"), counted(2, "error")
-    ('no errors', '1 error', '2 errors')
-    """
-    return f"{n or 'no'} {noun}{'' if n == 1 else 's'}"

@@ -14,7 +14,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from functools import partial
-from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +29,7 @@ from rejeu.core.types import JsonObject, Observation
 from rejeu.envs.make import VectorEnv
 from rejeu.envs.registry import is_plain_id
 from rejeu.logs.evaluation import Evaluation, evaluate
+from rejeu.logs.formatting import cell, markdown_table
 
 MAX_BYTES = 2**28
 """Upper limit on the size of a model."""
@@ -328,14 +328,10 @@ def to_dict(board: Leaderboard) -> JsonObject:
 
 def markdown(board: Leaderboard) -> str:
     """Returns a leaderboard as a Markdown table."""
-    rows = [
-        columns(board.language),
-        ["---"] * len(COLUMNS),
-        *([quoted(cell) for cell in cells_of(row, board.language)] for row in board.rows),
-    ]
-    lines = ["| " + " | ".join(cells) + " |" for cells in rows]
-    lines += ["", f"{board.env_id}, {said(EPISODES, board.episodes, language=board.language)}.", ""]
-    lines += [f"- {quoted(line)}" for line in notes(board)]
+    rows = [cells_of(row, board.language) for row in board.rows]
+    lines = [markdown_table(columns(board.language), rows), ""]
+    lines += [f"{board.env_id}, {said(EPISODES, board.episodes, language=board.language)}.", ""]
+    lines += [f"- {cell(line)}" for line in notes(board)]
     return "\n".join(lines).rstrip() + "\n"
 
 
@@ -367,12 +363,3 @@ def written(number: str, language: Language) -> str:
     if language == "en":
         return number
     return number.replace(",", NARROW_SPACE).replace(".", ",").replace("%", f"{NARROW_SPACE}%")
-
-
-def quoted(text: str) -> str:
-    r"""Returns a text that Markdown shows as it is.
-
-    >>> quoted("a|b <b>*x*")
-    'a\\|b &lt;b&gt;\\*x\\*'
-    """
-    return "".join(f"\\{c}" if c in "\\|*_[]`#~!" else c for c in escape(text, quote=False))
