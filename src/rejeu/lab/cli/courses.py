@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -65,18 +66,14 @@ def run_class(arguments: Class) -> tuple[int, JsonObject]:
     env_id = "" if arguments.env is not None else leaderboard.usual_env_id(paths)
     environment = from_run(RunConfig(env=env_id), arguments.folder, arguments)
     echo(said("{}, {} episodes of each of {} models", environment, episodes, len(paths), language=language))
-    board = leaderboard.build(
-        arguments.folder,
-        paths,
-        environment.env_id,
-        lambda n: environment.vector(n, "gymnasium", arguments.seed),
-        episodes,
-        arguments.seed,
-        60 * arguments.minutes,
-        arguments.success_threshold,
-        language,
-        echo,
-    )
+    settings = episodes, arguments.seed, 60 * arguments.minutes, arguments.success_threshold
+    results = {}
+    with closing(environment.vector(episodes, "gymnasium", arguments.seed)) as env:
+        for path in paths:
+            name = leaderboard.name_of(path, arguments.folder, paths)
+            results[path] = result = leaderboard.result_of(path, name, environment.env_id, env, *settings)
+            echo(said("{}: {}", name, result.said(language), language=language))
+    board = leaderboard.board_of(arguments.folder, paths, environment.env_id, episodes, results, language)
     if not arguments.json:
         show_table(leaderboard.columns(language), [leaderboard.cells_of(row, language) for row in board.rows], 3)
         for note in leaderboard.notes(replace(board, problems=())):  # which were printed when they were met

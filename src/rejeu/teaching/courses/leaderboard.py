@@ -10,8 +10,8 @@ import hashlib
 import math
 import os
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import closing, suppress
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -76,6 +76,11 @@ class Entrant:
         """95 % confidence interval of the mean return; the mean twice for a single episode."""
         low, high = self.evaluation.return_interval
         return (self.evaluation.mean_return,) * 2 if math.isnan(low) else (low, high)
+
+    def said(self, language: Language) -> str:
+        """Returns the result in one line, in a language."""
+        titles, cells = columns(language), cells_of(self, language)
+        return f"{titles[5]} {cells[5]} ({titles[6]} {cells[6]})"
 
 
 @dataclass(frozen=True)
@@ -182,48 +187,6 @@ def header(path: Path) -> JsonObject:
     return dict(checkpoint.read_header(path, "agent"))
 
 
-def build(
-    folder: Path,
-    paths: Sequence[Path],
-    env_id: str,
-    make_vector: Callable[[int], VectorEnv],
-    episodes: int,
-    seed: int,
-    seconds: float,
-    success_threshold: float | None = None,
-    language: Language = "en",
-    report: Callable[[str], None] = print,
-) -> Leaderboard:
-    """Evaluates every model, and returns the leaderboard.
-
-    Args:
-        folder: the names of the models are their paths in it.
-        paths: the models.
-        env_id: the environment that they must have been trained on.
-        make_vector: makes a number of environments.
-        episodes: episodes of each model.
-        seed: seed of the environments, the same for all models.
-        seconds: time of each model, without compilation. One that takes longer is not ranked.
-        success_threshold: return of a successful episode, the same for all models, if the environment does not report success;
-            None for the environment's own. That of a file is not used: its author could choose it.
-        language: of the leaderboard.
-        report: called with a line for each model.
-    """
-    results: dict[Path, Entrant | Unranked] = {}
-    titles = columns(language)
-    with closing(make_vector(episodes)) as env:
-        for path in paths:
-            name = name_of(path, folder, paths)
-            result = results[path] = result_of(path, name, env_id, env, episodes, seed, seconds, success_threshold)
-            if isinstance(result, Unranked):
-                text = result.said(language)
-            else:
-                cells = cells_of(result, language)
-                text = f"{titles[5]} {cells[5]} ({titles[6]} {cells[6]})"
-            report(said("{}: {}", name, text, language=language))
-    return board_of(folder, paths, env_id, episodes, results, language)
-
-
 def board_of(
     folder: Path,
     paths: Sequence[Path],
@@ -232,7 +195,16 @@ def board_of(
     results: Mapping[Path, Entrant | Unranked],
     language: Language,
 ) -> Leaderboard:
-    """Returns the leaderboard of the models that have a result; the other arguments are those of :func:`build`."""
+    """Returns the leaderboard of the models that have a result.
+
+    Args:
+        folder: the names of the models are their paths in it.
+        paths: the models.
+        env_id: the environment that they were evaluated in.
+        episodes: episodes of each model.
+        results: the results by path.
+        language: of the leaderboard.
+    """
     problems = [(name_of(path, folder, paths), entry) for path, entry in results.items() if isinstance(entry, Unranked)]
     equal = tuple(tuple(name_of(path, folder, paths) for path in group) for group in equal_files(paths))
     rows = ranked(result for result in results.values() if isinstance(result, Entrant))
@@ -261,6 +233,17 @@ def evaluated(
     success_threshold: float | None,
 ) -> Entrant:
     """Returns a model with its evaluation.
+
+    Args:
+        path: the model.
+        name: its name on the leaderboard.
+        env_id: the environment that it must have been trained on.
+        env: as many environments as episodes.
+        episodes: number of episodes.
+        seed: seed of the environments, the same for all models.
+        seconds: time of the model, without compilation.
+        success_threshold: return of a successful episode, the same for all models, if the environment does not report success;
+            None for the environment's own. That of a file is not used: its author could choose it.
 
     Raises:
         Unranked: if it is too large or of another environment, takes too long, or has returns that are not finite.
