@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 import warnings
-from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
@@ -346,13 +345,11 @@ def test_rewards_of_goals_may_read_the_info_only_if_it_is_kept(tmp_path, monkeyp
 
 @pytest.mark.usefixtures("untrained")
 def test_without_a_preset_dqn_has_values_of_its_own_but_on_images(tmp_path):
-    few, pixels = SimpleNamespace(n_envs=1, observation_space=CUBE), gym.spaces.Box(0, 255, (36, 36, 3), np.uint8)
-    assert untuned("DQN", few) == rejeu.agents.presets.small("DQN") != {}
-    assert untuned("DQN", SimpleNamespace(n_envs=1, observation_space=gym.spaces.Dict(eye=pixels, arm=CUBE))) == {}
-    assert untuned("PQN", few) == {}
-    assert (
-        untuned("PQN", SimpleNamespace(n_envs=128, observation_space=CUBE)) == AGENTS["PQN"].algorithm.Config.for_many
-    )
+    pixels = gym.spaces.Box(0, 255, (36, 36, 3), np.uint8)
+    assert untuned("DQN", 1, CUBE) == rejeu.agents.presets.small("DQN") != {}
+    assert untuned("DQN", 1, gym.spaces.Dict(eye=pixels, arm=CUBE)) == {}
+    assert untuned("PQN", 1, CUBE) == {}
+    assert untuned("PQN", 128, CUBE) == AGENTS["PQN"].algorithm.Config.for_many
     for env, steps in (("Blackjack-v1", 2), ("CartPole-v1", 1)):  # the second has a preset
         out = tmp_path / env
         argv = ["train", env, "--algo", "DQN", "--steps", "20", "--out", str(out), "--evaluate-episodes", "1"]

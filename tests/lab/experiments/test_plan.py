@@ -1,12 +1,20 @@
 """Plans: what they expand to, and where a mistake is said to be."""
 
+from contextlib import closing
+from pathlib import Path
+
 import gymnasium as gym
 import pytest
 from gymnasium.envs.registration import EnvSpec
 
 import rejeu
+from rejeu.algorithms.config import to_json as config_to_json
+from rejeu.lab.experiments import plan as plan_module
 from rejeu.lab.experiments.folder import MAX_JOBS
 from rejeu.lab.experiments.plan import PlanError, read_plan
+from rejeu.lab.runs.arguments import of_task
+from rejeu.lab.runs.begin import make_config, make_env
+from rejeu.lab.runs.environment import from_arguments
 from tests.environments import Counter
 
 PLAN = """\
@@ -69,6 +77,7 @@ def test_a_dict_is_a_plan_too():
         ({}, ["XQC"]),
         ({"minutes": 5}, ["SAC"]),
         ({"steps": 100_000}, ["XQC"]),
+        ({"envs": 64}, ["SAC"]),
         ({"settings": {"default": {}, "far": {"gamma": 0.999}}}, ["SAC", "SAC"]),  # one for all that are compared
     ],
 )
@@ -77,6 +86,20 @@ def test_without_algorithms_and_settings_long_runs_take_that_of_rejeu_train(opti
     monkeypatch.setitem(gym.registry, spec.id, spec)
     plan, _ = read_plan({"environments": spec.id, **options})
     assert [job.run.algorithm for job in plan.jobs] == algorithms
+
+
+@pytest.mark.parametrize(("algorithm", "n_envs"), [("DQN", 1), ("PQN", 128)])
+def test_a_plan_checks_the_configuration_that_is_trained(algorithm, n_envs, monkeypatch):
+    checked = []
+    monkeypatch.setattr(plan_module, "check_spaces", lambda environment, config: checked.append(config))
+    content = {"environments": "Blackjack-v1", "algorithms": algorithm, "settings": {"slow": {"learning_rate": 1e-5}}}
+    plan, _ = read_plan({**content, "envs": n_envs})
+    _, arguments = of_task(plan.jobs[0].task(Path("run"), False, ()))
+    environment = from_arguments(arguments.env, arguments)
+    with closing(make_env(arguments, environment, None, 0)) as env:
+        trained = make_config(arguments, environment, None, env, 0, ())
+    assert config_to_json(checked[0]) == trained.hyperparameters
+    assert trained.hyperparameters["batch_size"] != type(checked[0])().batch_size  # it differs from the defaults
 
 
 def test_options_of_one_environment():

@@ -17,17 +17,18 @@ from typing import Annotated, Any, NamedTuple
 import gymnasium as gym
 from msgspec import Meta
 
-from rejeu.agents import AGENTS, choose_algorithm, find_agent, find_preset, presets
+from rejeu.agents import AGENTS, find_agent, find_preset
 from rejeu.checkpoints.agent_state import Identity
 from rejeu.core import devices, spaces
 from rejeu.core.errors import one_line
 from rejeu.core.records import MAX_DEPTH, Seed, convert, is_deep, shown
-from rejeu.core.validation import as_path, build, check_names, choice, field_names
+from rejeu.core.validation import as_path, check_names, choice, field_names
 from rejeu.envs.make import BACKENDS, make_vector
 from rejeu.envs.registry import are_plain, is_plain_id, maker, register
 from rejeu.lab.experiments.folder import MAX_JOBS, Plan, Resources
 from rejeu.lab.experiments.work import FILES, Job, job_name
-from rejeu.lab.runs.config import RunConfig, merged, options
+from rejeu.lab.runs.begin import decide
+from rejeu.lab.runs.config import RunConfig, options
 from rejeu.logs.logging import check_logs, require
 from rejeu.logs.tables import flat
 
@@ -183,21 +184,16 @@ def expanded(
             with at(plan, *keys):
                 if "algorithms" in setting and algorithm not in read_algorithms(setting["algorithms"]):
                     continue
-                of_algorithm = convert(setting.get(str(algorithm), {}), Kwargs)
-                path = None if environment.run.preset is None else str(environment.run.preset)
-                preset = find_preset(environment.run.env, algorithm, path)
-                is_long = environment.run.is_long and not any(settings.values())
-                algorithm_name = algorithm or choose_algorithm(
-                    preset, environment.run.env, environment.observation, environment.action, is_long
-                )
                 common = {key: value for key, value in setting.items() if key != "algorithms" and key not in AGENTS}
-                base = preset or presets.default(environment.run.env, algorithm_name)
-                config = read_hyperparameters(algorithm_name, base.hyperparameters, {**common, **of_algorithm})
-            checked.append((environment, keys, name, config, {**common, **of_algorithm}))
-    for environment, keys, name, config, values in checked:
+                values = {**common, **convert(setting.get(str(algorithm), {}), Kwargs)}
+                run = replace(environment.run, algorithm=algorithm, hyperparameters=dict(flat(values)))
+                preset = find_preset(run.env, algorithm, None if run.preset is None else str(run.preset))
+                is_long = run.is_long and not any(settings.values())  # one algorithm for all settings
+                _, config = decide(run, preset, environment.observation, environment.action, is_long)
+            checked.append((environment, keys, name, config, replace(run, algorithm=config.name)))
+    for environment, keys, name, config, run in checked:
         with at(plan, *keys):
             check_spaces(environment, config)
-        run = replace(environment.run, algorithm=config.name, hyperparameters=dict(flat(values)))
         for seed in seeds:
             job = job_name(environment.label, config.name, name, seed)
             yield Job(name=job, run=replace(run, seed=seed), setting=name, **environment.files)
@@ -294,17 +290,6 @@ def find_spaces(run: RunConfig) -> tuple[gym.Space, gym.Space]:
         return env.observation_space, env.action_space
     finally:
         env.close()
-
-
-def read_hyperparameters(algorithm: str, base: Mapping[str, object], values: Mapping[str, object]) -> Any:
-    """Returns the configuration of an algorithm from ``base`` and ``values``, as ``rejeu train`` would.
-
-    Raises:
-        ValueError, TypeError: for an unknown or invalid hyperparameter.
-    """
-    config = AGENTS[algorithm].algorithm.Config
-    check_names(values, field_names(config), algorithm)
-    return build(config, merged(dict(flat(values)), base))
 
 
 def check_spaces(environment: PlannedEnvironment, config: Any) -> None:

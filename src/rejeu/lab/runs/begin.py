@@ -29,7 +29,7 @@ from rejeu.core.types import Settings
 from rejeu.envs.make import VectorEnv, WorkerOptions, make_vector
 from rejeu.envs.registry import ENVPOOL_SIZE, has_package, is_envpool_installed, usable_envpool
 from rejeu.lab.runs.arguments import Train
-from rejeu.lab.runs.config import DecidedRun, merged
+from rejeu.lab.runs.config import DecidedRun, RunConfig, merged
 from rejeu.lab.runs.environment import Environment, from_arguments, module_of
 from rejeu.lab.runs.session import Report, Session, TrainingLimits, installed_logs, make_evaluation_env
 from rejeu.logs.formatting import counted
@@ -48,11 +48,9 @@ def begin(arguments: Train, stack: ExitStack, report: Report) -> Session:
     environment = from_arguments(arguments.env, arguments)
     preset = find_preset(environment.env_id, algorithm, None if arguments.preset is None else str(arguments.preset))
     env = stack.enter_context(closing(make_env(arguments, environment, preset, seed)))
-    is_long = arguments.is_long and not arguments.hyperparameters and env.n_envs < MANY
-    algorithm = algorithm or choose_algorithm(preset, env.env_id, env.observation_space, env.action_space, is_long)
-    config = make_config(arguments, environment, preset, algorithm, env, seed, logs)
+    config = make_config(replace(arguments, algorithm=algorithm), environment, preset, env, seed, logs)
     general: Settings = {"seed": seed, "success_threshold": config.success_threshold, "device": config.device}
-    agent = AGENTS[algorithm](config.policy, env, **general, **config.hyperparameters)
+    agent = AGENTS[config.algorithm](config.policy, env, **general, **config.hyperparameters)
     if env.backend not in ("envpool", "jax"):
         check_own_environment(environment, agent.config)
     return Session(
@@ -90,32 +88,49 @@ def describe_backend(env: VectorEnv, environment: Environment, preset: Preset | 
     return env.backend + (hint if is_slower and not is_envpool_installed() else "")
 
 
-def untuned(algorithm: str, env: VectorEnv) -> Mapping[str, object]:
+def decide(
+    run: RunConfig, preset: Preset | None, observations: gym.Space, actions: gym.Space, is_long: bool
+) -> tuple[Preset, configs.AlgorithmConfig]:
+    """Returns the preset of a run, else the defaults, and with what is asked of the run the configuration of its algorithm.
+
+    Args:
+        run: what is asked of it, with the id of its environment.
+        preset: that of the environment, None if there is none.
+        observations: space.
+        actions: space.
+        is_long: whether the algorithm may be one for long runs without hyperparameters of one's own.
+
+    Raises:
+        TypeError: for an unknown hyperparameter, with the nearest known one.
+        ValueError: for an invalid value, or if no algorithm takes the actions.
+    """
+    n_envs = run.n_envs or (preset.n_envs if preset else 1)
+    is_long = is_long and n_envs < MANY
+    algorithm = run.algorithm or choose_algorithm(preset, run.env, observations, actions, is_long)
+    base = preset or presets.default(run.env, algorithm, untuned(algorithm, n_envs, observations))
+    hyperparameters = merged(run.hyperparameters, base.hyperparameters)
+    return base, validation.build(AGENTS[algorithm].algorithm.Config, hyperparameters)
+
+
+def untuned(algorithm: str, n_envs: int, observations: gym.Space) -> Mapping[str, object]:
     """Returns the hyperparameters of an algorithm in environments without a preset."""
-    config = AGENTS[algorithm].algorithm.Config
-    if env.n_envs >= MANY:
-        return config.for_many
-    return {} if any(leaf.kind == "image" for leaf in leaves(env.observation_space)) else presets.small(algorithm)
+    if n_envs >= MANY:
+        return AGENTS[algorithm].algorithm.Config.for_many
+    return {} if any(leaf.kind == "image" for leaf in leaves(observations)) else presets.small(algorithm)
 
 
 def make_config(
     arguments: Train,
     environment: Environment,
     preset: Preset | None,
-    algorithm: str,
     env: VectorEnv,
     seed: int,
     logs: tuple[str, ...],
 ) -> DecidedRun:
-    """Returns the configuration of the run: the arguments, then the preset, then the defaults.
-
-    Raises:
-        TypeError: for an unknown hyperparameter, with the nearest known one.
-        ValueError: for an invalid value.
-    """
-    base = presets.default(environment.env_id, algorithm, untuned(algorithm, env)) if preset is None else preset
-    hyperparameters = merged(arguments.hyperparameters, base.hyperparameters)
-    config = validation.build(AGENTS[algorithm].algorithm.Config, hyperparameters)
+    """Returns the configuration of the run: the arguments, then the preset, then the defaults; raises as :func:`decide`."""
+    run = replace(arguments, env=environment.env_id, n_envs=env.n_envs)
+    is_long = run.is_long and not run.hyperparameters
+    base, config = decide(run, preset, env.observation_space, env.action_space, is_long)
     nested = isinstance(env.observation_space, spaces.Dict | spaces.Tuple)
     return DecidedRun(
         env=environment.env_id,
@@ -123,7 +138,7 @@ def make_config(
         env_kwargs=dict(environment.run.env_kwargs),
         wrappers=environment.run.wrappers,
         imports=environment.run.imports,
-        algorithm=algorithm,
+        algorithm=config.name,
         preset=preset is not None,
         hyperparameters=configs.to_json(config),
         policy="MultiInputPolicy" if nested else "MlpPolicy",
