@@ -254,6 +254,16 @@ def test_what_ffmpeg_says_is_passed_on(tmp_path):
     assert os.listdir(tmp_path) == []
 
 
+@pytest.mark.parametrize(("suffix", "beginning"), [(".gif", b"GIF89a"), (".webm", b"\x1aE\xdf\xa3")])
+def test_a_video_is_a_gif_or_webm_by_its_suffix(tmp_path, suffix, beginning):
+    with VideoFile(tmp_path / f"clip{suffix}", 10) as video:
+        for value in (0, 200):
+            video.write(np.full((9, 11, 3), value, np.uint8))  # odd sizes
+    assert video.path.read_bytes().startswith(beginning)
+    with pytest.raises(ValueError, match=r"must end in one of \.mp4, \.webm, \.gif"):
+        VideoFile(tmp_path / "clip.avi", 10)
+
+
 def test_frames_of_another_shape_or_type_are_refused(tmp_path):
     for bad in (np.zeros((8, 6, 3), np.uint8), np.zeros((8, 8, 3))):
         writer = VideoFile(tmp_path / "v", 30)
@@ -287,7 +297,7 @@ def test_environment_that_cannot_render_is_an_error(tmp_path):
         ({"episodes": 0}, "episodes=0"),
         ({"max_steps": 0}, "max_steps=0"),
         ({"fps": 0}, "fps=0"),
-        ({"path": "v.avi"}, "must end in .mp4"),
+        ({"path": "v.avi"}, r"must end in one of \.mp4"),
     ],
 )
 def test_bad_arguments_are_named(arguments, message, lamp, tmp_path):

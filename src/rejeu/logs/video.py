@@ -1,4 +1,4 @@
-"""Videos of a policy: H.264 in mp4, written frame by frame by ffmpeg without a display, and shown in a notebook."""
+"""Videos of a policy: mp4, webm or gif, written frame by frame by ffmpeg without a display, and shown in a notebook."""
 
 from __future__ import annotations
 
@@ -30,6 +30,17 @@ from rejeu.envs.rendering import check_renders, make_rendering_env, natural_fps,
 
 HOLD_SECONDS = 0.5
 """How long the last frame of an episode is shown."""
+EVEN = "pad=ceil(iw/2)*2:ceil(ih/2)*2"
+"""Filter that gives the frames even heights and widths, which most formats need."""
+FORMATS = {
+    ".mp4": ("-vf", EVEN, "-c:v", "libx264", "-pix_fmt", "yuv420p", "-movflags", "+faststart"),
+    ".webm": ("-vf", EVEN, "-c:v", "libvpx-vp9", "-pix_fmt", "yuv420p", "-crf", "32", "-b:v", "0"),
+    ".gif": (
+        "-vf",
+        "split[frames][same];[same]palettegen=stats_mode=diff[palette];[frames][palette]paletteuse=dither=none",
+    ),
+}
+"""Options of ffmpeg by suffix."""
 
 
 def ffmpeg() -> str:
@@ -44,9 +55,9 @@ def ffmpeg() -> str:
 
 
 class VideoFile:
-    """An mp4 file that appears at its path when it is closed.
+    """A video that appears at its path when it is closed: an mp4 file with H.264, a webm file with VP9, or a gif.
 
-    H.264, yuv420p; odd heights and widths are padded by a black line. As a context manager it is closed at the end, or
+    Odd heights and widths are padded by a black line, except in a gif. As a context manager it is closed at the end, or
     discarded after an exception. ``imageio_ffmpeg.write_frames`` is not used: it ignores ffmpeg's exit status, so that a full
     disk leaves half a video without an error, and it forks while JAX's threads run, about which JAX warns.
 
@@ -57,12 +68,12 @@ class VideoFile:
 
     def __init__(self, path: str | Path, fps: float) -> None:
         path = as_path(path)
-        if path.suffix not in ("", ".mp4"):
-            raise ValueError(f"path={str(path)!r} must end in .mp4, the only supported format")
+        if path.suffix not in ("", *FORMATS):
+            raise ValueError(f"path={str(path)!r} must end in one of {', '.join(FORMATS)}")
         self.path = (path if path.suffix else path.with_name(path.name + ".mp4")).absolute()
         self.fps = fps
         self.n_frames = 0
-        self._partial = self.path.with_name(f".{self.path.stem}.{secrets.token_hex(4)}.partial.mp4")
+        self._partial = self.path.with_name(f".{self.path.stem}.{secrets.token_hex(4)}.partial{self.path.suffix}")
         self._program = ffmpeg()
         self._process: subprocess.Popen[bytes] | None = None
         self._shape: tuple[int, ...] = ()
@@ -127,8 +138,7 @@ class VideoFile:
             [
                 *(self._program, "-y", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24"),
                 *("-s", f"{width}x{height}", "-r", str(self.fps), "-i", "-", "-an"),
-                *("-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-c:v", "libx264", "-pix_fmt", "yuv420p"),
-                *("-movflags", "+faststart", str(self._partial)),
+                *(*FORMATS[self.path.suffix], str(self._partial)),
             ],
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
@@ -162,7 +172,7 @@ def record_video(
     seed: int | None = None,
     fps: float | None = None,
 ) -> Path:
-    """Records the agent's deterministic policy to an mp4 file, and returns the path of the file.
+    """Records the agent's deterministic policy to an mp4, webm or gif file, and returns the path of the file.
 
     The video has one frame after each reset and one for each step. The last frame of an episode is shown for half a second.
     An existing file is replaced when the new one is complete.
