@@ -28,6 +28,7 @@ def pictures(page):
 def test_a_game_is_played_by_keys_recorded_and_read_again(browser, common):
     with opened(browser, common, "/play?env=FrozenLake-v1&seed=1") as page:
         page.wait_for_selector("text=press a key to begin")
+        page.get_by_text("Environment and players").click()
         page.get_by_role("switch", name="record").click()
         page.evaluate("document.querySelector('.screen').id = 'before'")
         page.get_by_role("button", name="Start").click()
@@ -41,6 +42,7 @@ def test_a_game_is_played_by_keys_recorded_and_read_again(browser, common):
         assert pictures(page) != before
         page.get_by_role("button", name="q", exact=True).click()
         page.wait_for_selector("text=1 episode for MINARI_DATASETS_PATH")
+        page.get_by_role("button", name="again").wait_for()
     (recorded,) = (common.folder / "played").iterdir()
     (episode,) = read(recorded).episodes
     assert episode.actions.tolist() == [2, 2, 1]  # right, right, down
@@ -58,9 +60,35 @@ def test_two_agents_are_shown_side_by_side_from_the_same_start(browser, common):
         check_widths(page)
         page.keyboard.press("p")
         page.wait_for_selector("text=pause >> nth=0")
+        page.get_by_text("Environment and players").click()
         page.get_by_role("switch", name="I play").click()
         page.get_by_role("button", name="Start").click()
         page.wait_for_url("**/play?env=CartPole-v1&agent=anna.safetensors&agent=*&seed=3")  # a reload keeps the game
+
+
+VISIBLE = """() => [...document.querySelectorAll(".keys .key, .screen p")].every((element) => {
+    const { top, bottom, right } = element.getBoundingClientRect();
+    return top > 0 && bottom <= innerHeight && right <= innerWidth; })"""
+AZERTY = "navigator.keyboard.getLayoutMap = async () => new Map([['KeyA', 'q'], ['KeyQ', 'a'], ['KeyD', 'd']])"
+
+
+def test_a_game_fits_a_telephone_and_its_keys_are_those_of_the_keyboard(browser, common):
+    """The keys are where they are on a US keyboard: left is where A is there, which is Q on a French one."""
+    with opened(browser, common, "/play", 360, 640, has_touch=True) as page:
+        page.add_init_script(AZERTY)
+        page.goto(common.at("/play?env=FrozenLake-v1&seed=1"))
+        page.wait_for_selector("text=press a key to begin")
+        page.get_by_role("button", name="a", exact=True).wait_for()  # quits
+        for width, height in ((360, 640), (640, 360), (1280, 800)):
+            page.set_viewport_size({"width": width, "height": height})
+            page.wait_for_function("document.documentElement.scrollHeight <= innerHeight")
+            page.wait_for_function(VISIBLE)
+            assert page.locator(".screen canvas").bounding_box()["height"] > 60
+        page.get_by_role("button", name="d", exact=True).tap()
+        page.wait_for_selector(".screen[data-presses='1']")
+        page.keyboard.press("q")  # the key of a US keyboard there, which says A here
+        page.get_by_role("button", name="again").tap()
+        page.wait_for_selector("text=press a key to begin")
 
 
 def test_an_error_is_one_line_on_the_page(browser, common):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 
 from fastapi import Request
@@ -12,7 +12,7 @@ from rejeu.agents import presets
 from rejeu.core.language import said
 from rejeu.lab.studio.games import HostedGame, Wanted
 from rejeu.lab.studio.layout import address, follow
-from rejeu.lab.studio.screen import CSS, Screen
+from rejeu.lab.studio.screen import CSS, FITTING, Screen
 from rejeu.lab.studio.state import Studio
 from rejeu.teaching.play.game import Event
 from rejeu.teaching.play.keys import KNOWN, KeyMap
@@ -29,13 +29,19 @@ def build(studio: Studio, request: Request) -> None:
 
     Its address may name ``env``, ``agent`` once or twice, a ``seed``, and ``watch`` for a game without keys; it then begins.
     """
-    ui.add_css(CSS)
+    ui.add_css(CSS + FITTING)
+    ui.query(".page").classes("fits")
     asked = request.query_params
     names = asked.getlist("agent")[:MOST_AGENTS]
     first = studio.row(names[0]) if names else None
     env_id = asked.get("env") or (first["env"] if first is not None else None)
     seed = asked.get("seed", "")
-    with ui.row().classes("items-center w-full"):
+    with (
+        ui.expansion(said("Environment and players"), value=not (env_id or names))
+        .props("dense")
+        .classes("w-full") as form,
+        ui.row().classes("items-center w-full"),
+    ):
         env = ui.select(
             environments(studio, env_id),
             label="environment",
@@ -51,7 +57,7 @@ def build(studio: Studio, request: Request) -> None:
             "seed", value=int(seed) if seed.isdecimal() and len(seed) < 16 else None, min=0, precision=0
         ).classes("w-20")
         start = ui.button("Start", icon="play_arrow").props("no-caps")
-    stage = ui.column().classes("w-full")
+    stage = ui.column().classes("stage w-full")
 
     def start_anew() -> None:
         seed = "" if number.value is None else str(int(number.value))
@@ -62,9 +68,10 @@ def build(studio: Studio, request: Request) -> None:
     def begin() -> None:
         from_seed = None if number.value is None else int(number.value)
         wanted = Wanted(env.value or "", tuple(agents.value), bool(by_hand.value), from_seed, bool(record.value))
+        form.value = False
         stage.clear()  # the screen of an earlier game ends it
         with stage:
-            show(studio, wanted, offer)
+            show(studio, wanted, offer, begin)
 
     def offer(env_id: str | None = None) -> None:
         env_id = env.value or env_id
@@ -94,11 +101,26 @@ def offered(studio: Studio, env_id: str | None, selected: list[str]) -> list[str
     return [*dict.fromkeys([*selected, *studio.guests, *runs])]
 
 
-def show(studio: Studio, wanted: Wanted, begun: Callable[[str], object]) -> None:
-    """Begins a game, and shows it; ``begun`` is called with the id of its environment."""
+def show(studio: Studio, wanted: Wanted, begun: Callable[[str], object], again: Callable[[], object]) -> None:
+    """Begins a game, and shows it.
+
+    Args:
+        studio: that has the agents.
+        wanted: who plays.
+        begun: called with the id of its environment.
+        again: called to begin it anew, when it has ended.
+    """
+    keycaps: dict[ui.button, str] = {}
+    labels: dict[str, str] = {}
+
+    def label(learned: dict[str, str]) -> None:
+        labels.update(learned)
+        for button, text in keycaps.items():
+            button.text = labelled(text, labels)
+
     status = ui.label("The environment is made, and agents are compiled ...").classes("text")
-    screen = Screen(lambda event: playing.handle(event))
-    buttons = ui.row().classes("gap-1 items-center")
+    screen = Screen(lambda event: playing.handle(event), label)
+    buttons = ui.row().classes("keys gap-1 items-center w-full")
     playing = HostedGame(lambda: wanted.open(studio), screen.show)
     screen.on_leave = lambda: playing.handle(Event("close"))
 
@@ -107,24 +129,44 @@ def show(studio: Studio, wanted: Wanted, begun: Callable[[str], object]) -> None
             status.text = ""
             begun(playing.opened.env_id)
             with buttons:
-                show_keys(playing, playing.opened.keys)
+                keycaps.update(show_keys(playing, playing.opened.keys))
+            label({})
         if playing.ended:
             timer.deactivate()
+            keycaps.clear()
             buttons.clear()
-            status.text = playing.said or "The game has ended."
+            status.text = playing.said or said("The game has ended.")
+            with buttons:
+                ui.button(said("again"), icon="replay", on_click=again).props("no-caps")
 
     timer = ui.timer(LOOK, look)
 
 
-def show_keys(playing: HostedGame, keys: KeyMap | None) -> None:
-    """Shows what each key does, as buttons that are that key."""
-    entries = [] if keys is None else legend(keys)
-    for entry in entries:
-        for text, _ in entry.keys:
-            button = ui.button(text).props(CHIP).style("touch-action: none")
-            for name, event_type in (("pointerdown", "press"), ("pointerup", "release"), ("pointerleave", "release")):
-                button.on(name, partial(playing.handle_all, event_type, text.split("+")))
-        ui.label(entry.label).classes("q-mr-sm text-caption")
+def show_keys(playing: HostedGame, keys: KeyMap | None) -> dict[ui.button, str]:
+    """Shows what each key does, as buttons that are that key; returns their keys, by SDL's names."""
+    keycaps: dict[ui.button, str] = {}
+    together = "gap-1 items-center no-wrap q-mr-sm"
+    for entry in [] if keys is None else legend(keys):
+        with ui.row().classes(together):
+            for text, _ in entry.keys:
+                button = ui.button(text).props(CHIP).classes("key")
+                for name in ("pointerdown", "pointerup", "pointerleave", "pointercancel"):
+                    event_type = "press" if name == "pointerdown" else "release"
+                    button.on(name, partial(playing.handle_all, event_type, text.split("+")))
+                keycaps[button] = text
+            ui.label(entry.label).classes("text-caption")
     for key, label in HELP:
-        ui.button(key, on_click=partial(playing.handle_all, "press", [key])).props(CHIP)
-        ui.label(said(label)).classes("q-mr-sm text-caption")
+        with ui.row().classes(together):
+            button = ui.button(key, on_click=partial(playing.handle_all, "press", [key])).props(CHIP).classes("key")
+            ui.label(said(label)).classes("text-caption")
+        keycaps[button] = key
+    return keycaps
+
+
+def labelled(text: str, labels: Mapping[str, str]) -> str:
+    """Returns the text of keys, with what stands on them.
+
+    >>> labelled("a+w", {"a": "q", "w": "z"}), labelled("left", {"a": "q"})
+    ('q+z', 'left')
+    """
+    return "+".join(labels.get(key, key) for key in text.split("+"))

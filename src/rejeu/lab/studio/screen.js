@@ -6,18 +6,22 @@ export default {
       <figcaption><b>{{ one.name }}</b><span>{{ one.score }}</span><small>{{ one.about }}</small></figcaption>
       <canvas :ref="(canvas) => { canvases[i] = canvas }" role="img" :aria-label="one.name + ' ' + one.score"></canvas>
       <p>{{ one.message }}</p>
+      <div v-for="bar in one.bars || []" class="bar" :class="{chosen: bar.is_chosen}"><span>{{ bar.name }}</span>
+        <div><i :style="{left: bar.start * 100 + '%', width: Math.max(bar.end - bar.start, 0.005) * 100 + '%'}"></i>
+          <b v-if="bar.mark !== null" :style="{left: bar.mark * 100 + '%'}"></b></div><span>{{ bar.text }}</span></div>
     </figure></div>`,
   props: { channel: String, keys: Boolean },
   data: () => ({ captions: [] }),
   mounted() {
     this.canvases = [];
-    this.presses = 0;
+    this.labels = {};
     this.open();
     this.listening = new AbortController();
     const { signal } = this.listening;
     if (!this.keys) return;
     window.addEventListener("keydown", (event) => this.key("press", event), { signal });
     window.addEventListener("keyup", (event) => this.key("release", event), { signal });
+    navigator.keyboard?.getLayoutMap?.().then((map) => this.learn(Object.fromEntries(map)), () => {});
     window.addEventListener("blur", () => this.send(["leave", ""]), { signal });
   },
   beforeUnmount() {
@@ -59,6 +63,11 @@ export default {
     send(message) {
       if (this.socket.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify(message));
     },
+    learn(labels) { // what stands on the keys, which browsers without a map of them show one by one
+      if (Object.entries(labels).every(([code, label]) => this.labels[code] === label)) return;
+      this.labels = { ...this.labels, ...labels };
+      this.$emit("labels", this.labels);
+    },
     key(kind, event) {
       if (event.ctrlKey || event.metaKey || event.altKey || event.target.closest("input, textarea, select, [role=listbox]")) return;
       if (["ArrowLeft", "ArrowRight", "ArrowUp", "ArrowDown", " ", "Enter"].includes(event.key)) {
@@ -66,7 +75,8 @@ export default {
         event.preventDefault(); // the page would scroll
         event.target.closest("button")?.blur();
       }
-      if (!event.repeat) this.send([kind, event.location === 2 ? `right ${event.key}` : event.key]);
+      if (event.code && event.key.length === 1 && event.key !== " ") this.learn({ [event.code]: event.key.toLowerCase() });
+      if (!event.repeat) this.send([kind, event.code || event.key]); // the place of a key, not its letter
     },
   },
 };

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import io
+import re
 import secrets
 import weakref
 from collections.abc import Callable, Sequence
@@ -28,17 +29,41 @@ CSS = """
 .screen canvas.small { image-rendering: pixelated; }
 .screen p { margin: 4px 0; min-height: 1.5em; text-align: center; font-weight: 600; }
 .screen .won p { color: #26965f; }
+.bar { display: grid; grid-template-columns: 30% 1fr 7em; gap: 8px; align-items: center; font-size: 13px; }
+.bar div { position: relative; height: 12px; background: #8883; border-radius: 3px; }
+.bar i { position: absolute; top: 0; bottom: 0; background: #63a4e0; border-radius: 3px; }
+.bar b { position: absolute; top: -2px; bottom: -2px; width: 3px; margin-left: -1px; background: #d9631e; }
+.bar.chosen { font-weight: 700; }
+.bar.chosen i { background: #d9631e; }
+.bar span:last-child { text-align: right; font-variant-numeric: tabular-nums; }
+.one-row .screen { flex-wrap: nowrap; overflow-x: auto; }
+.one-row .screen figure { flex: 1 0 150px; }
+.one-row .screen figcaption { flex-direction: column; gap: 0; }
+.one-row .screen figcaption small { display: none; }
 """
-KEYS = {
-    "arrowleft": "left",
-    "arrowright": "right",
-    "arrowup": "up",
-    "arrowdown": "down",
-    " ": "space",
-    "enter": "return",
+FITTING = """
+.fits { height: calc(100dvh - 56px); flex-wrap: nowrap; padding-top: 4px; padding-bottom: 4px; gap: 4px; }
+.fits .stage { flex: 1 1 0; min-height: 0; flex-wrap: nowrap; gap: 4px; }
+.fits .screen { flex: 1 1 0; min-height: 0; flex-wrap: nowrap; justify-content: center; }
+.fits figure { display: flex; flex-direction: column; flex: 1 1 0; min-height: 0; min-width: 0; max-width: none; }
+.fits figcaption { flex-wrap: wrap; column-gap: 12px; row-gap: 0; }
+.fits canvas { flex: 1 1 0; min-height: 0; object-fit: contain; border: 0; }
+.fits .keys { flex: none; }
+.key { touch-action: none; user-select: none; -webkit-user-select: none; -webkit-touch-callout: none; }
+@media (pointer: coarse) { .key { min-width: 44px; min-height: 44px; } }
+@media (max-aspect-ratio: 1) { .fits .screen { flex-direction: column; } }
+"""
+"""Of pages in which the pictures give way to all else, so that they fit the window."""
+KEYS = {"enter": "return", "numpadenter": "return", "space": "space", " ": "space"}
+KEYS |= {
+    f"{name}{side}": f"{side} {key}"
+    for side in ("left", "right")
+    for name, key in (("shift", "shift"), ("control", "ctrl"))
 }
-KEYS |= {"shift": "left shift", "control": "left ctrl", "right control": "right ctrl"}
-"""SDL's names of keys by those of browsers, where they differ."""
+KEYS |= {f"arrow{side}": side for side in ("left", "right", "up", "down")}
+KEYS |= dict(zip(("comma", "period", "semicolon", "quote", "minus", "equal"), ",.;'-=", strict=True))
+KEYS |= dict(zip(("bracketleft", "bracketright", "backslash", "slash", "backquote"), "[]\\/`", strict=True))
+"""SDL's names of keys by the codes of browsers in lower case, where they differ."""
 _open: weakref.WeakValueDictionary[str, Screen] = weakref.WeakValueDictionary()
 
 
@@ -49,9 +74,12 @@ class Screen(Element, component="screen.js"):
 
     Args:
         key: called with what the keyboard does, with SDL's names of keys.
+        labels: called with what stands on the keys of the keyboard, by SDL's names.
     """
 
-    def __init__(self, key: Callable[[Event], object] | None = None) -> None:
+    def __init__(
+        self, key: Callable[[Event], object] | None = None, labels: Callable[[dict[str, str]], object] | None = None
+    ) -> None:
         super().__init__()
         self._key = key
         self._newest: tuple[Sequence[bytes], JsonObject] = (), {}
@@ -61,12 +89,14 @@ class Screen(Element, component="screen.js"):
         channel = secrets.token_urlsafe(12)
         self.props.update(channel=channel, keys=key is not None)
         _open[channel] = self
+        if labels is not None:
+            self.on("labels", lambda event: labels({key_name(code): str(text) for code, text in event.args.items()}))
 
     def show(self, pictures: Sequence[np.ndarray], captions: Sequence[JsonObject], presses: int = 0) -> None:
         """Shows pictures, ``uint8 (height, width, 3)``.
 
-        Captions are texts: ``name``, ``score``, ``about`` and ``message``; ``won`` colors the message. ``presses`` says how
-        many keys had been pressed before.
+        Captions are texts: ``name``, ``score``, ``about`` and ``message``; ``won`` colors the message, and ``bars`` are dicts
+        of :class:`rejeu.lab.studio.deciding.Bar`. ``presses`` says how many keys had been pressed before.
         """
         self._newest = [jpeg(picture) for picture in pictures], {"captions": captions, "presses": presses}
         self._loop.call_soon_threadsafe(self._changed.set)
@@ -114,13 +144,14 @@ def jpeg(picture: np.ndarray) -> bytes:
     return file.getvalue()
 
 
-def key_name(name: str) -> str:
-    """Returns SDL's name of a key from that of a browser.
+def key_name(code: str) -> str:
+    """Returns SDL's name of a key from a browser's code of its place, which is that of the key there on a US keyboard.
 
-    >>> [key_name(name) for name in ("ArrowLeft", "A", " ", "right Shift")]
-    ['left', 'a', 'space', 'right shift']
+    >>> [key_name(code) for code in ("ArrowLeft", "KeyA", "Digit7", "Numpad7", "Space", "ShiftRight", "Slash")]
+    ['left', 'a', '7', '7', 'space', 'right shift', '/']
     """
-    return KEYS.get(name.lower(), name.lower())
+    name = re.sub(r"^(key|digit|numpad)(?=.$)", "", code.lower())
+    return KEYS.get(name, name)
 
 
 @app.websocket("/screen/{channel}")
