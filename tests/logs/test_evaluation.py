@@ -218,3 +218,29 @@ def test_the_callback_is_called_after_every_step_that_counts_with_what_it_may_wa
 def test_a_mean_below_the_threshold_is_an_error():
     with pytest.raises(AssertionError, match=r"mean return 3.00 is not above reward_threshold=5.00"):
         rejeu.evaluate_policy(Still(), Counter(), 1, reward_threshold=5.0)
+
+
+def test_each_episode_keeps_the_goal_that_it_had():
+    class Plane(Reach):
+        """A goal in a plane, whose first number is the seed."""
+
+        observation_space = gym.spaces.Dict(
+            {
+                key: gym.spaces.Box(-20.0, 20.0, (4,), np.float32)
+                for key in ("observation", "achieved_goal", "desired_goal")
+            }
+        )
+
+        def reset(self, *, seed=None, options=None):
+            _, info = super().reset(seed=seed)
+            self.goal = np.array([-1.0 if seed is None else seed, 2, 3, 4], np.float32)
+            return self._observe(), info
+
+        def _observe(self):
+            position = np.repeat(self.position, 4)
+            return {"observation": position, "achieved_goal": position, "desired_goal": self.goal}
+
+    envs = InProcess([Plane(), Plane()])
+    result = evaluate(lambda obs, began: np.zeros((2, 1), np.float32), envs, 3, seed=5)
+    assert result.goals.tolist() == [[5, 2, 3], [6, 2, 3], [-1, 2, 3]]
+    assert evaluate(lambda obs, began: np.zeros((1, 1), np.float32), InProcess([Reach()]), 1).goals.shape == (0, 0)

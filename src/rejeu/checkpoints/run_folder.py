@@ -56,6 +56,8 @@ class RunFolder:
     """The learning curve."""
     replays = File("replays.csv")
     """Episodes of the trained agent, one row each; read by :mod:`rejeu.lab.runs.read`."""
+    goals = File("goals.csv")
+    """Goals of the newest episodes of evaluations, one row each, and whether they were reached."""
     report = File("report.html")
     """The page about the run."""
     warnings = File("warnings.txt")

@@ -28,6 +28,8 @@ class Drawing(ABC):
 
     fps: float
     """Frames per second at which an episode is shown."""
+    camera: np.ndarray | None = None
+    """How goals are projected into the picture, as :func:`rejeu.envs.goal_camera.goal_camera` returns it."""
 
     @abstractmethod
     def draw(self, scene: Scene) -> np.ndarray | None:

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import DTypeLike
 
 from rejeu.core.errors import BadEnvironmentError
+from rejeu.core.types import Observation
 from rejeu.envs.validation import describe_value
 
 PARKING_WEIGHTS = np.array([1.0, 0.3, 0.0, 0.0, 0.02, 0.02])
 """Weights of x, y, vx, vy, cos h, sin h in highway-env's ``parking-v0`` (1.12, default configuration)."""
 PARKED = -0.12
 """Reward above which a vehicle is parked there, and the episode ends."""
+
+MOST_PARTS = 3
+"""Numbers of a goal that are kept of each episode: enough for a place in space."""
 
 NUMBERS = {bool, int, float, np.bool_, np.float32, np.float64}
 """Types of one number that functions of goals usually return."""
@@ -36,6 +40,13 @@ def parking_reward(achieved: np.ndarray, desired: np.ndarray, infos: object = No
     which does not include the -5 that ``step`` adds on a collision either. Infos have no effect.
     """
     return -np.sqrt(np.abs(achieved - desired) @ PARKING_WEIGHTS.astype(achieved.dtype))
+
+
+def goals_in(obs: Observation, n: int) -> np.ndarray | None:
+    """Returns the first two or three numbers of the desired goals in ``n`` observations, ``(n, 2 or 3)``; None without two."""
+    desired = obs.get("desired_goal") if isinstance(obs, Mapping) else None
+    numbers = np.zeros((n, 0)) if desired is None else np.reshape(desired, (n, -1))[:, :MOST_PARTS].astype(float)
+    return numbers if numbers.shape[1] > 1 else None
 
 
 def goal_functions(env: Any) -> GoalFunctions | None:

@@ -1,8 +1,8 @@
 """Curves and histograms as plain data: smoothed here, drawn by Plotly in pages and by matplotlib in pictures.
 
 A chart is a dictionary of JSON values: titles ``x`` and ``y``, ``percent`` for shares, ``range`` of the vertical axis,
-``note`` and ``series``. A series has ``kind`` ("dots", "line", "points", "band", "marks" or "area"), ``name``, ``color``,
-``x`` (steps), ``t`` (minutes) and ``y``, with ``low`` and ``high`` for a band or error bars.
+``note`` and ``series``. A series has ``kind`` ("dots", "line", "points", "band", "marks", "area" or "places"), ``name``,
+``color``, ``x`` (steps), ``t`` (minutes) and ``y``, with ``low`` and ``high`` for a band or error bars.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rejeu.logs import statistics
+from rejeu.logs.formatting import counted
 from rejeu.logs.tables import HUGE, Table
 
 MAX_DOTS = 1500
@@ -326,41 +327,113 @@ def histogram(
     }
 
 
+class GoalPlace(NamedTuple):
+    """Goals that are close together."""
+
+    rows: np.ndarray
+    """Of the episodes, ``int (n,)``."""
+    goal: np.ndarray
+    """The mean of the goals."""
+    rate: float
+    """The share of the episodes in which the goal was reached."""
+
+
+PLACES = 24
+"""Goals are one place if they are closer than about this fraction of the extent of all."""
+OUTCOMES = (
+    ("always reached", "good", "circle", "\N{BLACK CIRCLE}"),
+    ("sometimes", "accent", "diamond", "\N{BLACK DIAMOND}"),
+    ("never", "bad", "x", "\N{MULTIPLICATION SIGN}"),
+)
+"""Names, colors, shapes and signs of places where all, some or none of the episodes reached the goal."""
+
+
+def goal_places(goals: np.ndarray, success: np.ndarray) -> list[GoalPlace]:
+    """Returns the places of goals ``(n, k)``, and the shares of episodes that reached them; ``success`` is 1 or 0."""
+    extent = np.ptp(goals, axis=0).max()
+    cells = np.floor((goals - goals.min(0)) * (PLACES / (extent or 1.0)) + 0.5)
+    numbers = np.unique(cells, axis=0, return_inverse=True)[1].reshape(-1)
+    places = [np.flatnonzero(numbers == i) for i in range(numbers.max() + 1)]
+    return [GoalPlace(rows, goals[rows].mean(0), float(np.mean(success[rows] > 0.5))) for rows in places]
+
+
 def goal_chart(episodes: Table) -> Chart | None:
-    """Returns a map of goals, by their first two numbers: those that were reached, and those that were not; None without any.
+    """Returns a map of goals by their first two numbers: which share of the episodes reached each place; None without any.
+
+    Its ``places`` have the mean ``goal`` and the ``seeds`` of their episodes, as far as they are known.
 
     Args:
-        episodes: with the columns ``goal_0``, ``goal_1`` and ``success``.
+        episodes: with the columns ``goal_0``, ``goal_1`` and ``success``; others are ``goal_2`` and ``seed``.
     """
-    x, y, success = (episodes.column(name) for name in ("goal_0", "goal_1", "success"))
-    is_known = usable(x) & usable(y) & np.isfinite(success)
-    if not is_known.any():
+    names = [name for name in ("goal_0", "goal_1", "goal_2") if name in episodes.columns]
+    goals, success = np.array([episodes.column(name) for name in names]).T, episodes.column("success")
+    rows = np.flatnonzero(usable(goals).all(1) & np.isfinite(success)) if len(names) > 1 else np.zeros(0, int)
+    if not len(rows):
         return None
+    goals, places = goals[rows], goal_places(goals[rows], success[rows])
+    outcomes = np.array([0 if spot.rate == 1.0 else 2 if spot.rate == 0.0 else 1 for spot in places])
     shown_series = []
-    for name, color, at in (
-        ("reached", "good", is_known & (success > 0.5)),
-        ("not reached", "bad", is_known & (success <= 0.5)),
-    ):
-        if at.any():
-            where = {"x": plain(x[at]), "t": plain(x[at]), "y": plain(y[at])}
-            shown_series.append({"kind": "points", "name": f"{name} ({at.sum():,})", "color": color, **where})
-    axes = {"x": "first number of the goal", "y": "second number", "percent": False}
+    for i, (name, color, symbol, sign) in enumerate(OUTCOMES):
+        at = np.flatnonzero(outcomes == i)
+        x, y = np.array([places[j].goal for j in at]).reshape(len(at), -1)[:, :2].T if len(at) else ((), ())
+        texts = [f"{100 * places[j].rate:.0f} % of {counted(len(places[j].rows), 'episode')}" for j in at]
+        marks = {
+            "symbol": symbol,
+            "sign": sign,
+            "text": texts,
+            "places": at.tolist(),
+            "x": plain(x),
+            "t": plain(x),
+            "y": plain(y),
+        }
+        shown_series += (
+            [{"kind": "places", "name": f"{name} ({len(at):,})", "color": color, **marks}] if len(at) else []
+        )
+    seeds, step = episodes.column("seed")[rows], episodes.column("step")[rows]
+    last = "" if np.isnan(step).all() else f", evaluated up to step {np.nanmax(step):,.0f}"
+    rate = f"{100 * np.mean(success[rows] > 0.5):.0f} % of {counted(len(rows), 'episode')} reached the goal{last}"
     return {
-        **axes,
-        "range": fit(y[:0], y[is_known]),
-        "x_range": fit(x[:0], x[is_known]),
+        **{"x": "number 1 of the goal", "y": "number 2 of the goal", "percent": False, "is_equal": True},
+        "range": fit(goals[:0, 1], goals[:, 1]),
+        "x_range": fit(goals[:0, 0], goals[:, 0]),
         "series": shown_series,
-        "note": "",
+        "note": rate,
+        "places": [{"goal": spot.goal.tolist(), "seeds": plain(seeds[spot.rows])} for spot in places],
     }
 
 
-def value_chart(values: np.ndarray, to_go: np.ndarray) -> Chart:
-    """Returns the chart of the critic's values along an episode and of the discounted returns; either may be empty."""
+def on_picture(chart: Chart, pixels: np.ndarray, picture: str, size: tuple[int, int]) -> Chart:
+    """Returns a map of goals on a picture of the environment; unchanged if no goal is in it.
+
+    Args:
+        chart: of :func:`goal_chart`.
+        pixels: x and y of its places in the picture, ``(n, 2)``.
+        picture: its address.
+        size: width and height in pixels.
+    """
+    if not ((pixels >= 0) & (pixels <= size)).all(1).any():
+        return chart
+    placed = []
+    for series in chart["series"]:
+        x, y = plain(pixels[series["places"], 0]), plain(pixels[series["places"], 1])
+        placed.append({**series, "x": x, "t": x, "y": y})
+    axes = {"x": "", "y": "", "x_range": [0, size[0]], "range": [size[1], 0]}
+    return {**chart, **axes, "series": placed, "picture": picture}
+
+
+def value_chart(values: np.ndarray, to_go: np.ndarray, expected: float | None = None) -> Chart:
+    """Returns the chart of the critic's values along an episode and of the discounted returns; either may be empty.
+
+    ``expected`` is what the critic expected when a time limit cut the episode, NaN without a critic; None if none did.
+    """
     lines = {"discounted return from here on": ("line", to_go), "what the critic expects": ("accent", values)}
     shown_series = []
     for name, (color, line) in lines.items():
         at = thinned(len(line))
         shown_series += [series("line", name, color, at, at, line[at])] if len(at) else []
+    if expected is not None:
+        end, value = [max(len(values), len(to_go))], expected if math.isfinite(expected) else 0.0
+        shown_series.append(series("points", "cut by the time limit", "bad", end, end, [value]))
     return {"x": "step of the episode", "y": "", "percent": False, "range": None, "series": shown_series, "note": ""}
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,6 +15,7 @@ from rejeu.core import interrupt, xla
 from rejeu.core.spaces import scale_action
 from rejeu.core.types import JsonObject, Observation
 from rejeu.envs.base import VectorEnv
+from rejeu.envs.goals import goals_in
 from rejeu.logs import statistics
 from rejeu.logs.formatting import counted, html_table
 
@@ -38,6 +39,9 @@ class Evaluation:
     NaN."""
     cut: int = 0
     """How many of the episodes did not end and were cut off after :data:`MOST_STEPS` steps."""
+    goals: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    """The first numbers of the desired goal of each episode, ``(n, 2)`` or ``(n, 3)``, as
+    :func:`rejeu.envs.goals.goals_in` returns them; ``(0, 0)`` if they are unknown."""
 
     @property
     def n(self) -> int:
@@ -175,6 +179,7 @@ def evaluate(
     total, length = np.zeros(env.n_envs), np.zeros(env.n_envs, int)
     longest = max(MOST_STEPS, env.max_episode_steps or 0)
     rows: list[tuple[float, int, float]] = []
+    goals: list[np.ndarray] = []
     cut = 0
     obs, done = env.reset(seed), np.ones(env.n_envs, bool)
     while to_play.any():
@@ -185,8 +190,11 @@ def evaluate(
         length += 1
         done = step.terminated | step.truncated
         endless = ~done & (to_play > 0) & (length >= longest)
-        for i in np.flatnonzero(done | endless).tolist():
+        ended = np.flatnonzero(done | endless).tolist()
+        desired = goals_in(step.obs, env.n_envs) if ended else None
+        for i in ended:
             if to_play[i]:
+                goals += [] if desired is None else [desired[i]]
                 value = step.return_of(i, total[i])
                 rows.append((value, length[i], env.judge(step, i, value, success_threshold)))
                 to_play[i] = 0 if endless[i] or xla.clock() >= end else to_play[i] - 1
@@ -196,7 +204,8 @@ def evaluate(
     returns, lengths, successes = zip(*rows, strict=True)
     if cut:
         cut_off(cut)
-    return Evaluation(np.array(returns), np.array(lengths), np.array(successes), cut)
+    desired_goals = np.array(goals) if goals else np.zeros((0, 0))
+    return Evaluation(np.array(returns), np.array(lengths), np.array(successes), cut, desired_goals)
 
 
 def cut_off(n: int) -> None:

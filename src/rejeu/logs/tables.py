@@ -68,6 +68,17 @@ def evaluation_table(evaluations: Iterable[tuple[int, Any]], episodes: Table = E
     return Table({"step": steps, **columns})
 
 
+def written(names: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """Returns rows as the text of a CSV file; numbers after the named columns are those of a goal.
+
+    >>> written(("step", "success"), [(10, 1.0, 0.5, 2.0)]).splitlines()
+    ['step,success,goal_0,goal_1', '10,1.0,0.5,2.0']
+    """
+    cells = [*rows]
+    goal = [f"goal_{i}" for i in range(len(cells[0]) - len(names))] if cells else []
+    return "".join(",".join(map(str, row)) + "\n" for row in ([*names, *goal], *cells))
+
+
 def flat(values: Mapping[str, object], prefix: str = "") -> Iterator[tuple[str, object]]:
     """Yields the values of nested mappings by dotted name. A schedule is one value.
 

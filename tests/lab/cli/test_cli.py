@@ -20,7 +20,6 @@ from rejeu.callbacks import Evaluate
 from rejeu.checkpoints import run_folder as folder
 from rejeu.lab import cli
 from rejeu.lab.cli import main
-from rejeu.lab.cli.report import goal_of
 from rejeu.lab.reporting.report.page import plotly_script
 from rejeu.lab.runs import config
 from rejeu.lab.runs.begin import untuned
@@ -692,8 +691,3 @@ def test_help_names_the_commands_and_python_m_rejeu_is_the_same_command(capsys):
     assert all(command in text for command in ("train", "evaluate", "record", "list", "--version"))
     done = subprocess.run([sys.executable, "-m", "rejeu", "--version"], capture_output=True, text=True, check=True)
     assert done.stdout == f"rejeu {rejeu.__version__}\n"
-
-
-def test_the_goal_of_a_replayed_episode_is_its_first_two_numbers():
-    assert goal_of({"desired_goal": np.array([[1, 2], [3, 4]]), "observation": 0}) == [1.0, 2.0]
-    assert [goal_of(obs) for obs in (np.zeros(3), {"desired_goal": 2}, {"a": 1})] == [[], [], []]

@@ -11,6 +11,7 @@ import pytest
 from filelock import FileLock
 
 from rejeu.callbacks.evaluate import Evaluated
+from rejeu.checkpoints.run_folder import RunFolder
 from rejeu.core import xla
 from rejeu.lab.cli import main
 from rejeu.lab.reporting import rows, run_list
@@ -24,7 +25,7 @@ from tests.lab.reporting.test_comparison import write_run
 def test_an_evaluation_is_a_row_with_its_own_values_in_each_column(tmp_path, capsys):
     evaluation = Evaluation(np.array([1.0, 5.0]), np.array([10, 30]), np.array([0.0, 1.0]))
     agent = SimpleNamespace(seconds={"total": 7.0}, last_saved=None, snapshot=lambda path: lambda: path)
-    report = output.reporter(agent, CsvFile(tmp_path / "table.csv"), tmp_path / "models", "seed 3: ")
+    report = output.reporter(agent, CsvFile(tmp_path / "table.csv"), RunFolder(tmp_path), "seed 3: ")
     report(Evaluated(40, evaluation), True)
     (row,) = csv.DictReader((tmp_path / "table.csv").read_text().splitlines())
     expected = {"step": 40, "seconds": 7, "success_rate": 0.5, "mean_return": 3, "std_return": 2}
@@ -32,6 +33,20 @@ def test_an_evaluation_is_a_row_with_its_own_values_in_each_column(tmp_path, cap
     assert capsys.readouterr().out == "seed 3: step        40  success  50.0%  return 3.00  (best)\n"
     report(Evaluated(50, evaluation), False)
     assert "best" not in capsys.readouterr().out
+
+
+def test_goals_of_the_newest_episodes_of_evaluations_are_kept(tmp_path, monkeypatch):
+    monkeypatch.setattr(output, "MOST_GOALS", 3)
+    agent = SimpleNamespace(seconds={"total": 7.0}, last_saved=None, snapshot=lambda path: lambda: path)
+    agent.failed_writes = SimpleNamespace(attempt=lambda name, write, is_row: write())
+    run = RunFolder(write_run(tmp_path / "run", "DQN"))
+    report = output.reporter(agent, CsvFile(tmp_path / "table.csv"), run)
+    for step, success in ((40, 0.0), (80, 1.0)):
+        goals = np.array([[step, 1.0], [step, 2.0]])
+        report(Evaluated(step, Evaluation(np.ones(2), np.ones(2, int), np.full(2, success), goals=goals)), True)
+    rows = [[float(cell) for cell in row] for row in list(csv.reader(run.goals.read_text().splitlines()))[1:]]
+    assert rows == [[40, 0, 40, 2], [80, 1, 80, 1], [80, 1, 80, 2]]
+    assert run_list.read(run.path).goals.column("goal_1").tolist() == [2, 1, 2]
 
 
 def test_the_stopwatch_counts_from_its_start_and_compilation_is_what_the_clock_leaves_out(monkeypatch):

@@ -13,6 +13,7 @@ from rejeu.envs.canvas import Canvas, Drawing, Scene
 from rejeu.envs.functional.ball_drawing import BallDrawing
 from rejeu.envs.functional.parking import ROW_DISTANCE, spot
 from rejeu.envs.functional.point_maze import RADIUS, TOLERANCE
+from rejeu.envs.goal_camera import goal_camera
 from rejeu.envs.registry import make_env
 
 PAPER, INK, FAINT = (246, 246, 243), (52, 58, 70), (214, 225, 240)
@@ -73,7 +74,9 @@ class ParkingLot(Drawing):
         vehicle.goal.heading = float(side) * np.pi / 2
         if scene.action is not None:
             vehicle.action = self.env.action_type.get_action(np.asarray(scene.action, np.float64))
-        return self.env.render()
+        picture = self.env.render()
+        self.camera = goal_camera(self.env)
+        return picture
 
     def close(self) -> None:
         self.env.close()
@@ -94,6 +97,8 @@ class Maze(Canvas):
         self.walls = env.walls
         self.n_rows, self.n_columns = self.walls.shape
         super().__init__((self.n_columns * self.CELL, self.n_rows * self.CELL), render_mode, "PointMaze", 10.0)
+        left, top = self._place(np.zeros(2))
+        self.camera = np.array([[self.CELL, 0.0, left], [0.0, -self.CELL, top], [0.0, 0.0, 1.0]])
 
     def paint(self, scene: Scene) -> None:
         draw, cell, state = self.pygame.draw, self.CELL, scene.states[-1]

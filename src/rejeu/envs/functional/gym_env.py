@@ -84,6 +84,11 @@ class GymnasiumEnv(gym.Env[Any, Any]):
         return self.functional.max_episode_steps
 
     @property
+    def goal_camera(self) -> np.ndarray | None:
+        """How goals are projected into the picture that was drawn last; None if that is unknown."""
+        return None if self._drawing is None else self._drawing.camera
+
+    @property
     def state(self) -> PyTree:
         """The state of the environment, None before the first reset."""
         return self._vector.state_of(0)

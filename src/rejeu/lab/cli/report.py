@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import webbrowser
-from collections.abc import Mapping
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from rejeu.checkpoints.run_folder import RunFolder, find_model
 from rejeu.core import atomic
-from rejeu.core.types import Observation
 from rejeu.core.validation import whole
 from rejeu.lab.cli.commands import Report
 from rejeu.lab.reporting.report import write_report
+from rejeu.logs.tables import written
 
 SUFFIXES = (".html", ".htm")
 
@@ -58,14 +55,6 @@ def replay(path: Path, arguments: Report) -> None:
     with closing(environment_of(model, arguments).make()) as env:
         for seed in range(whole("--replay", arguments.replay, least=1)):
             played = agent.evaluate(1, env=env, seed=seed)
-            goal = goal_of(env.reset(seed=seed)[0])
-            rows.append([seed, played.mean_return, f"{played.mean_length:.0f}", played.success_rate, *goal])
-    head = ["seed", "return", "length", "success", *(f"goal_{i}" for i in range(len(rows[0]) - 4))]
-    atomic.write(RunFolder(path).replays, "".join(",".join(map(str, row)) + "\n" for row in [head, *rows]))
-
-
-def goal_of(obs: Observation) -> list[float]:
-    """Returns the first two numbers of the goal in an observation, empty if there is none."""
-    goal = obs.get("desired_goal") if isinstance(obs, Mapping) else None
-    values = [] if goal is None else np.ravel(goal)[:2].astype(float).tolist()
-    return values if len(values) == 2 else []
+            goals = played.goals[0] if len(played.goals) else ()
+            rows.append([seed, played.mean_return, f"{played.mean_length:.0f}", played.success_rate, *goals])
+    atomic.write(RunFolder(path).replays, written(["seed", "return", "length", "success"], rows))

@@ -103,7 +103,7 @@ class RowReader:
                 raise ValueError("its name is not UTF-8; rename the folder")
             run = run_list.read(path, table_only=True)
             row = describe(run)
-            run = replace(run, episodes=EMPTY, evaluations=EMPTY, metrics=EMPTY, replays=EMPTY)
+            run = replace(run, episodes=EMPTY, evaluations=EMPTY, metrics=EMPTY, goals=EMPTY, replays=EMPTY)
         except Exception as error:  # files can hold anything, and one run may not hide the others
             row = {**nothing(path, "damaged"), "notes": (shown(str(error) or repr(error), 300),)}
         now = time.monotonic()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 import warnings
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
@@ -25,8 +26,11 @@ from rejeu.lab.runs.read import RunSummary, read_warnings
 from rejeu.lab.runs.requests import keep_model
 from rejeu.logs.formatting import counted, quoted
 from rejeu.logs.logging import Sink
+from rejeu.logs.tables import written
 
 echo = partial(print, flush=True)
+MOST_GOALS = 100
+"""Newest episodes of evaluations whose goals are kept."""
 
 
 class Stopwatch:
@@ -57,8 +61,9 @@ def header(config: DecidedRun, environment: Environment, backend: str, folder: R
     )
 
 
-def reporter(agent: Agent, table: Sink, models: Path, label: str = "") -> Callable[[Evaluated, bool], None]:
-    """Returns a function that prints an evaluation, after ``label``, adds it to a table, and keeps its model in a folder."""
+def reporter(agent: Agent, table: Sink, folder: RunFolder, label: str = "") -> Callable[[Evaluated, bool], None]:
+    """Returns a function that prints an evaluation, after ``label``, adds it to a table, and keeps its model and goals."""
+    recent: deque[list[float]] = deque(maxlen=MOST_GOALS)
 
     def report(result: Evaluated, is_best: bool) -> None:
         evaluation = result.evaluation
@@ -74,7 +79,12 @@ def reporter(agent: Agent, table: Sink, models: Path, label: str = "") -> Callab
                 "best": int(is_best),
             },
         )
-        keep_model(agent, models, result.step)
+        keep_model(agent, folder.models, result.step)
+        rows = zip(evaluation.successes.tolist(), evaluation.goals.tolist(), strict=False)
+        recent.extend([result.step, success, *goal] for success, goal in rows)
+        if recent:
+            write = partial(atomic.write, folder.goals, written(("step", "success"), recent))
+            agent.failed_writes.attempt(f"goals {folder.goals}", write, is_row=True)
         success = "" if math.isnan(evaluation.success_rate) else f"success {evaluation.success_rate:6.1%}  "
         echo(
             f"{label}step {result.step:>9,}  {success}return {evaluation.mean_return:,.2f}{'  (best)' if is_best else ''}"

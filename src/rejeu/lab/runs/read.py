@@ -74,6 +74,8 @@ class RunSummary:
     ``best``."""
     metrics: Table = EMPTY
     """Columns ``step``, ``rollout/...``, ``time/...``, ``train/...``."""
+    goals: Table = EMPTY
+    """Columns ``step``, ``success``, ``goal_0`` ...: the newest episodes of evaluations in goal environments."""
     replays: Table = EMPTY
     """Columns ``seed``, ``return``, ``length``, ``success``: episodes of the trained agent, each from its seed."""
     warnings: tuple[str, ...] = ()
@@ -150,7 +152,7 @@ def read_run(path: str | Path, columns: Collection[str] | None = None) -> RunSum
     metrics, evaluations = (ordered(read_table(path)) for path in (files.metrics, files.evaluations))
     metrics = statistics_rows(metrics)
     episodes = ordered(read_table(files.episodes, columns))
-    replays = read_table(files.replays) if is_file(files.replays) else EMPTY
+    goals, replays = (read_table(path) if is_file(path) else EMPTY for path in (files.goals, files.replays))
     tables = (episodes, metrics, evaluations)
     last_steps = [int(table.column("step")[-1]) for table in tables if len(table)]
     times = (episodes.column("seconds"), metrics.column("time/time_elapsed"), evaluations.column("seconds"))
@@ -164,11 +166,12 @@ def read_run(path: str | Path, columns: Collection[str] | None = None) -> RunSum
         episodes=episodes,
         evaluations=evaluations,
         metrics=metrics,
+        goals=goals,
         replays=replays,
         warnings=read_warnings(files.warnings),
         videos=tuple(find_videos(files)),
         models=tuple(path for path in (files.best, files.agent) if is_file(path)),
-        notes=(*notes, *(note for table in (*tables, replays) for note in table.notes)),
+        notes=(*notes, *(note for table in (*tables, goals, replays) for note in table.notes)),
     )
     state = state_of(run)
     if state == "running":  # in its first seconds nothing was written

@@ -210,7 +210,7 @@ class Session(NamedTuple):
         """Returns the callback that evaluates, and all callbacks of the run."""
         agent, config, folder = self.agent, self.config, self.folder
         table = CsvFile(folder.evaluations, None if self.is_new else agent.num_timesteps)
-        report = reporter(agent, GuardedSink(table, agent.failed_writes), folder.models, self.label)
+        report = reporter(agent, GuardedSink(table, agent.failed_writes), folder, self.label)
         every, episodes = config.evaluate_every, config.evaluate_episodes
         evaluate = Evaluate(self.evaluation_env, every, episodes, folder.best, report=report)
         is_pause_due = pause(agent, self.limits)

@@ -249,10 +249,48 @@ def test_goals_of_replayed_episodes_are_a_map(tmp_path):
     rows = "0,5,5,1,1.0,2.0\n1,5,5,0,3.0,4.0\n2,5,5,1,-1.0,0.5\n3,5,5,nan,9,9\n4,5,5,1,nan,9\n"
     (folder / "replays.csv").write_text(f"seed,return,length,success,goal_0,goal_1\n{rows}", encoding="utf-8")
     chart = data_of(text_of(folder))["charts"]["run0-goals"]
-    assert [(one["name"], one["color"], one["x"], one["y"]) for one in chart["series"]] == [
-        ("reached (2)", "good", [1, -1], [2, 0.5]),
-        ("not reached (1)", "bad", [3], [4]),
+    assert [
+        (one["name"], one["color"], one["symbol"], {*zip(one["x"], one["y"], strict=True)}) for one in chart["series"]
+    ] == [
+        ("always reached (2)", "good", "circle", {(1, 2), (-1, 0.5)}),
+        ("never (1)", "bad", "x", {(3, 4)}),
     ]
+    assert chart["note"] == "67 % of 3 episodes reached the goal"
+
+
+def test_one_failure_does_not_hide_the_successes_at_its_place():
+    goals = np.array([[0.0, 0.0]] * 5 + [[10.0, 0.0]] * 2)
+    success = np.array([1.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
+    columns = {"seed": np.arange(7.0), "success": success, "goal_0": goals[:, 0], "goal_1": goals[:, 1]}
+    chart = charts.goal_chart(Table(columns))
+    assert [(one["symbol"], one["x"], one["text"]) for one in chart["series"]] == [
+        ("diamond", [0], ["80 % of 5 episodes"]),
+        ("x", [10], ["0 % of 2 episodes"]),
+    ]
+    assert [chart["places"][one["places"][0]]["seeds"] for one in chart["series"]] == [[0, 1, 2, 3, 4], [5, 6]]
+
+
+def test_goals_of_the_newest_evaluations_are_a_map_too(tmp_path):
+    folder = write(tmp_path / "run")
+    (folder / "goals.csv").write_text(
+        "step,success,goal_0,goal_1,goal_2\n8000,1,1,2,5\n9000,0,3,4,6\n", encoding="utf-8"
+    )
+    chart = data_of(text_of(folder))["charts"]["run0-evaluated_goals"]
+    assert chart["note"] == "50 % of 2 episodes reached the goal, evaluated up to step 9,000"
+    assert sorted(place["goal"] for place in chart["places"]) == [[1, 2, 5], [3, 4, 6]]
+
+
+def test_a_map_is_drawn_on_a_picture_if_a_goal_is_in_it():
+    columns = {"success": np.ones(2), "goal_0": np.array([0.0, 9.0]), "goal_1": np.array([0.0, 9.0])}
+    chart = charts.goal_chart(Table(columns))
+    at = {tuple(place["goal"]): i for i, place in enumerate(chart["places"])}
+    pixels = np.zeros((2, 2))
+    pixels[at[0.0, 0.0]], pixels[at[9.0, 9.0]] = (30, 40), (np.nan, np.nan)
+    drawn = charts.on_picture(chart, pixels, "data:,", (60, 50))
+    assert (drawn["picture"], drawn["x_range"], drawn["range"]) == ("data:,", [0, 60], [50, 0])
+    (series,) = drawn["series"]
+    assert {*zip(series["x"], series["y"], strict=True)} == {(30, 40), (None, None)}
+    assert charts.on_picture(chart, pixels + 60, "data:,", (60, 50)) == chart
 
 
 def test_value_of_an_episode_is_drawn_beside_what_followed():

@@ -134,6 +134,7 @@ def charts_of(run: RunSummary, prefix: str) -> tuple[dict[str, Chart], list[Char
     for i, (name, chart) in enumerate(chart_data.metric_charts(run.metrics).items()):
         curves.append((chart_data.group_of(name), f"metric{i}", shown(name), chart))
     curves.append((GOALS, "goals", "Goals of the trained agent", chart_data.goal_chart(run.replays)))
+    curves.append((GOALS, "evaluated_goals", "Goals of the newest evaluations", chart_data.goal_chart(run.goals)))
     curves.append((TIME, "time", "Shares of the time", chart_data.time_chart(run.metrics)))
     charts: dict[str, Chart] = {}
     groups: dict[str, list[ChartEntry]] = {heading: [] for heading in (CURVES, GOALS, *chart_data.GROUPS, TIME)}

@@ -56,6 +56,11 @@ const RejeuCharts = (() => {
           marker: { color: own, size: 8, line: { color: color("card"), width: 1.5 } },
           error_y: { ...bars, color: own, thickness: 1.3, width: 0, visible: Boolean(series.low) },
         });
+      } else if (series.kind === "places") {
+        found.push({
+          ...common, y: series.y, mode: "markers", customdata: series.places, text: series.text.map(plain), hovertemplate: "%{text}<extra></extra>",
+          marker: { color: own, size: 13, symbol: series.symbol, line: { color: color("card"), width: 1.5 } },
+        });
       } else if (series.kind === "band") {
         const keep = x.map((_, i) => i).filter((i) => series.low[i] != null && series.high[i] != null);
         const edge = { ...common, x: keep.map((i) => x[i]), mode: "lines", line: { width: 0 }, hoverinfo: "skip", hovertemplate: undefined };
@@ -69,7 +74,8 @@ const RejeuCharts = (() => {
   }
 
   // Draws a chart over steps (axis "x") or minutes ("t"), and its legend into the box if there is one.
-  function draw(element, chart, axis, box) {
+  // A click on a place of a map calls choose with its number.
+  function draw(element, chart, axis, box, choose) {
     if (!switchedOff.has(element)) switchedOff.set(element, new Set());
     const hidden = switchedOff.get(element);
     const stacked = chart.series.some((series) => series.kind === "area");
@@ -77,11 +83,22 @@ const RejeuCharts = (() => {
     if (!chart.small) more.x = chart.x ?? (axis === "x" ? "environment steps" : "minutes of training");
     const last = Math.max(0, ...chart.series.map((series) => series[axis].findLast((x) => x != null) ?? 0));
     more.range = chart.x_range ?? (last > 0 ? [0, last * (stacked ? 1 : 1.02)] : undefined);
-    Plotly.react(element, traces(chart, axis, hidden), layout(chart, more), bare);
-    if (box) legend(element, chart, axis, box, hidden);
+    const axes = layout(chart, more);
+    if (chart.is_equal) Object.assign(axes.yaxis, { scaleanchor: "x", constrain: "domain" });
+    if (chart.is_equal) axes.xaxis.constrain = "domain";
+    if (chart.picture) {
+      const [sizex, sizey] = [chart.x_range[1], chart.range[0]];
+      axes.images = [{ source: chart.picture, xref: "x", yref: "y", x: 0, y: 0, sizex, sizey, sizing: "stretch", layer: "below" }];
+      Object.assign(axes.xaxis, { visible: false });
+      Object.assign(axes.yaxis, { visible: false });
+    }
+    const isNew = !element.classList.contains("js-plotly-plot");
+    Plotly.react(element, traces(chart, axis, hidden), axes, bare);
+    if (isNew && choose) element.on("plotly_click", (event) => event.points[0].customdata === undefined || choose(event.points[0].customdata));
+    if (box) legend(element, chart, axis, box, hidden, choose);
   }
 
-  function legend(element, chart, axis, box, hidden) {
+  function legend(element, chart, axis, box, hidden, choose) {
     const focused = [...box.children].indexOf(document.activeElement);
     box.replaceChildren();
     chart.series.forEach((series, number) => {
@@ -92,10 +109,11 @@ const RejeuCharts = (() => {
       button.setAttribute("aria-pressed", String(!hidden.has(number)));
       sign.className = series.kind;
       sign.style.background = series.kind === "band" ? faded(series.color, 0.35) : color(series.color);
+      if (series.sign) Object.assign(sign, { textContent: series.sign, style: `color: ${color(series.color)}` });
       button.append(sign, series.name);
       button.addEventListener("click", () => {
         if (!hidden.delete(number)) hidden.add(number);
-        draw(element, chart, axis, box);
+        draw(element, chart, axis, box, choose);
       });
       box.append(button);
     });
