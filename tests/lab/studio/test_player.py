@@ -1,10 +1,12 @@
 """An agent that acts for those who watch: which policy, from which seed, and what is said when it cannot. No browser."""
 
 import json
+import math
 import os
 import threading
 import time
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -14,7 +16,7 @@ import rejeu
 from rejeu.checkpoints.run_folder import RunFolder
 from rejeu.lab.runs.arguments import RunOptions
 from rejeu.lab.studio import player
-from rejeu.lab.studio.player import BEST, LiveEpisode, LivePlayer
+from rejeu.lab.studio.player import BEST, GoalView, LiveEpisode, LivePlayer
 from tests.lab.reporting.report.folders import write
 
 
@@ -64,10 +66,11 @@ def test_the_last_policy_acts_then_the_one_that_is_chosen_from_its_seed(watched,
     for model in (BEST, "step_000000000021"):
         one.choose(model, 7)
         until(lambda model=model: one.episode.model == model and one.episode.is_over)
-        assert (one.episode.seed, one.episode.step) == (7, 21)
+        episode = one.episode
+        assert (episode.seed, episode.step) == (7, 21)
         expected = agents[1].evaluate(1, env="CartPole-v1", seed=7)
-        assert sum(one.episode.rewards) == expected.mean_return
-        assert len(one.episode.values) == len(one.episode.rewards)
+        assert sum(episode.rewards) == expected.mean_return
+        assert len(episode.values) == len(episode.rewards)
     one.close()
     until(lambda: not one._thread.is_alive())
 
@@ -166,3 +169,63 @@ def test_it_yields_to_training(watched):
     assert os.getpriority(os.PRIO_PROCESS, one._thread.native_id) == min(
         os.getpriority(os.PRIO_PROCESS, 0) + player.NICE, 19
     )
+
+
+def test_a_pause_waits_for_each_step(watched):
+    one, shown = watched
+    until(lambda: shown)
+    one.is_paused = True
+    one.choose(BEST, 3)
+    until(lambda: one.episode.model == BEST and len(shown) > 1 and shown[-1][1]["bars"])
+    for n in (1, 2):
+        one.step()
+        until(lambda n=n: len(one.episode.rewards) == n)
+        time.sleep(2 * player.PAUSED)
+        assert len(one.episode.rewards) == n
+    assert [bar["name"] for bar in shown[-1][1]["bars"]] == ["left", "right"]
+    one.is_paused = False
+    until(lambda: one.episode.is_over or one.episode.seed != 3)
+
+
+def test_slow_motion_takes_more_time_between_two_steps(folder, monkeypatch):
+    waits, wait = [], threading.Event.wait
+    monkeypatch.setattr(threading.Event, "wait", lambda event, time=None: waits.append(time) or wait(event, time))
+    one = LivePlayer(folder.path, RunOptions(), lambda *_: None)
+    one.speed = 0.1  # of the 50 steps a second of CartPole: one in 0.2 s
+    until(lambda: any(time is not None and 0.1 < time <= 0.2 for time in waits))
+    one.close()
+
+
+@pytest.mark.parametrize("limit", [3, 500])
+def test_an_episode_that_a_time_limit_cut_says_what_the_critic_still_expected(watched, folder, monkeypatch, limit):
+    one, shown = watched
+    monkeypatch.setattr(player, "for_agent", lambda agent, env: gym.wrappers.TimeLimit(env.unwrapped, limit))
+    one.choose(BEST, 1)
+    until(lambda: one.complete is not None and one.complete.seed == 1)
+    episode = one.complete
+    assert episode.is_cut is (limit == 3)
+    assert math.isfinite(episode.expected) is (limit == 3)
+    message = next(captions["message"] for _, captions in reversed(shown) if captions["message"])
+    assert message == player.end_of(episode)
+
+
+class Lots:
+    """An environment whose goal has the seed as its first number."""
+
+    def reset(self, seed):
+        return {"desired_goal": np.array([seed, 5.0, 6.0, 7.0])}, {}
+
+
+def test_the_seed_of_a_place_is_the_one_whose_goal_is_nearest():
+    assert player.nearest_seed(Lots(), [7.4, 5.0, 6.0]) == 7
+    assert player.nearest_seed(Lots(), [1e6, 5.0]) == player.SEEDS - 1
+
+
+def test_a_map_of_goals_is_drawn_on_the_picture_or_has_their_names():
+    chart = {"x": "", "y": "", "places": [{"goal": [1.0, 2.0]}], "series": [{"places": [0], "x": [1], "y": [2]}]}
+    picture = np.zeros((20, 30, 3), np.uint8)
+    camera = np.array([[10.0, 0, 0], [0, 5.0, 0], [0, 0, 1]])
+    drawn = GoalView(["height", "angle"], camera, picture).draw(chart)
+    assert (drawn["series"][0]["x"], drawn["series"][0]["y"], drawn["x_range"]) == ([10], [10], [0, 30])
+    named = GoalView(["height", "angle"], None, picture).draw(chart)
+    assert (named["x"], named["y"], named["series"]) == ("height", "angle", chart["series"])

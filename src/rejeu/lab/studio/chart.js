@@ -24,7 +24,7 @@ export default {
       const { plot, legend } = this.$refs;
       if (!this.chart || !plot || !plot.offsetWidth) return;
       if (this.chart.counts) RejeuCharts.histogram(plot, this.chart, this.chosen, (bar) => this.$emit("choose", bar));
-      else RejeuCharts.draw(plot, this.chart, this.axis, legend);
+      else RejeuCharts.draw(plot, this.chart, this.axis, legend, (place) => this.$emit("choose", place));
     },
   },
 };

@@ -21,7 +21,7 @@ class Figure(Element, component="chart.js"):
     Args:
         chart: as the functions of :mod:`rejeu.logs.charts` return it; None draws nothing yet.
         height: in CSS.
-        choose: called with the number of the bar of a histogram that was clicked.
+        choose: called with the number of the bar of a histogram, or of the place of a map, that was clicked.
     """
 
     def __init__(

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import base64
 import math
 import os
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import gymnasium as gym
+import jax
 import numpy as np
 
 from rejeu.agents import Agent, OnPolicyAgent, load
@@ -20,9 +23,12 @@ from rejeu.checkpoints.model_files import Counters
 from rejeu.checkpoints.run_folder import RunFolder
 from rejeu.core import checkpoint
 from rejeu.core.errors import one_line
+from rejeu.core.language import said
 from rejeu.core.records import convert
 from rejeu.core.types import Action, JsonObject, Observation, PyTree
 from rejeu.envs.base import success_of
+from rejeu.envs.goal_camera import goal_camera, goal_names, project
+from rejeu.envs.goals import goals_in
 from rejeu.envs.masks import for_agent
 from rejeu.envs.rendering import rgb_frame
 from rejeu.lab.runs import requests
@@ -30,6 +36,10 @@ from rejeu.lab.runs.arguments import RunOptions
 from rejeu.lab.runs.config import read_folder
 from rejeu.lab.runs.environment import from_run
 from rejeu.lab.runs.read import has_process, is_recent
+from rejeu.lab.studio.deciding import Bar, bars_of
+from rejeu.lab.studio.screen import jpeg
+from rejeu.logs import charts
+from rejeu.logs.charts import Chart
 from rejeu.logs.video import playback_fps
 
 LEAST_FPS = 20.0
@@ -38,11 +48,35 @@ MOST_FPS = 1000.0
 """Steps a second of environments that are faster."""
 RENEW = 2.0
 """Seconds between two looks for new weights, and two requests for them."""
+PAUSED = 0.05
+"""Seconds between two looks whether a pause has ended."""
 REST = 0.8
 """Seconds for which the end of an episode is shown."""
+SEEDS, SEARCH = 100, 2.0
+"""Most seeds that are tried for a goal, and seconds after which no further one is."""
 NICE = 10
 CURRENT, BEST = "current", "best"
 """The policy that is being trained, or the last one; and the one that evaluated best."""
+
+
+class GoalView(NamedTuple):
+    """The names of an environment's goals, and where they are in a picture of the start of an episode."""
+
+    names: list[str]
+    """Of the first two numbers of a goal."""
+    camera: np.ndarray | None
+    """As :func:`rejeu.envs.goal_camera.goal_camera` returns it."""
+    picture: np.ndarray
+    """``uint8 (height, width, 3)``."""
+
+    def draw(self, chart: Chart) -> Chart:
+        """Returns a map of goals on the picture, or with the names at its axes."""
+        if self.camera is None:
+            return {**chart, "x": self.names[0], "y": self.names[1]}
+        goals = np.array([goal_place["goal"] for goal_place in chart["places"]])
+        address = "data:image/jpeg;base64," + base64.b64encode(jpeg(self.picture)).decode()
+        height, width = self.picture.shape[:2]
+        return charts.on_picture(chart, project(self.camera, goals), address, (width, height))
 
 
 @dataclass
@@ -59,6 +93,12 @@ class LiveEpisode:
     """The critic's value of each step; empty without a critic."""
     success: float = math.nan
     is_over: bool = False
+    is_cut: bool = False
+    """Whether a time limit ended it."""
+    extents: list[float] = field(default_factory=list)
+    """Differences between the highest and the least value of the actions at each step that was shown."""
+    expected: float = math.nan
+    """The value that the critic expected beyond the time limit."""
 
     def to_go(self, gamma: float) -> np.ndarray:
         """Returns the discounted return from each step on."""
@@ -83,6 +123,8 @@ class LivePlayer:
         """The episode that is played, or was played last."""
         self.complete: LiveEpisode | None = None
         """The last episode that was played to its end."""
+        self.goal_view: GoalView | None = None
+        """None until the first episode has begun."""
         self.gamma = 1.0
         self.problem = ""
         """Why nothing is shown."""
@@ -91,16 +133,30 @@ class LivePlayer:
         self.model, self._next_seed = CURRENT, 0
         self.seed: int | None = None
         """From which its episodes begin; None for new ones."""
-        self._changed, self._closed = threading.Event(), threading.Event()
+        self.goal: Sequence[float] | None = None
+        """The goal near which that of its episodes is to be; None for any."""
+        self.speed = 1.0
+        """Multiplies the frames a second."""
+        self.is_paused = False
+        """Whether it waits before each step for :meth:`step`."""
+        self._changed, self._closed, self._stepped = threading.Event(), threading.Event(), threading.Event()
         self._renew_at, self._step = 0.0, 0
         self._stamp: object = None
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 
-    def choose(self, model: str, seed: int | None = None) -> None:
-        """Ends the episode; then a policy acts: "current", "best" or the name of a model; from a seed, or from a new one."""
-        self.model, self.seed = model, seed
+    def choose(self, model: str, seed: int | None = None, goal: Sequence[float] | None = None) -> None:
+        """Ends the episode; then a policy acts: "current", "best" or the name of a model; from a seed, or from a new one.
+
+        With a goal it is the seed, of the first hundred, whose goal is nearest.
+        """
+        self.model, self.seed, self.goal = model, seed, goal
         self._changed.set()
+
+    def step(self) -> None:
+        """Takes one step, and pauses before the next."""
+        self.is_paused = True
+        self._stepped.set()
 
     def close(self) -> None:
         """Ends the thread."""
@@ -129,6 +185,8 @@ class LivePlayer:
             agent, name = self._load(agent), self.model
             playing = for_agent(agent, env)
             self.gamma = float(getattr(agent.config, "gamma", 1.0))
+            if self.goal is not None:
+                self.seed, self.goal = nearest_seed(env, self.goal), None
             self.episode = LiveEpisode(name, self._next_seed if self.seed is None else self.seed, self._step)
             self._next_seed += self.seed is None
             self._play(agent, playing, self.episode)
@@ -139,8 +197,10 @@ class LivePlayer:
         """Plays one episode, with new weights as they come; another choice ends it."""
         obs, _ = env.reset(seed=episode.seed)
         fps, memory, due = max(min(playback_fps(env), MOST_FPS), LEAST_FPS), None, time.perf_counter()
-        stride, period = max(int(fps / LEAST_FPS), 1), 1 / fps
-        self._show(env, episode)
+        bars: Sequence[Bar] = ()
+        if self.goal_view is None:  # the first action may be compiled for seconds
+            self._show(env, episode, bars)
+            self.goal_view = GoalView(goal_names(env, 2), goal_camera(env), rgb_frame(env))
         while not (episode.is_over or self._changed.is_set() or self._closed.is_set()):
             if not self.is_seen:
                 time.sleep(0.1)
@@ -150,18 +210,33 @@ class LivePlayer:
                 episode.step = self._step
             action, following = agent.predict(obs, memory, deterministic=True)
             episode.values += value_of(agent, obs, memory, action)
+            stride = 1 if self.is_paused else max(int(fps * self.speed / LEAST_FPS), 1)
+            if len(episode.rewards) % stride == 0:
+                bars = bars_of(agent, env, (obs, memory, action), episode.extents)
+                self._show(env, episode, bars)
+            due = self._wait(due, 1 / (fps * self.speed))
             memory = following
             obs, reward, terminated, truncated, info = env.step(action)
             episode.rewards.append(float(reward))
-            episode.is_over = bool(terminated or truncated)
+            episode.is_over, episode.is_cut = bool(terminated or truncated), bool(truncated and not terminated)
             episode.success = success_of(info) if episode.is_over else math.nan
-            if episode.is_over or len(episode.rewards) % stride == 0:
-                self._show(env, episode)
-            due = max(due + period, time.perf_counter() - period)
-            self._changed.wait(max(due - time.perf_counter(), 0.0))
+        if episode.is_cut:
+            action, _ = agent.predict(obs, memory, deterministic=True)
+            episode.expected = (value_of(agent, obs, memory, action) or [math.nan])[0]
+        if episode.is_over:
+            self._show(env, episode, bars)
 
-    def _show(self, env: gym.Env, episode: LiveEpisode) -> None:
-        self.show([rgb_frame(env)], [caption(episode)])
+    def _wait(self, due: float, period: float) -> float:
+        """Waits until a step is due, and while it is paused; returns when the next one is."""
+        due = max(due + period, time.perf_counter() - period)
+        self._changed.wait(max(due - time.perf_counter(), 0.0))
+        while self.is_paused and not self._changed.is_set() and not self._stepped.wait(PAUSED):
+            due = time.perf_counter()
+        self._stepped.clear()
+        return due
+
+    def _show(self, env: gym.Env, episode: LiveEpisode, bars: Sequence[Bar]) -> None:
+        self.show([rgb_frame(env)], [{**caption(episode), "bars": [bar._asdict() for bar in bars]}])
 
     def _load(self, agent: Agent | None) -> Agent:
         """Returns the agent with the weights that are asked for; an older agent is given them if they have changed."""
@@ -175,8 +250,7 @@ class LivePlayer:
         elif stamp != self._stamp:
             agent.set_parameters(path)
         if stamp != self._stamp:
-            counters = convert(checkpoint.read_header(path, "agent").get("counters"), Counters)
-            self._step = counters.step - counters.steps_before
+            self._step = step_of(path)
         self._stamp = stamp
         return agent
 
@@ -198,6 +272,23 @@ class LivePlayer:
         raise FileNotFoundError("there is no model yet; the first is written within seconds or at the first evaluation")
 
 
+def nearest_seed(env: gym.Env, goal: Sequence[float]) -> int:
+    """Returns the seed from which an environment has the goal nearest to this one, of those that are tried in a moment."""
+    end, distances = time.monotonic() + SEARCH, []
+    for seed in range(SEEDS):
+        goals = goals_in(jax.tree.map(lambda leaf: np.asarray(leaf)[None], env.reset(seed=seed)[0]), 1)
+        distances.append(math.inf if goals is None else math.dist(goals[0, : len(goal)], goal[: goals.shape[1]]))
+        if time.monotonic() > end:
+            break
+    return int(np.argmin(distances))
+
+
+def step_of(model: Path) -> int:
+    """Returns the step of the training at which a model was saved."""
+    counters = convert(checkpoint.read_header(model, "agent").get("counters"), Counters)
+    return counters.step - counters.steps_before
+
+
 def value_of(agent: Agent, obs: Observation, memory: PyTree, action: Action) -> list[float]:
     """Returns the value that the critic gives to what the agent does, as a list that is empty without a critic."""
     algorithm = agent.learner.algorithm
@@ -208,14 +299,28 @@ def value_of(agent: Agent, obs: Observation, memory: PyTree, action: Action) -> 
 
 def caption(episode: LiveEpisode) -> JsonObject:
     """Returns the texts of the picture."""
-    ends = {1.0: "reached", 0.0: "not reached"}
     return {
-        "name": f"the policy at step {episode.step:,}",
-        "score": f"return {sum(episode.rewards):,.2f} · step {len(episode.rewards):,}",
-        "about": f"seed {episode.seed}",
-        "message": ends.get(episode.success, "the episode has ended") if episode.is_over else "",
+        "name": said("the policy at step {}", f"{episode.step:,}"),
+        "score": said("return {} · step {}", f"{sum(episode.rewards):,.2f}", f"{len(episode.rewards):,}"),
+        "about": said("seed {}", episode.seed),
+        "message": end_of(episode) if episode.is_over else "",
         "won": episode.success == 1.0,
     }
+
+
+def end_of(episode: LiveEpisode) -> str:
+    """Returns how an episode has ended.
+
+    >>> end_of(LiveEpisode("best", 0, 0, success=1.0)), end_of(LiveEpisode("best", 0, 0, is_cut=True, expected=2.5))
+    ('reached', 'the time limit cut the episode here; the critic expected 2.5 more')
+    """
+    if episode.success == 1.0:
+        return said("reached")
+    if episode.is_cut and math.isfinite(episode.expected):
+        return said("the time limit cut the episode here; the critic expected {} more", f"{episode.expected:,.4g}")
+    if episode.is_cut:
+        return said("the time limit cut the episode here")
+    return said("not reached" if episode.success == 0.0 else "the episode has ended")
 
 
 def lower_priority() -> None:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from nicegui import ui
 from rejeu.checkpoints.run_folder import RunFolder
 from rejeu.core import atomic
 from rejeu.core.errors import one_line
+from rejeu.core.language import said
 from rejeu.core.records import brief
 from rejeu.core.types import JsonObject
 from rejeu.lab.experiments.work import HIDDEN
@@ -32,12 +34,15 @@ from rejeu.lab.studio.player import BEST, CURRENT, LiveEpisode, LivePlayer, lowe
 from rejeu.lab.studio.runs import COLORS
 from rejeu.lab.studio.screen import CSS, Screen
 from rejeu.lab.studio.state import Studio
+from rejeu.lab.studio.then_and_now import ThenAndNow
 from rejeu.logs import charts
 from rejeu.logs.charts import Chart
 
 FIRST = (sections.CURVES, sections.GOALS)
 """Headings of the charts that are open; the others are folded."""
 REPLAYS = 100
+SLOW = 0.2
+"""Speed of slow motion."""
 READING = ThreadPoolExecutor(1, initializer=lower_priority)
 """Where runs are read; training goes first."""
 SEEN = """<script>document.addEventListener("visibilitychange", () => emitEvent("seen", !document.hidden));</script>"""
@@ -77,6 +82,8 @@ class RunPage:
         self.studio, self.name, self.path = studio, name, path
         self.figures: dict[str, Figure] = {}
         self.grids: dict[str, ui.element] = {}
+        self.maps: dict[str, Chart] = {}
+        self.map_notes: dict[str, ui.label] = {}
         self.row: Row | None = None
         self.due = 0.0
         self.is_ours = name in studio.summaries and is_file(RunFolder(path).config)
@@ -87,6 +94,8 @@ class RunPage:
             with ui.column().classes("gap-2").style("flex: 1 1 300px"):
                 self.tiles = ui.row().classes("gap-2 w-full")
                 self.values = Values() if self.is_ours else None
+        if self.is_ours:
+            ThenAndNow(RunFolder(path), studio.given(name))
         with ui.row().classes("items-center w-full"):
             self.axis = ui.toggle({"x": "steps", "t": "time"}, value="x", on_change=self.turn).props("dense no-caps")
         self.groups = ui.column().classes("w-full gap-2")
@@ -139,11 +148,37 @@ class RunPage:
                 with self.groups, ui.expansion(title, value=title in FIRST).classes("w-full"):
                     self.grids[title] = ui.element("div").classes("charts w-full")
             for entry in entries:
+                is_map = "places" in data[entry.id]
                 if entry.id not in self.figures:
                     with self.grids[title], ui.card().classes("card").props("flat bordered"):
                         ui.label(entry.title).classes("text-weight-medium text")
-                        self.figures[entry.id] = Figure()
-                self.figures[entry.id].show(data[entry.id], axis=self.axis.value)
+                        choose = partial(self.watch_goal, entry.id) if is_map else None
+                        self.figures[entry.id] = Figure(height="340px" if is_map else "240px", choose=choose)
+                        self.map_notes |= {entry.id: ui.label().classes("text-caption quiet")} if is_map else {}
+                if is_map:
+                    self.maps[entry.id] = data[entry.id]
+                    self.map_notes[entry.id].text = entry.note
+                else:
+                    self.figures[entry.id].show(data[entry.id], axis=self.axis.value)
+        self.show_maps()
+
+    def show_maps(self) -> None:
+        """Draws the maps of goals, on a picture of the environment where goals have a place in it."""
+        view = None if self.live is None else self.live.player.goal_view
+        for entry_id, chart in self.maps.items():
+            self.figures[entry_id].show(chart if view is None else view.draw(chart))
+
+    def watch_goal(self, entry_id: str, number: int) -> None:
+        """Shows an episode with a goal at a place of a map: the next one that was played, or of the current policy."""
+        places = self.maps[entry_id]["places"]
+        if self.live is None or not 0 <= number < len(places):
+            return
+        seed = next_seed(places[number]["seeds"], self.live.player.seed)
+        if seed is None:
+            self.live.choose(CURRENT, goal=places[number]["goal"])
+            ui.notify(said("The current policy acts from a start with the goal nearest to this place."))
+        else:
+            self.episodes.watch({"seed": seed})
 
     def turn(self) -> None:
         """Draws all charts over another axis."""
@@ -155,6 +190,16 @@ class RunPage:
         self.log.text = (
             processes.read_log(self.path) or "There is none: the studio did not start this run, nor a sweep."
         )
+
+
+def next_seed(seeds: Sequence[float | None], current: int | None) -> int | None:
+    """Returns the seed after the current one, or the first; None if none is known.
+
+    >>> next_seed([3.0, 7.0], 3), next_seed([3.0, 7.0], 7), next_seed([3.0, 7.0], None), next_seed([None], 3)
+    (7, 3, 3, None)
+    """
+    numbers = [int(seed) for seed in seeds if seed is not None]
+    return numbers[(numbers.index(current) + 1) % len(numbers) if current in numbers else 0] if numbers else None
 
 
 def read(path: Path) -> sections.Parts:
@@ -285,11 +330,26 @@ class LiveView:
             self.slider = ui.slider(min=0, max=0, value=0, on_change=self.chosen).props("label-always=false")
             self.label = ui.label().classes("quiet").style("min-width: 9em")
             action("best", None, lambda: self.choose(BEST))
+        with ui.row().classes("items-center gap-2"):
+            self.pause = action(said("pause"), "pause", self.turn_pause)
+            action(said("one step"), "skip_next", self.step)
+            slow = ui.checkbox(said("slow motion")).props("dense")
         self.player = LivePlayer(page.path, page.studio.given(page.name), self.screen.show)
+        slow.on_value_change(lambda event: setattr(self.player, "speed", SLOW if event.value else 1.0))
         self.screen.on_leave = self.player.close
         ui.add_body_html(SEEN)
         ui.on("seen", lambda event: setattr(self.player, "is_seen", bool(event.args)))
         ui.timer(EVERY, self.look)
+
+    def step(self) -> None:
+        """Takes one step."""
+        self.player.step()
+        self.name()
+
+    def turn_pause(self) -> None:
+        """Pauses, or goes on."""
+        self.player.is_paused = not self.player.is_paused
+        self.name()
 
     def look(self) -> None:
         """Offers policies that are new, and shows what the critic expected."""
@@ -302,12 +362,15 @@ class LiveView:
             self.slider.value = value
         self.name()
         self.status.text = self.player.problem
+        self.page.show_maps()
         if self.page.values is not None:
             self.page.values.show(self.player.complete or self.player.episode, self.player.gamma)
 
     def name(self) -> None:
         """Says which policy the slider is at."""
-        model = self.player.model
+        model, is_paused = self.player.model, self.player.is_paused
+        self.pause.text = said("continue") if is_paused else said("pause")
+        self.pause.props(f"icon={'play_arrow' if is_paused else 'pause'}")
         names = {CURRENT: "current policy", BEST: "best policy"}
         self.label.text = names.get(model) or f"at {int(model.removeprefix('step_')):,} steps"
 
@@ -316,10 +379,10 @@ class LiveView:
         self.choose(self.steps[min(int(self.slider.value), len(self.steps) - 1)])
         self.name()
 
-    def choose(self, model: str, seed: int | None = None) -> None:
-        """Lets a policy act, from a seed if one is given."""
-        if (model, seed) != (self.player.model, self.player.seed):
-            self.player.choose(model, seed)
+    def choose(self, model: str, seed: int | None = None, goal: Sequence[float] | None = None) -> None:
+        """Lets a policy act, from a seed or to a goal if one is given."""
+        if goal is not None or (model, seed) != (self.player.model, self.player.seed):
+            self.player.choose(model, seed, goal)
 
 
 class Values:
@@ -335,7 +398,8 @@ class Values:
         if episode is not None and episode.rewards:
             self.title.text = f"Value of each step, seed {episode.seed}"
             to_go = episode.to_go(gamma) if episode.is_over else np.zeros(0)
-            self.figure.show(charts.value_chart(np.array(episode.values), to_go))
+            expected = episode.expected if episode.is_cut else None
+            self.figure.show(charts.value_chart(np.array(episode.values), to_go, expected))
 
 
 class Episodes:
