@@ -276,5 +276,5 @@ def test_a_clock_that_stands_still_does_not_end_a_run(monkeypatch):
 def test_a_run_that_waits_for_one_environment_names_the_call_that_makes_eight(env_id, n_envs, share, hints, recwarn):
     seconds = {"env": 20 * share, "replay": 0.0, "update": 20 * (1 - share), "total": 20.0}
     run = SimpleNamespace(env=SimpleNamespace(env_id=env_id, n_envs=n_envs), seconds=seconds)
-    training.hint_at_more_environments(SimpleNamespace(run=run, steps_per_second=37.0))
+    training.hint_at_more_environments(SimpleNamespace(run=run, record=SimpleNamespace(steps_per_second=37.0)))
     assert ["rejeu.make_vector('CartPole-v1', n_envs=8)" in str(one.message) for one in recwarn] == [True] * hints
