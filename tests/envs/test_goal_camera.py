@@ -35,7 +35,7 @@ def test_the_goal_on_the_lot_is_where_highway_env_draws_it():
 
 def test_a_camera_sees_what_is_in_front_of_it():
     """It looks along x with z up; half of 100 pixels are seen at a slope of 1, so that y to the left is x in the picture."""
-    camera = perspective([1, 0, 0], [1, 0, 0], [0, 0, 1], 1.0, (200, 100))
+    camera = perspective(np.array([1, 0, 0]), np.array([1, 0, 0]), np.array([0, 0, 1]), 1.0, (200, 100))
     goals = np.array([[3, 0, 0], [3, 0, 1], [3, -1, 0], [0, 0, 0]])
     np.testing.assert_allclose(project(camera, goals), [[100, 50], [100, 25], [125, 50], [np.nan, np.nan]])
     assert np.isnan(project(camera, goals[:, :2])).all()  # these are places in a plane
@@ -71,7 +71,11 @@ def test_an_environment_may_say_where_its_goals_are_and_what_they_are_called():
     assert (goal_camera(env), goal_names(env, 2)) == (None, ["number 1 of the goal", "number 2 of the goal"])
     env.goal_names, env.goal_camera = ["height", "angle", "speed"], [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
     assert goal_names(env, 2) == ["height", "angle"]
+    assert goal_names(env, 4) == ["height", "angle", "speed", "number 4 of the goal"]
     assert project(goal_camera(env), np.array([[3.0, 4.0]])).tolist() == [[3, 4]]
+    env.goal_camera = [1, 0, 0]
+    with pytest.raises(ValueError, match=r"goal_camera of .* has the shape \(3,\), expected \(3, k \+ 1\)"):
+        goal_camera(env)
 
 
 def test_a_robots_goal_is_where_mujoco_finds_it_in_its_picture():

@@ -17,10 +17,18 @@ def goal_camera(env: gym.Env) -> np.ndarray | None:
     The matrix maps the first ``k`` numbers of a goal and a 1 to ``(x w, y w, w)``, where x and y are pixels from the upper
     left corner; see :func:`project`. Known are highway-env's parking, MuJoCo's environments whose goals are places, and
     environments with an attribute ``goal_camera``.
+
+    Raises:
+        ValueError: if that attribute has another shape.
     """
-    camera = attribute(env, "goal_camera")
-    if camera is not None:
-        return np.asarray(camera, float)
+    declared = attribute(env, "goal_camera")
+    if declared is not None:
+        camera = np.asarray(declared, float)
+        if camera.ndim != 2 or len(camera) != 3:
+            raise ValueError(
+                f"goal_camera of {env} has the shape {camera.shape}, expected (3, k + 1) for k numbers of a goal"
+            )
+        return camera
     inner: Any = env.unwrapped
     config, renderer = getattr(inner, "config", None), getattr(inner, "mujoco_renderer", None)
     if isinstance(config, dict) and "scales" in config.get("observation", {}) and getattr(inner, "viewer", None):
@@ -37,12 +45,8 @@ def goal_camera(env: gym.Env) -> np.ndarray | None:
 
 def goal_names(env: gym.Env, n: int) -> list[str]:
     """Returns names of the first ``n`` numbers of goals: an environment's own ``goal_names``, or their positions."""
-    declared = attribute(env, "goal_names")
-    return (
-        [str(name) for name in declared][:n]
-        if declared is not None
-        else [f"number {i + 1} of the goal" for i in range(n)]
-    )
+    names = [str(name) for name in attribute(env, "goal_names") or ()]
+    return [*names, *(f"number {i + 1} of the goal" for i in range(len(names), n))][:n]
 
 
 def from_above(surface: Any, scales: Sequence[float]) -> np.ndarray:
@@ -52,11 +56,7 @@ def from_above(surface: Any, scales: Sequence[float]) -> np.ndarray:
 
 
 def perspective(
-    position: Sequence[float] | np.ndarray,
-    forward: Sequence[float] | np.ndarray,
-    up: Sequence[float] | np.ndarray,
-    slope: float,
-    size: tuple[int, int],
+    position: np.ndarray, forward: np.ndarray, up: np.ndarray, slope: float, size: tuple[int, int]
 ) -> np.ndarray:
     """Returns the camera of a pinhole at a position, for goals in space.
 
@@ -69,9 +69,7 @@ def perspective(
     """
     width, height = size
     right, focal = np.cross(forward, up), 0.5 * height / slope
-    axes = np.array(
-        [focal * right + 0.5 * width * np.array(forward), 0.5 * height * np.array(forward) - focal * np.array(up)]
-    )
+    axes = np.array([focal * right + 0.5 * width * forward, 0.5 * height * forward - focal * up])
     rows = np.vstack([axes, forward])
     return np.column_stack([rows, -rows @ position])
 

@@ -373,22 +373,12 @@ def goal_chart(episodes: Table) -> Chart | None:
     goals, places = goals[rows], goal_places(goals[rows], success[rows])
     outcomes = np.array([0 if spot.rate == 1.0 else 2 if spot.rate == 0.0 else 1 for spot in places])
     shown_series = []
-    for i, (name, color, symbol, sign) in enumerate(OUTCOMES):
-        at = np.flatnonzero(outcomes == i)
-        x, y = np.array([places[j].goal for j in at]).reshape(len(at), -1)[:, :2].T if len(at) else ((), ())
+    for i in np.unique(outcomes).tolist():
+        at, (name, color, symbol, sign) = np.flatnonzero(outcomes == i).tolist(), OUTCOMES[i]
+        x, y = np.array([places[j].goal[:2] for j in at]).T
         texts = [f"{100 * places[j].rate:.0f} % of {counted(len(places[j].rows), 'episode')}" for j in at]
-        marks = {
-            "symbol": symbol,
-            "sign": sign,
-            "text": texts,
-            "places": at.tolist(),
-            "x": plain(x),
-            "t": plain(x),
-            "y": plain(y),
-        }
-        shown_series += (
-            [{"kind": "places", "name": f"{name} ({len(at):,})", "color": color, **marks}] if len(at) else []
-        )
+        marks = {"kind": "places", "name": f"{name} ({len(at):,})", "color": color, "symbol": symbol, "sign": sign}
+        shown_series.append({**marks, "places": at, "text": texts, "x": plain(x), "t": plain(x), "y": plain(y)})
     seeds, step = episodes.column("seed")[rows], episodes.column("step")[rows]
     last = "" if np.isnan(step).all() else f", evaluated up to step {np.nanmax(step):,.0f}"
     rate = f"{100 * np.mean(success[rows] > 0.5):.0f} % of {counted(len(rows), 'episode')} reached the goal{last}"

@@ -7,7 +7,7 @@ import pytest
 pytest.importorskip("nicegui", reason="needs nicegui, which is in the extra studio")
 
 import rejeu
-from rejeu.lab.studio.deciding import MOST_BARS, bars_of, share_bars, spread_bars, value_bars
+from rejeu.lab.studio.deciding import MOST_BARS, bars_of, spread_bars, value_bars
 
 
 def test_of_many_actions_the_most_valued_are_shown_in_their_order():
@@ -19,11 +19,6 @@ def test_of_many_actions_the_most_valued_are_shown_in_their_order():
 
 def test_equal_values_are_no_preference():
     assert {bar.end for bar in value_bars(np.array([2.0, 2.0]), "ab", 0, 0.0)} == {1.0}
-
-
-def test_probabilities_are_shares_of_the_width():
-    bars = share_bars(np.array([0.25, 0.75]), ["left", "right"], 1)
-    assert [(bar.text, bar.end, bar.is_chosen) for bar in bars] == [("25%", 0.25, False), ("75%", 0.75, True)]
 
 
 def test_mean_spread_and_action_are_between_the_bounds():
@@ -59,5 +54,6 @@ def test_an_agent_has_bars_for_its_actions(algorithm, env_id, names):
         assert extents[1:] == [np.ptp(agent.q_values(obs, None, "mean"))]
     elif len(names) > 1:
         assert sum(bar.end for bar in bars) == pytest.approx(1.0)
+        assert [bar.text for bar in bars] == [f"{100 * bar.end:.0f} %" for bar in bars]
     else:
         assert bars[0].start < (agent.predict(obs, deterministic=True)[0][0] + 2) / 4 < bars[0].end

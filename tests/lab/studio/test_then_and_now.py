@@ -22,9 +22,8 @@ def folder(tmp_path_factory):
     """A run with models of 8 steps and more; that of 16 steps was the best."""
     folder = RunFolder(write(tmp_path_factory.mktemp("course") / "run", videos=False))
     folder.models.mkdir()
-    agent = rejeu.PPO(
-        "MlpPolicy", "CartPole-v1", n_steps=8, n_epochs=1, batch_size=8, policy_kwargs={"net_arch": [8]}, seed=0
-    )
+    settings = {"learning_starts": 100, "buffer_size": 100, "policy_kwargs": {"net_arch": [8]}}
+    agent = rejeu.DQN("MlpPolicy", "CartPole-v1", seed=0, **settings)
     for step in (8, 16, 24, 32):
         agent.learn(8, reset_num_timesteps=False)
         agent.save(folder.models / f"step_{step:012}.safetensors")
@@ -35,13 +34,12 @@ def folder(tmp_path_factory):
 
 
 def test_the_early_the_middle_the_best_and_the_current_policy_are_shown_once(folder):
-    names = [policy.name for policy in policies(folder)]
-    assert names == ["after 8 steps", "best, after 16 steps", "after 24 steps", "current, after 32 steps"]
+    assert [*policies(folder)] == ["after 8 steps", "best, after 16 steps", "after 24 steps", "current, after 32 steps"]
     folder.best.rename(folder.path / "elsewhere")
-    assert [policy.model.stem for policy in policies(folder)] == ["step_000000000008", "step_000000000024", "agent"]
+    assert [model.stem for model in policies(folder).values()] == ["step_000000000008", "step_000000000024", "agent"]
     best = (folder.path / "elsewhere").read_bytes()
     folder.best.write_bytes(folder.agent.read_bytes())
-    assert policies(folder)[-1].name == "best, current, after 32 steps"
+    assert [*policies(folder)][-1] == "best, current, after 32 steps"
     folder.best.write_bytes(best)
 
 

@@ -51,7 +51,8 @@ def bars_of(agent: Agent, env: gym.Env, step: tuple[Observation, PyTree, Action]
             extents.append(float(np.ptp(values)))
             return value_bars(values, names, index, max(extents))
         drawn = samples(agent, obs, memory) - int(space.start)
-        return share_bars(np.bincount(drawn.astype(int), minlength=len(names)) / SAMPLES, names, index)
+        shares = np.bincount(drawn.astype(int), minlength=len(names)) / SAMPLES
+        return highest_bars(shares, [f"{100 * share:.0f} %" for share in shares], names, index)
     if isinstance(space, gym.spaces.Box):
         drawn = samples(agent, obs, memory).reshape(SAMPLES, -1)[:, :MOST_BARS]
         ends = (space.low.reshape(-1)[:MOST_BARS], space.high.reshape(-1)[:MOST_BARS])
@@ -85,22 +86,21 @@ def number_names(env: gym.Env, space: gym.spaces.Box) -> list[str]:
 
 
 def value_bars(values: np.ndarray, names: Sequence[str], index: int, extent: float) -> list[Bar]:
-    """Returns the bars of the values of actions ``(n,)``; of many the highest.
+    """Returns the bars of the values of actions ``(n,)``.
 
     That of the highest value is full, and of the others lacks their difference from it as a share of ``extent``.
 
     >>> [(bar.name, bar.text, bar.end) for bar in value_bars(np.array([1.0, 3.0, 2.0]), "abc", 1, extent=4.0)]
     [('a', '1', 0.5), ('b', '3', 1.0), ('c', '2', 0.75)]
     """
-    at = np.sort(np.argsort(-values, kind="stable")[:MOST_BARS])
-    ends = (1.0 - (values.max() - values) / (extent or 1.0)).tolist()
-    return [Bar(names[i], f"{values[i]:.4g}", 0.0, ends[i], is_chosen=bool(i == index)) for i in at]
+    ends = 1.0 - (values.max() - values) / (extent or 1.0)
+    return highest_bars(ends, [f"{value:.4g}" for value in values], names, index)
 
 
-def share_bars(shares: np.ndarray, names: Sequence[str], index: int) -> list[Bar]:
-    """Returns the bars of the probabilities of actions ``(n,)``; of many the highest."""
-    at = np.sort(np.argsort(-shares, kind="stable")[:MOST_BARS])
-    return [Bar(names[i], f"{shares[i]:.0%}", 0.0, float(shares[i]), is_chosen=bool(i == index)) for i in at]
+def highest_bars(ends: np.ndarray, texts: Sequence[str], names: Sequence[str], index: int) -> list[Bar]:
+    """Returns the bars of actions, of many those with the highest ends; ``index`` is that of the action that is taken."""
+    at = np.sort(np.argsort(-ends, kind="stable")[:MOST_BARS]).tolist()
+    return [Bar(names[i], texts[i], 0.0, float(ends[i]), is_chosen=i == index) for i in at]
 
 
 def spread_bars(

@@ -12,7 +12,7 @@ from rejeu.agents import presets
 from rejeu.core.language import said
 from rejeu.lab.studio.games import HostedGame, Wanted
 from rejeu.lab.studio.layout import address, follow
-from rejeu.lab.studio.screen import CSS, FITTING, Screen
+from rejeu.lab.studio.screen import CSS, Screen
 from rejeu.lab.studio.state import Studio
 from rejeu.teaching.play.game import Event
 from rejeu.teaching.play.keys import KNOWN, KeyMap
@@ -29,7 +29,7 @@ def build(studio: Studio, request: Request) -> None:
 
     Its address may name ``env``, ``agent`` once or twice, a ``seed``, and ``watch`` for a game without keys; it then begins.
     """
-    ui.add_css(CSS + FITTING)
+    ui.add_css(CSS)
     ui.query(".page").classes("fits")
     asked = request.query_params
     names = asked.getlist("agent")[:MOST_AGENTS]
@@ -44,19 +44,21 @@ def build(studio: Studio, request: Request) -> None:
     ):
         env = ui.select(
             environments(studio, env_id),
-            label="environment",
+            label=said("environment"),
             value=env_id,
             with_input=True,
             new_value_mode="add-unique",
         ).classes("w-64")
-        agents = ui.select(offered(studio, env_id, names), label="agents", value=names, multiple=True).classes("w-64")
+        agents = ui.select(offered(studio, env_id, names), label=said("agents"), value=names, multiple=True).classes(
+            "w-64"
+        )
         agents.props(f"use-chips max-values={MOST_AGENTS}")
-        by_hand = ui.switch("I play", value="watch" not in asked)
-        record = ui.switch("record").bind_enabled_from(by_hand, "value")
+        by_hand = ui.switch(said("I play"), value="watch" not in asked)
+        record = ui.switch(said("record")).bind_enabled_from(by_hand, "value")
         number = ui.number(
-            "seed", value=int(seed) if seed.isdecimal() and len(seed) < 16 else None, min=0, precision=0
+            said("seed"), value=int(seed) if seed.isdecimal() and len(seed) < 16 else None, min=0, precision=0
         ).classes("w-20")
-        start = ui.button("Start", icon="play_arrow").props("no-caps")
+        start = ui.button(said("Start"), icon="play_arrow").props("no-caps")
     stage = ui.column().classes("stage w-full")
 
     def start_anew() -> None:
@@ -118,7 +120,7 @@ def show(studio: Studio, wanted: Wanted, begun: Callable[[str], object], again: 
         for button, text in keycaps.items():
             button.text = labelled(text, labels)
 
-    status = ui.label("The environment is made, and agents are compiled ...").classes("text")
+    status = ui.label(said("The environment is made, and agents are compiled ...")).classes("text")
     screen = Screen(lambda event: playing.handle(event), label)
     buttons = ui.row().classes("keys gap-1 items-center w-full")
     playing = HostedGame(lambda: wanted.open(studio), screen.show)

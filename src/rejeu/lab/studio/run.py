@@ -325,11 +325,11 @@ class LiveView:
     def __init__(self, page: RunPage) -> None:
         self.page, self.steps = page, [CURRENT]
         self.screen = Screen()
-        self.status = ui.label("the agent is loaded").classes("quiet text")
+        self.status = ui.label(said("the agent is loaded")).classes("quiet text")
         with ui.row().classes("items-center w-full no-wrap gap-4"):
             self.slider = ui.slider(min=0, max=0, value=0, on_change=self.chosen).props("label-always=false")
             self.label = ui.label().classes("quiet").style("min-width: 9em")
-            action("best", None, lambda: self.choose(BEST))
+            action(said("best"), None, lambda: self.choose(BEST))
         with ui.row().classes("items-center gap-2"):
             self.pause = action(said("pause"), "pause", self.turn_pause)
             action(said("one step"), "skip_next", self.step)
@@ -371,8 +371,8 @@ class LiveView:
         model, is_paused = self.player.model, self.player.is_paused
         self.pause.text = said("continue") if is_paused else said("pause")
         self.pause.props(f"icon={'play_arrow' if is_paused else 'pause'}")
-        names = {CURRENT: "current policy", BEST: "best policy"}
-        self.label.text = names.get(model) or f"at {int(model.removeprefix('step_')):,} steps"
+        names = {CURRENT: said("current policy"), BEST: said("best policy")}
+        self.label.text = names.get(model) or said("after {} steps", f"{int(model.removeprefix('step_')):,}")
 
     def chosen(self) -> None:
         """Lets the policy at the slider act."""
@@ -396,7 +396,7 @@ class Values:
     def show(self, episode: LiveEpisode | None, gamma: float) -> None:
         """Draws an episode, as far as it is."""
         if episode is not None and episode.rewards:
-            self.title.text = f"Value of each step, seed {episode.seed}"
+            self.title.text = said("Value of each step, seed {}", episode.seed)
             to_go = episode.to_go(gamma) if episode.is_over else np.zeros(0)
             expected = episode.expected if episode.is_cut else None
             self.figure.show(charts.value_chart(np.array(episode.values), to_go, expected))
@@ -408,21 +408,21 @@ class Episodes:
     def __init__(self, page: RunPage) -> None:
         self.page = page
         self.histogram: Chart | None = None
-        with ui.expansion("Episodes", value=True).classes("w-full"):
+        with ui.expansion(said("Episodes"), value=True).classes("w-full"):
             self.title = ui.label().classes("text")
             self.figure = Figure(height="200px", choose=self.choose)
-            self.play = action(f"Play {REPLAYS} episodes", "replay", lambda event: self.replay(event.sender))
+            self.play = action(said("Play {} episodes", REPLAYS), "replay", lambda event: self.replay(event.sender))
             self.play.set_visibility(False)
             self.table = ui.table(rows=[], columns=EPISODES, row_key="seed", pagination=10).props("flat dense")
             self.table.on("rowClick", lambda event: self.watch(event.args[1]))
             self.table.set_visibility(False)
-            self.training_title = ui.label("Returns of the training episodes").classes("text")
+            self.training_title = ui.label(said("Returns of the training episodes")).classes("text")
             self.training = Figure(height="200px")
 
     def show(self, replays: JsonObject | None, training: Chart | None, has_model: bool) -> None:
         """Draws the histograms."""
         self.histogram = replays
-        self.title.text = TITLE if replays else ""
+        self.title.text = said(TITLE) if replays else ""
         self.figure.set_visibility(replays is not None)
         self.play.set_visibility(has_model)
         self.training_title.set_visibility(training is not None)
@@ -445,9 +445,9 @@ class Episodes:
         """Shows an episode again: the best policy acts from its seed."""
         if self.page.live is not None and isinstance(seed := episode.get("seed"), int):
             self.page.live.choose(BEST, seed)
-            ui.notify(f"The best policy acts from the seed {seed}.")
+            ui.notify(said("The best policy acts from the seed {}.", seed))
 
     def replay(self, button: Any) -> None:
         """Lets the best policy play episodes from known seeds, in a process of its own."""
-        text = f"The best policy plays {REPLAYS} episodes; they are listed here when it has finished."
+        text = said("The best policy plays {} episodes; they are listed here when it has finished.", REPLAYS)
         command(button, "report", self.page, text, "--replay", str(REPLAYS))

@@ -8,6 +8,7 @@ import re
 import secrets
 import weakref
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import numpy as np
 from fastapi import WebSocket, WebSocketDisconnect
@@ -20,40 +21,8 @@ from rejeu.teaching.play.game import Event
 
 QUALITY = 85
 """Of a JPEG, from 1 to 95."""
-CSS = """
-.screen { display: flex; width: 100%; flex-wrap: wrap; gap: 12px; outline: none; }
-.screen figure { margin: 0; flex: 1 1 300px; max-width: 720px; }
-.screen figcaption { display: flex; gap: 12px; align-items: baseline; overflow-wrap: anywhere; }
-.screen figcaption small { margin-left: auto; opacity: 0.7; }
-.screen canvas { display: block; width: 100%; border: 1px solid #8886; }
-.screen canvas.small { image-rendering: pixelated; }
-.screen p { margin: 4px 0; min-height: 1.5em; text-align: center; font-weight: 600; }
-.screen .won p { color: #26965f; }
-.bar { display: grid; grid-template-columns: 30% 1fr 7em; gap: 8px; align-items: center; font-size: 13px; }
-.bar div { position: relative; height: 12px; background: #8883; border-radius: 3px; }
-.bar i { position: absolute; top: 0; bottom: 0; background: #63a4e0; border-radius: 3px; }
-.bar b { position: absolute; top: -2px; bottom: -2px; width: 3px; margin-left: -1px; background: #d9631e; }
-.bar.chosen { font-weight: 700; }
-.bar.chosen i { background: #d9631e; }
-.bar span:last-child { text-align: right; font-variant-numeric: tabular-nums; }
-.one-row .screen { flex-wrap: nowrap; overflow-x: auto; }
-.one-row .screen figure { flex: 1 0 150px; }
-.one-row .screen figcaption { flex-direction: column; gap: 0; }
-.one-row .screen figcaption small { display: none; }
-"""
-FITTING = """
-.fits { height: calc(100dvh - 56px); flex-wrap: nowrap; padding-top: 4px; padding-bottom: 4px; gap: 4px; }
-.fits .stage { flex: 1 1 0; min-height: 0; flex-wrap: nowrap; gap: 4px; }
-.fits .screen { flex: 1 1 0; min-height: 0; flex-wrap: nowrap; justify-content: center; }
-.fits figure { display: flex; flex-direction: column; flex: 1 1 0; min-height: 0; min-width: 0; max-width: none; }
-.fits figcaption { flex-wrap: wrap; column-gap: 12px; row-gap: 0; }
-.fits canvas { flex: 1 1 0; min-height: 0; object-fit: contain; border: 0; }
-.fits .keys { flex: none; }
-.key { touch-action: none; user-select: none; -webkit-user-select: none; -webkit-touch-callout: none; }
-@media (pointer: coarse) { .key { min-width: 44px; min-height: 44px; } }
-@media (max-aspect-ratio: 1) { .fits .screen { flex-direction: column; } }
-"""
-"""Of pages in which the pictures give way to all else, so that they fit the window."""
+CSS = Path(__file__).with_suffix(".css")
+"""Style of a screen; on pages of the class ``fits`` the pictures give way to all else, so that they fit the window."""
 KEYS = {"enter": "return", "numpadenter": "return", "space": "space", " ": "space"}
 KEYS |= {
     f"{name}{side}": f"{side} {key}"

@@ -8,7 +8,6 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from nicegui import ui
@@ -41,27 +40,22 @@ MOST_FPS, MOST_SECONDS, HOLD_SECONDS = 20.0, 20.0, 1.5
 FORMATS = {"GIF": ".gif", "WebM": ".webm"}
 
 
-class Policy(NamedTuple):
-    """A policy of a run, and what it is called."""
+def policies(folder: RunFolder) -> dict[str, Path]:
+    """Returns an early policy, one of the middle, the best and the current one, as far as they were kept, oldest first.
 
-    name: str
-    model: Path
-
-
-def policies(folder: RunFolder) -> list[Policy]:
-    """Returns an early policy, one of the middle, the best and the current one, as far as they were kept, oldest first."""
+    They are model files by what they are called.
+    """
     course = requests.models(folder.models)
-    current = next((path for path in (folder.live, folder.agent) if path.is_file()), None)
-    models = [*(("", path) for path in (*course[:1], *course[len(course) // 2 :][:1]))]
-    models += [("best", folder.best)] if folder.best.is_file() else []
-    models += [] if current is None else [("current", current)]
+    models = [("", path) for path in (*course[:1], *course[len(course) // 2 :][:1])]
+    models += [("best", path) for path in [folder.best] if path.is_file()]
+    models += [("current", path) for path in (folder.live, folder.agent) if path.is_file()][:1]
     by_step: dict[int, list[tuple[str, Path]]] = {}
     for word, path in models:
         by_step.setdefault(step_of(path), []).append((word, path))
-    return [
-        Policy(", ".join([*(said(word) for word, _ in same if word), said("after {} steps", f"{step:,}")]), same[0][1])
+    return {
+        ", ".join([*(said(word) for word, _ in same if word), said("after {} steps", f"{step:,}")]): same[0][1]
         for step, same in sorted(by_step.items())
-    ]
+    }
 
 
 def open_game(folder: RunFolder, options: RunOptions, seed: int) -> AbstractContextManager[Opened]:
@@ -72,7 +66,7 @@ def open_game(folder: RunFolder, options: RunOptions, seed: int) -> AbstractCont
         ValueError: if the environment must be named, or cannot be rendered.
     """
     environment = from_run(read_folder(folder), folder.path, options)
-    agents = {policy.name: load(policy.model, device="cpu") for policy in policies(folder)}
+    agents = {name: load(model, device="cpu") for name, model in policies(folder).items()}
     if not agents:
         raise FileNotFoundError(said("there is no policy yet; the first is kept at the first evaluation"))
     return opened(environment.make, agents, by_hand=False, seed=seed, episodes=1)
