@@ -104,7 +104,7 @@ def test_all_episodes_are_judged_when_learn_reaches_its_limit(limit: Any, monkey
     monkeypatch.setattr(device, "MAX_TURNS", 100)
     monkeypatch.setattr("rejeu.training.compiled.MAX_TURNS", 100)
     agent = make(rejeu.DQN, "jax/CartPole-v1", learning_starts=10_000, best_window=3).learn(**limit)
-    assert agent.stops is not None
+    assert agent.call.stops is not None
     means = np.convolve(agent.history["return"], np.full(3, 1 / 3), "valid")
     assert agent.best is not None
     assert agent.best.score == pytest.approx(means.max())

@@ -67,7 +67,7 @@ def test_random_actions_and_those_of_the_policy_are_within_the_share() -> None:
 def test_actions_are_within_the_share_on_the_device() -> None:
     """Positions of a point that its actions move."""
     agent = make(rejeu.SAC, jax_environments.Reach(grid=False), action_share=0.125, learning_starts=20).learn(40)
-    assert agent.stops is not None, "it trained on the host"
+    assert agent.call.stops is not None, "it trained on the host"
     positions = agent.run.replay.arrays()["obs.observation"].reshape(-1)
     moves = np.abs(np.diff(positions[:11]))  # of the first episode
     assert 0.05 < moves.max() <= 0.125 + 1e-6

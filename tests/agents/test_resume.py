@@ -375,7 +375,7 @@ def test_signals_end_training_with_a_checkpoint(number, tmp_path):
             os.kill(os.getpid(), number)
 
     agent = small_sac(BALL).learn(60, [kill, Checkpoint(tmp_path, every=1000)])
-    assert (agent.interrupted, agent.interrupted_by) == (True, number)
+    assert (agent.interrupted, agent.call.interrupted_by) == (True, number)
     assert rejeu.SAC.resume(tmp_path).num_timesteps == 33
 
 

@@ -86,7 +86,7 @@ def test_a_callback_reads_the_limits_of_the_call():
 
     class Reading(Noting):
         def before_training(self, agent):
-            seen.append((agent.training_call.n_steps, agent.training_call.last_step))
+            seen.append((agent.call.training_call.n_steps, agent.call.training_call.last_step))
 
     agent = small_sac(BALL).learn(3, Reading([], "a"))
     agent.learn(4, Reading([], "a"), reset_num_timesteps=False)

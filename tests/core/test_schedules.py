@@ -141,7 +141,7 @@ def test_schedules_follow_training_time_likewise(monkeypatch):
     agent = small_sac(Counter()).learn(8)
     spent = agent.seconds["total"]
     agent.learn(minutes=1, callback=lambda *_: False, reset_num_timesteps=False)
-    assert agent.training_call.seconds_before == spent
+    assert agent.call.training_call.seconds_before == spent
 
 
 def test_a_resumed_call_keeps_its_progress_and_its_schedules_continue_after_it(tmp_path):
@@ -251,7 +251,7 @@ def test_off_policy_loops_tell_actions_updates_and_weights_how_far_the_run_is(on
         taken = before + np.arange(n_steps)
         acted += [*(taken / total)]
         updates += [*((taken + 1) / total)]
-    assert agent.stops is not None if on_device else agent.stops is None
+    assert agent.call.stops is not None if on_device else agent.call.stops is None
     heard = agent.state
     n = int(heard.n)
     n_missing = len(updates) - n  # nothing can be drawn in the first turn
@@ -275,7 +275,7 @@ def test_on_policy_loops_tell_actions_and_updates_how_far_the_run_is(on_device):
         ends = before + np.arange(4, n_steps + 1, 4)
         updates += [*(ends / total)]
         acted += [*((ends - 1) / total)]
-    assert agent.stops is not None if on_device else agent.stops is None
+    assert agent.call.stops is not None if on_device else agent.call.stops is None
     n = int(agent.state.n)
     np.testing.assert_allclose(agent.state.updates[:n], updates, rtol=1e-6)
     np.testing.assert_allclose(agent.state.acted[:n], acted, rtol=1e-6)

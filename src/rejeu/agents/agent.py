@@ -5,9 +5,9 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import inspect
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, Self, TypeVar, overload
 
@@ -25,12 +25,12 @@ from rejeu.checkpoints import model_files, resume
 from rejeu.checkpoints.agent_state import (
     AGENT_ARGUMENTS,
     BEST_WINDOW,
+    AnyAgent,
     Best,
     CallState,
     Files,
     Identity,
     Outputs,
-    Resumed,
     TrainingRecord,
 )
 from rejeu.checkpoints.run_files import CheckpointFolder, folder_of
@@ -51,9 +51,8 @@ from rejeu.logs.formatting import counted, html_table
 from rejeu.logs.history import History
 from rejeu.logs.logging import Logger, Sink, check_logs
 from rejeu.training import finite
-from rejeu.training.compiled import Stops
 from rejeu.training.learner import Learner, PackedState
-from rejeu.training.run import Progress, Run, TrainingCall, initial_run
+from rejeu.training.run import initial_run
 
 if TYPE_CHECKING:
     from rejeu.agents.exporting import Exported
@@ -102,7 +101,7 @@ class ClassOnly:
         return self.method.__get__(None, owner)
 
 
-class Agent(ABC):
+class Agent(AnyAgent):
     """The base class of all agents. Abstract: use SAC, PPO or another algorithm.
 
     To add an algorithm, subclass :class:`rejeu.OffPolicyAgent` or :class:`rejeu.OnPolicyAgent`. Values that belong together
@@ -111,37 +110,8 @@ class Agent(ABC):
 
     algorithm: ClassVar[Any]
     """The object with ``Config`` and ``make``: a module, or a ``types.SimpleNamespace(Config=Config, make=make)``."""
-    config: Any
-    """Its hyperparameters."""
-    identity: Identity
-    """Arguments that tell it from other agents of the same hyperparameters, which training does not change."""
-    observation_space: gym.Space
-    action_space: gym.Space
-    obs_leaves: tuple[spaces.Leaf, ...]
-    """The arrays of an observation."""
-    learner: Learner
-    """The compiled functions of the algorithm."""
-    run: Run
-    """The state that every step changes: environments, buffer, counters, and the state of the algorithm."""
-    on_device: bool | None = None
-    """Whether ``learn`` trains in one program on the device: True requires it, False uses the loop of the host. None uses the
-    device where the environments are JAX environments and the settings allow it; see ``docs/device.md``."""
-    outputs: Outputs
-    """Where rows of statistics go."""
-    logger: Logger
-    """Accepts further numbers for the rows of statistics."""
-    call: CallState
-    """The current or last call of ``learn``, and what it counts from."""
-    record: TrainingRecord
-    """The episodes of training, the speed, and the best weights."""
-    files: Files
-    """The files that training writes, and those that it could not write."""
-    resumed: Resumed | None = None
-    """Where :meth:`resume` continued the run; None for a new or loaded agent."""
     notes: list[str]
     """The notes of :func:`rejeu.sb3.load_zip` about the file; only of agents that it read."""
-    n_predictions: int = 0
-    """Calls of ``predict`` that drew from the policy; each draws with a key of its own."""
 
     policy_name = PartOf[str]("identity")
     """The argument ``policy``."""
@@ -167,16 +137,6 @@ class Agent(ABC):
     """Names of the logs to which rows of statistics are written."""
     tensorboard_log = PartOf[str | Path | None]("outputs")
     """Folder of the folders of these logs; None for ``logs``."""
-    training_call = PartOf[TrainingCall | None]("call")
-    """The current or last call of ``learn``: its limits and progress."""
-    is_learning = PartOf[bool]("call")
-    """Whether ``learn`` is running."""
-    interrupted_by = PartOf[int | None]("call")
-    """The number of the signal that ended the last ``learn``, of Ctrl-C or SIGTERM."""
-    stops = PartOf[Stops | None]("call")
-    """During a ``learn`` on the device: where the program returns to the host. None with the loop of the host."""
-    n_together = PartOf[int]("call")
-    """Runs in the program of the current or last ``learn``."""
     history = PartOf[History]("record")
     """Every episode of training."""
     ep_info_buffer = PartOf[deque[dict[str, float]]]("record")
@@ -366,10 +326,6 @@ class Agent(ABC):
         """Returns the exploration noise, None for none."""
 
     @abstractmethod
-    def gradient_batch_size(self, n_envs: int) -> int:
-        """Returns the number of transitions in the batch of one gradient step."""
-
-    @abstractmethod
     def make_buffer(self, env: VectorEnv) -> Any:
         """Returns an empty buffer for transitions of ``env``."""
 
@@ -382,23 +338,6 @@ class Agent(ABC):
         """Discards transitions that only the policy that collected them can learn from."""
 
     @abstractmethod
-    def first_learning_step(self, step: int) -> int:
-        """Returns the environment step of the first gradient step, for a run that starts at ``step``."""
-
-    @abstractmethod
-    def steps_to_take(self, n_steps: int) -> int:
-        """Returns after how many environment steps a ``learn`` of ``n_steps`` ends."""
-
-    @abstractmethod
-    def loop(self, n_steps: int | None, progress: Callable[[int], float]) -> Iterator[Progress]:
-        """Trains until ``n_steps`` environment steps are taken (None: without end), and yields after every turn.
-
-        Args:
-            n_steps: over all environments.
-            progress: returns the progress of schedules, in [0, 1], after that many steps.
-        """
-
-    @abstractmethod
     def start_episodes(self) -> None:
         """Starts a new episode in every environment."""
 
@@ -409,7 +348,7 @@ class Agent(ABC):
         with the next ``learn``.
         """
         self.run.obs = self.run.action = None
-        if self.is_learning:
+        if self.call.is_learning:
             self.start_episodes()
 
     @property
@@ -804,7 +743,7 @@ class Agent(ABC):
         env = self.run.env
         if env is None:
             return None
-        if not self.is_learning:
+        if not self.call.is_learning:
             self.abandon_episodes()
         if env.venv is None:
             import rejeu  # whose wings the library does not import
@@ -829,7 +768,7 @@ class Agent(ABC):
             ValueError: if the spaces differ.
             RuntimeError: during ``learn``.
         """
-        if self.is_learning:
+        if self.call.is_learning:
             raise RuntimeError(
                 "set_env was called while the agent learns; stop training first (a callback that returns False), then "
                 "call set_env and learn(..., reset_num_timesteps=False)"

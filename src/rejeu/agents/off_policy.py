@@ -119,8 +119,8 @@ class OffPolicyAgent(Agent):
         return n_steps
 
     def loop(self, n_steps: int | None, progress: Callable[[int], float]) -> Iterator[Progress]:
-        if self.stops is not None:
-            return train_one(self.run, self.learner, self.config, n_steps, progress, self.stops)
+        if self.call.stops is not None:
+            return train_one(self.run, self.learner, self.config, n_steps, progress, self.call.stops)
         if self.config.demonstrations is not None and self.learner.observe is not None and not self.run.step:
             from rejeu import demonstrations
 

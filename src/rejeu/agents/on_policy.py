@@ -78,8 +78,8 @@ class OnPolicyAgent(Agent):
         return steps_to_take(self.run, self.config, n_steps)
 
     def loop(self, n_steps: int | None, progress: Callable[[int], float]) -> Iterator[Progress]:
-        if self.stops is not None:
-            return train_one(self.run, self.learner, self.config, n_steps, progress, self.stops)
+        if self.call.stops is not None:
+            return train_one(self.run, self.learner, self.config, n_steps, progress, self.call.stops)
         return on_policy(self.run, self.learner, self.config, n_steps, progress)
 
     def start_episodes(self) -> None:

@@ -217,7 +217,7 @@ def learn_together(
                     if not active or interrupt.requested:
                         break
             for agent in agents:
-                agent.interrupted_by = interrupt.signal
+                agent.call.interrupted_by = interrupt.signal
         except NonFiniteSteps as broken:
             culprit = agents[broken.which]
             values = [f"{name}={getattr(culprit.config, name):g}" for name in differing]
@@ -240,8 +240,8 @@ def common_stops(
             )
         if call.n_episodes is not None:
             raise ValueError("several runs in one program end after steps or minutes, not after episodes")
-        agent.stops, agent.n_together = device.stops_at(call, run_callbacks), len(agents)
-        every |= {*agent.stops.every}
+        agent.call.stops, agent.call.n_together = device.stops_at(call, run_callbacks), len(agents)
+        every |= {*agent.call.stops.every}
     return Stops(tuple(sorted(every)))
 
 

@@ -33,7 +33,7 @@ class TrainingCallback(ABC):
     """Whether it must be called after every step, so that an agent in a JAX environment trains with the loop of the host."""
 
     def before_training(self, agent: Any) -> None:  # noqa: B027 - optional
-        """Called by ``learn`` before the first step; ``agent.training_call`` has its limits."""
+        """Called by ``learn`` before the first step; ``agent.call.training_call`` has its limits."""
 
     @abstractmethod
     def __call__(self, agent: Any, progress: Progress) -> bool | None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import secrets
+from abc import abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -209,20 +210,34 @@ class AnyAgent(Protocol):
 
     algorithm: ClassVar[Any]
     config: Any
+    """Its hyperparameters."""
     identity: Identity
+    """Arguments that tell it from other agents of the same hyperparameters, which training does not change."""
     observation_space: gym.Space
     action_space: gym.Space
     obs_leaves: tuple[Leaf, ...]
+    """The arrays of an observation."""
     learner: Learner
+    """The compiled functions of the algorithm."""
     run: Run
-    on_device: bool | None
+    """The state that every step changes: environments, buffer, counters, and the state of the algorithm."""
+    on_device: bool | None = None
+    """Whether ``learn`` trains in one program on the device: True requires it, False uses the loop of the host. None uses the
+    device where the environments are JAX environments and the settings allow it; see ``docs/device.md``."""
     outputs: Outputs
+    """Where rows of statistics go."""
     logger: Logger
+    """Accepts further numbers for the rows of statistics."""
     call: CallState
+    """The current or last call of ``learn``, and what it counts from."""
     record: TrainingRecord
+    """The episodes of training, the speed, and the best weights."""
     files: Files
-    resumed: Resumed | None
-    n_predictions: int
+    """The files that training writes, and those that it could not write."""
+    resumed: Resumed | None = None
+    """Where :meth:`resume` continued the run; None for a new or loaded agent."""
+    n_predictions: int = 0
+    """Calls of ``predict`` that drew from the policy; each draws with a key of its own."""
 
     @classmethod
     def converted(cls, settings: Mapping[str, Any]) -> dict[str, Any]: ...
@@ -244,12 +259,29 @@ class AnyAgent(Protocol):
     def n_threads(self, n_envs: int) -> int: ...
     def start_run(self, env: VectorEnv | None, state: PackedState | None = None) -> None: ...
     def make_envs(self, env: Any, n_envs: int = 1, backend: Backend = "auto", seed: int | None = None) -> VectorEnv: ...
-    def gradient_batch_size(self, n_envs: int) -> int: ...
-    def first_learning_step(self, step: int) -> int: ...
-    def steps_to_take(self, n_steps: int) -> int: ...
-    def loop(self, n_steps: int | None, progress: Callable[[int], float]) -> Iterator[Progress]: ...
     def abandon_episodes(self) -> None: ...
     def predict(self, observation: Any, *args: Any, **settings: Any) -> tuple[Any, Any]: ...
     def with_masks(self, obs: Any, masks: Any) -> Any: ...
     def get_vec_normalize_env(self) -> Any: ...
     def check_spaces(self, vector: VectorEnv, source: str) -> None: ...
+
+    @abstractmethod
+    def gradient_batch_size(self, n_envs: int) -> int:
+        """Returns the number of transitions in the batch of one gradient step."""
+
+    @abstractmethod
+    def first_learning_step(self, step: int) -> int:
+        """Returns the environment step of the first gradient step, for a run that starts at ``step``."""
+
+    @abstractmethod
+    def steps_to_take(self, n_steps: int) -> int:
+        """Returns after how many environment steps a ``learn`` of ``n_steps`` ends."""
+
+    @abstractmethod
+    def loop(self, n_steps: int | None, progress: Callable[[int], float]) -> Iterator[Progress]:
+        """Trains until ``n_steps`` environment steps are taken (None: without end), and yields after every turn.
+
+        Args:
+            n_steps: over all environments.
+            progress: returns the progress of schedules, in [0, 1], after that many steps.
+        """

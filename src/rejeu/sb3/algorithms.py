@@ -241,7 +241,11 @@ class Original(Agent):
                 finite.settle(self)
                 old.value = number
             elif "run" in self.__dict__ and new != config:
-                if self.is_learning and configs.takes_schedule(type(config), name) and isinstance(number, int | float):
+                if (
+                    self.call.is_learning
+                    and configs.takes_schedule(type(config), name)
+                    and isinstance(number, int | float)
+                ):
                     with suppress(TypeError, ValueError):  # what is set once may be set at every step
                         new = dataclasses.replace(config, **{name: schedules.Live(number)})
                 self.change(new)
@@ -283,7 +287,7 @@ class Original(Agent):
 
     @exploration_rate.setter
     def exploration_rate(self, value: float) -> None:
-        if self.is_learning:
+        if self.call.is_learning:
             arguments.unsupported(
                 "exploration_rate", value, "follows exploration_initial_eps and ..._final_eps in learn; set these"
             )
@@ -423,7 +427,7 @@ class Original(Agent):
 
     @property
     def _current_progress_remaining(self) -> float:
-        call = self.training_call
+        call = self.call.training_call
         return 1.0 if call is None else 1.0 - float(call.progress(self.run.step, self.run.episode))
 
     def set_random_seed(self, seed: int | None = None) -> None:

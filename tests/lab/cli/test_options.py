@@ -327,7 +327,7 @@ def test_resume(spy, sessions, monkeypatch, tmp_path):
     assert not sessions[-1].has_video
     assert main([*argv, "--steps", "80"]) == 0  # beyond the goal
     assert sessions[-1].limits == TrainingLimits(steps=80)
-    agent.training_call.is_over.return_value = True
+    agent.call.training_call.is_over.return_value = True
     for words, limits in (
         (["--steps", "8"], TrainingLimits(steps=8)),
         (["--minutes", "2"], TrainingLimits(minutes=2.0)),

@@ -26,7 +26,7 @@ def test_an_environment_that_returns_nan_is_reported_with_its_steps(what: str) -
     said = r"not finite in one of the steps \d+ to \d+; agent.on_device = False .* says which"
     with pytest.raises(rejeu.BadEnvironmentError, match=said) as raised:
         agent.learn(100)
-    assert agent.stops is not None
+    assert agent.call.stops is not None
     assert "\n" not in str(raised.value)
     assert_finite_experience(agent)
     if what == "reward":
@@ -51,7 +51,7 @@ def assert_reported(agent: Any, said: str) -> rejeu.NonFiniteError:
 
     with pytest.raises(rejeu.NonFiniteError, match=said) as raised:
         agent.learn(300, remember)
-    assert agent.stops is not None
+    assert agent.call.stops is not None
     error = raised.value
     assert "\n" not in str(error)
     begin = max(states)

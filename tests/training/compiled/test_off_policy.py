@@ -80,7 +80,7 @@ def test_dqn_equals_the_loop_of_the_host(n_envs: int, settings: dict[str, Any]) 
     """Every action and episode is equal. XLA rounds the arithmetic of a larger program otherwise in the last bits."""
     device, host = (make(rejeu.DQN, "jax/CartPole-v1", n_envs, **settings) for _ in range(2))
     device.learn(301)
-    assert device.stops is not None
+    assert device.call.stops is not None
     learn_on_host(host, 301)
     assert device.n_updates > 10 or "episode" in str(settings)
     assert_same_runs(device, host, 1e-4)
@@ -123,7 +123,7 @@ def test_hindsight_equals_the_loop_of_the_host(
     settings["replay_buffer_kwargs"] = {"goal_selection_strategy": strategy}
     device, host = (make(rejeu.DDPG, Reach(stops=stops), 2, action_noise=0.3, **settings) for _ in range(2))
     device.learn(160)
-    assert device.stops is not None
+    assert device.call.stops is not None
     learn_on_host(host, 160)
     assert_same_runs(device, host, 1e-4)
     assert {episode.success for episode in device.history.episodes} == ({0.0, 1.0} if stops else {0.0})
@@ -226,6 +226,6 @@ def test_steps_are_copied_to_the_host_when_they_are_read() -> None:
         assert not copied
 
     agent = make(rejeu.SAC, "jax/Pendulum-v1").learn(150, look)
-    assert agent.stops is not None
+    assert agent.call.stops is not None
     assert sizes
     assert sizes[-1] == 150

@@ -54,8 +54,8 @@ def test_training_equals_the_loop_of_the_host(kind: Any, env: Any, settings: dic
     for agent in (device, host):
         agent.learn(n_steps)
         agent.learn(30, reset_num_timesteps=False)
-    assert device.stops is not None
-    assert host.stops is None
+    assert device.call.stops is not None
+    assert host.call.stops is None
     assert device.n_updates > 2
     assert_same_runs(device, host, 1e-3)
     if env is SHORT:

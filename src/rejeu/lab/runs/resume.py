@@ -123,8 +123,8 @@ def choose_limits(agent: Agent, arguments: Continued, finish: bool) -> TrainingL
                 f"the run is complete after {agent.num_timesteps:,} steps; give --steps N, or --minutes M, to train further"
             )
         return TrainingLimits(steps, minutes)
-    assert agent.training_call is not None
-    last = agent.training_call.last_step
+    assert agent.call.training_call is not None
+    last = agent.call.training_call.last_step
     if steps is not None and last is not None and agent.run.step + steps > last:
         return TrainingLimits(steps)
     return TrainingLimits(pause_steps=steps, pause_minutes=minutes)

@@ -280,7 +280,7 @@ def evaluate_now(evaluate: Evaluate, agent: Agent) -> None:
 
 def has_reached_goal(agent: Agent) -> bool:
     """Returns whether the current or last ``learn`` reached its limit."""
-    return agent.training_call is None or agent.training_call.is_over(agent.run)
+    return agent.call.training_call is None or agent.call.training_call.is_over(agent.run)
 
 
 def pause(agent: Agent, limits: TrainingLimits) -> Callable[[Progress], bool]:

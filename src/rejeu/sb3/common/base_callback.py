@@ -65,7 +65,7 @@ class BaseCallback(TrainingCallback):
 
     def before_training(self, agent: Agent) -> None:
         """Calls ``init_callback``, ``on_training_start`` and ``on_rollout_start``."""
-        call = agent.training_call
+        call = agent.call.training_call
         assert call is not None
         self.init_callback(agent)
         attributes = {
@@ -81,7 +81,7 @@ class BaseCallback(TrainingCallback):
 
     def __call__(self, agent: Agent, progress: Progress) -> bool:
         """Calls ``update_locals``, ``on_step`` and, around an update, ``on_rollout_end`` and ``on_rollout_start``."""
-        call, result = agent.training_call, progress.result
+        call, result = agent.call.training_call, progress.result
         assert call is not None
         assert result is not None
         self.update_locals(

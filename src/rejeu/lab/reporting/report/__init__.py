@@ -72,7 +72,7 @@ def record(agent: Agent, path: Path, evaluations: Sequence[tuple[int, Evaluation
             n_envs=None if env is None else env.n_envs,
             hyperparameters=configs.to_json(given_config(agent)),
         ),
-        state="running" if agent.is_learning else "finished",
+        state="running" if agent.call.is_learning else "finished",
         steps=agent.run.step,
         seconds=agent.seconds["total"],
         episodes=Table(history.to_dict()),
