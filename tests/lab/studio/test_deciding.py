@@ -1,5 +1,7 @@
 """Bars of what an agent weighs at a step."""
 
+from types import SimpleNamespace
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -7,7 +9,7 @@ import pytest
 pytest.importorskip("nicegui", reason="needs nicegui, which is in the extra studio")
 
 import rejeu
-from rejeu.lab.studio.deciding import MOST_BARS, bars_of, spread_bars, value_bars
+from rejeu.lab.studio.deciding import MOST_BARS, bars_of, number_names, samples, spread_bars, value_bars
 
 
 def test_of_many_actions_the_most_valued_are_shown_in_their_order():
@@ -57,3 +59,21 @@ def test_an_agent_has_bars_for_its_actions(algorithm, env_id, names):
         assert [bar.text for bar in bars] == [f"{100 * bar.end:.0f} %" for bar in bars]
     else:
         assert bars[0].start < (agent.predict(obs, deterministic=True)[0][0] + 2) / 4 < bars[0].end
+
+
+@pytest.mark.parametrize(("size", "n"), [(4, 256), (84 * 84 * 4, 16)])
+def test_of_pictures_fewer_actions_are_drawn(size, n):
+    class Sampler:
+        """Draws as many actions as it has observations, with a memory of two numbers for each."""
+
+        def predict(self, obs, memory, deterministic):
+            assert (memory.shape, deterministic) == ((len(obs), 2), False)
+            return np.arange(len(obs)), memory
+
+    assert samples(Sampler(), np.zeros(size), np.zeros((1, 2))).tolist() == list(range(n))
+
+
+def test_numbers_are_called_by_the_keys_that_change_them():
+    env = SimpleNamespace(spec=SimpleNamespace(id="LunarLanderContinuous-v3"))
+    assert number_names(env, gym.spaces.Box(-1, 1, (2,))) == ["main engine", "left / right"]
+    assert number_names(env, gym.spaces.Box(-1, 1, (7,))) == [f"number {i + 1}" for i in range(7)]

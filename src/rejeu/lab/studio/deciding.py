@@ -14,8 +14,9 @@ from rejeu.core.language import said
 from rejeu.core.types import Action, Observation, PyTree
 from rejeu.teaching.play.keys import keys_for, known_keys
 
-SAMPLES = 256
-"""Actions that are drawn where an agent has probabilities, so that their shares are within a few percent."""
+MOST_SAMPLES, LEAST_SAMPLES, MOST_NUMBERS = 256, 16, 2**18
+"""Actions that are drawn where an agent has probabilities, so that their shares are within a few percent; and how many numbers
+their observations may have, so that a policy that sees pictures still acts in time."""
 MOST_BARS = 10
 
 
@@ -51,19 +52,22 @@ def bars_of(agent: Agent, env: gym.Env, step: tuple[Observation, PyTree, Action]
             extents.append(float(np.ptp(values)))
             return value_bars(values, names, index, max(extents))
         drawn = samples(agent, obs, memory) - int(space.start)
-        shares = np.bincount(drawn.astype(int), minlength=len(names)) / SAMPLES
+        shares = np.bincount(drawn.astype(int), minlength=len(names)) / len(drawn)
         return highest_bars(shares, [f"{100 * share:.0f} %" for share in shares], names, index)
     if isinstance(space, gym.spaces.Box):
-        drawn = samples(agent, obs, memory).reshape(SAMPLES, -1)[:, :MOST_BARS]
+        drawn = samples(agent, obs, memory)
+        drawn = drawn.reshape(len(drawn), -1)[:, :MOST_BARS]
         ends = (space.low.reshape(-1)[:MOST_BARS], space.high.reshape(-1)[:MOST_BARS])
         return spread_bars(drawn, np.reshape(action, -1)[:MOST_BARS], *ends, number_names(env, space))
     return []
 
 
 def samples(agent: Agent, obs: Observation, memory: PyTree) -> np.ndarray:
-    """Returns actions that the policy draws at an observation, ``(SAMPLES, ...)``."""
-    copies = jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf)[None], SAMPLES, 0), obs)
-    carried = jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf), SAMPLES, 0), memory)
+    """Returns actions that the policy draws at an observation, ``(n, ...)``; of a large one fewer."""
+    size = sum(np.size(leaf) for leaf in jax.tree.leaves(obs))
+    n = min(max(MOST_NUMBERS // size, LEAST_SAMPLES), MOST_SAMPLES)
+    copies = jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf)[None], n, 0), obs)
+    carried = jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf), n, 0), memory)
     return np.asarray(agent.predict(copies, carried, deterministic=False)[0])
 
 
@@ -80,8 +84,8 @@ def number_names(env: gym.Env, space: gym.spaces.Box) -> list[str]:
     entry = known_keys("" if env.spec is None else env.spec.id, space) or {}
     for i in range(len(names)):
         alone = [(action[i], label) for action, label in entry.values() if label and [*np.flatnonzero(action)] == [i]]
-        if len(alone) > 1:
-            names[i] = " / ".join(said(label) for _, label in (min(alone), max(alone)))
+        if alone:
+            names[i] = " / ".join(dict.fromkeys(said(label) for _, label in (min(alone), max(alone))))
     return names
 
 
