@@ -15,7 +15,7 @@ from rejeu.core.schedules import Linear
 from rejeu.envs.functional.protocol import of_two_goals
 from rejeu.envs.functional.vector import goal_functions
 from rejeu.replay import device_priorities
-from rejeu.replay.device import DeviceReplay, download, uploaded
+from rejeu.replay.device import DeviceReplay, download, upload
 from rejeu.replay.hindsight import HerReplayBuffer, HindsightConfig, relabeled_positions
 from rejeu.replay.prioritized import Priorities, PriorityConfig
 from rejeu.replay.ring import Ring
@@ -78,9 +78,9 @@ def device_replay(n_envs: int, **settings: Any) -> DeviceReplay:
 def assert_same_batches(replay: DeviceReplay, buffer: Any, stops: bool, exact: bool) -> None:
     """Asserts that device and host return equal batches for equal random numbers."""
     env, key = Reach(stops=stops), jnp.array([3, 4], jnp.uint32)
-    ring = uploaded(replay, buffer.ring)
+    ring = upload(replay, buffer.ring)
     if buffer.priorities is not None:
-        ring = ring._replace(priorities=device_priorities.uploaded(buffer.priorities, [], 1, BATCH))
+        ring = ring._replace(priorities=device_priorities.upload(buffer.priorities, [], 1, BATCH))
     reward, terminated = of_two_goals(env.compute_reward), of_two_goals(env.compute_terminated) if stops else None
     for step in range(3):
         run = SimpleNamespace(replay=buffer, key=key, step=step, rng=None)
@@ -173,7 +173,7 @@ def test_priorities_of_new_steps_equal_those_of_the_host(n: int) -> None:
     buffer.begin(observations(np.random.default_rng(0), N_ENVS))
     buffer.priorities.largest = 3.0
     replay = device_replay(N_ENVS, priorities=buffer.priorities.config)
-    on_device = uploaded(replay, ring)._replace(priorities=device_priorities.uploaded(buffer.priorities, [], 1, BATCH))
+    on_device = upload(replay, ring)._replace(priorities=device_priorities.upload(buffer.priorities, [], 1, BATCH))
 
     @jax.jit
     def write(on_device: Any, step: Any, is_stored: Any) -> Any:
@@ -198,7 +198,7 @@ def test_priorities_of_new_steps_equal_those_of_the_host(n: int) -> None:
 def test_writing_on_the_device_equals_writing_on_the_host(n: int) -> None:
     replay, ring = device_replay(N_ENVS, strategy="future"), ring_of(N_ENVS)
     ring.begin(observations(np.random.default_rng(0), N_ENVS))
-    on_device = uploaded(replay, ring)
+    on_device = upload(replay, ring)
 
     @jax.jit
     def write(on_device: Any, step: Any) -> Any:
@@ -209,7 +209,7 @@ def test_writing_on_the_device_equals_writing_on_the_host(n: int) -> None:
     for step in steps(N_ENVS, n):
         on_device = write(on_device, step)
     host = filled(N_ENVS, n)
-    expected = uploaded(replay, host)
+    expected = upload(replay, host)
     for name in ("obs", "action", "reward", "kind", "head"):
         for one, two in zip(*(jax.tree.leaves(getattr(x, name)) for x in (on_device, expected)), strict=True):
             np.testing.assert_array_equal(one, two, err_msg=name)
@@ -229,7 +229,7 @@ def test_writing_on_the_device_equals_writing_on_the_host(n: int) -> None:
 @pytest.mark.parametrize("n", only([60], [5, 60]))
 def test_rows_of_the_device_are_copied_to_the_host_with_their_counters(n: int) -> None:
     ring, expected = filled(N_ENVS, 1), filled(N_ENVS, n)
-    download(ring, uploaded(device_replay(N_ENVS, strategy="future"), expected))
+    download(ring, upload(device_replay(N_ENVS, strategy="future"), expected))
     for name in ("head", "n_steps"):
         np.testing.assert_array_equal(getattr(ring, name), getattr(expected, name), err_msg=name)
     for env in range(N_ENVS):

@@ -38,7 +38,7 @@ def random_values(n: int, seed: int = 0) -> np.ndarray:
 
 def on_device(priorities: Priorities, *td_errors: Any, most: int = 2) -> device_priorities.DevicePriorities:
     """Returns priorities on the device."""
-    return device_priorities.uploaded(priorities, td_errors, most, BATCH)
+    return device_priorities.upload(priorities, td_errors, most, BATCH)
 
 
 @pytest.mark.parametrize("n", [3, WIDTH, 1_000, 40_000])

@@ -24,7 +24,7 @@ from rejeu.envs.masks import mask_leaf
 from rejeu.envs.registry import maker, register
 from rejeu.export import FORMATS, check, npz_file, target_of
 from rejeu.export.check import Check, SeenSteps
-from rejeu.export.contract import CARD, Exportable, FrameStack, Policy, frame_stack_of, policy_of
+from rejeu.export.contract import CARD_VERSION, Exportable, FrameStack, Policy, frame_stack_of, policy_of
 from rejeu.export.numpy_policy import NumpyPolicy
 from rejeu.replay.ring import stacked_leaves
 from rejeu.training import finite
@@ -153,7 +153,7 @@ def card_of(agent: AnyAgent, policy: Policy, target: str, source: str, duration:
     wide = target in ("onnx", "c")
     narrow = lambda port: port if wide else port._replace(dtype=spaces.narrow(port.dtype))  # noqa: E731
     return {
-        "card": CARD,
+        "card": CARD_VERSION,
         "rejeu": metadata.version("rejeu"),
         "target": target,
         "algorithm": agent.name,

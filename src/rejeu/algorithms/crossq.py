@@ -106,7 +106,7 @@ class Equations(NamedTuple):
     values: Callable[[PyTree, PyTree, Array], Array]
     """``values(critics, obs, action)``: by the running statistics, ``(n_critics, batch)``."""
     measure: Callable[[PyTree, PyTree], tuple[Array, Array]] = lambda errors, target: errors
-    """``measure(extra, (next_action, target))``, as of :class:`rejeu.algorithms.soft.SoftCritic`."""
+    """``measure(outputs, (next_action, target))``, as of :class:`rejeu.algorithms.soft.SoftCritic`."""
     n_outputs: int = 1
     """Of each critic."""
     head: Callable[[Array, int, int], PyTree] = Linear
@@ -156,8 +156,8 @@ def make_with(
         return actor_loss(actor, critics, alpha, batch.obs, key, obs, distribution, equations.values)
 
     def step(*arguments: PyTree) -> tuple[PyTree, PyTree, Array, PyTree]:
-        network, optimizer_state, loss, (extra, trained) = minimize(*arguments)
-        return equations.after_step(with_statistics(network, trained)), optimizer_state, loss, extra
+        network, optimizer_state, loss, (outputs, trained) = minimize(*arguments)
+        return equations.after_step(with_statistics(network, trained)), optimizer_state, loss, outputs
 
     parts = SoftCritic(
         actor=lambda key: network(key, None, 2 * action_dim, shape.actor_widths(config.hidden_layers.actor)),

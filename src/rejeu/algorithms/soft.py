@@ -140,8 +140,8 @@ class SoftCritic(NamedTuple):
     target_entropy: Callable[[PyTree], Scalar]
     """``target_entropy(obs)``: the entropy that the temperature keeps the policy at, in nats, ``()`` or ``(1, n)``."""
     measure: Callable[[PyTree, PyTree], tuple[Array, Array]] = lambda errors, target: errors
-    """``measure(extra, target)``: the values of the actions taken and the TD errors, ``(n_critics, batch)`` each, of what came
-    with the loss, which may be they."""
+    """``measure(outputs, target)``: the values of the actions taken and the TD errors, ``(n_critics, batch)`` each.
+    ``outputs`` came with the loss, and may be they."""
     minimize: Callable[..., tuple[PyTree, PyTree, Array, PyTree]] = minimize
     """How a network takes a step on its loss, as :func:`rejeu.core.algorithm.minimize`."""
     has_targets: bool = True
@@ -191,11 +191,11 @@ def update(
     target_key, actor_key = parts.keys(nth(state.key, state.n_updates))
     rate, alpha = at(config.learning_rate, clock.progress), jnp.exp(state.log_alpha)
     target = without_gradient(parts.target)(state.actor, state.target_critics, alpha, batch, target_key)
-    critics, critics_optimizer, critic_loss, extra = parts.minimize(
+    critics, critics_optimizer, critic_loss, outputs = parts.minimize(
         parts.critics_loss, state.critics, state.critics_optimizer, optimizer, rate, batch, target, actor_key
     )
     state = after_critics(state, critics, critics_optimizer, config)
-    values, error = parts.measure(extra, target)
+    values, error = parts.measure(outputs, target)
     target_entropy = parts.target_entropy(batch.obs)
 
     def improve(state: State) -> tuple[State, Array, Array]:

@@ -194,7 +194,7 @@ def status(
     return " · ".join(parts)
 
 
-def time_spent(before: Mapping[str, float], now: Mapping[str, float]) -> str:
+def time_spent(before: Mapping[str, float], after: Mapping[str, float]) -> str:
     """Returns how the time between two values of ``agent.seconds`` was spent, empty if there is none.
 
     >>> time_spent(
@@ -203,7 +203,7 @@ def time_spent(before: Mapping[str, float], now: Mapping[str, float]) -> str:
     ... )
     'env 12% · buffer 9% · update 70% · rest 9%'
     """
-    passed = {activity: now[activity] - before[activity] for activity in now}
+    passed = {activity: after[activity] - before[activity] for activity in after}
     if passed["total"] <= 0.0:
         return ""
     shares = time_shares(passed).items()

@@ -273,8 +273,8 @@ def merge(data: Path) -> None:
     """
     import h5py
 
-    waiting = parts(data)
-    sources = [path for path in (data / MAIN, *waiting) if path.is_file()]
+    episode_files = parts(data)
+    sources = [path for path in (data / MAIN, *episode_files) if path.is_file()]
     with atomic.replacing(data / MAIN) as replaced, Hdf5Output(replaced.name, "r+b") as sink:
         with h5py.File(sink, "w", libver="latest", track_order=True) as file:
             for path in sources:
@@ -289,5 +289,5 @@ def merge(data: Path) -> None:
     size = round((data / MAIN).stat().st_size / 1e6, 1)
     metadata |= {"total_episodes": len(steps), "total_steps": sum(steps), "dataset_size": size}
     atomic.write(data / METADATA, json.dumps(metadata))
-    for path in waiting:
+    for path in episode_files:
         path.unlink()

@@ -31,8 +31,8 @@ class Recording:
     """A folder with a Minari dataset and a video of the same episodes. Mutable.
 
     The folder is a Minari path. Every complete episode is on disk, and :func:`rejeu.demonstrations.read` finds it even if the
-    process is killed; Minari itself finds it after :meth:`close`, or :func:`rejeu.demonstrations.dataset.merge`. Episodes that
-    cannot be written wait in memory, with a warning, and are tried again. The dataset contains the environment's spec, if an
+    process is killed; Minari itself finds it after :meth:`close`, or :func:`rejeu.demonstrations.dataset.merge`. An
+    episode that cannot be written is lost, with a warning. The dataset contains the environment's spec, if an
     environment can be made from it. An aborted episode ends in a truncation; an episode without steps is left out. The video
     has one frame after each reset and one for each step. The last frame of an episode is shown for half a second.
 

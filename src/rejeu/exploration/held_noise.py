@@ -18,7 +18,7 @@ from jax import Array
 from rejeu.core.algorithm import Clock, Explorer, PyTree
 from rejeu.core.distributions import TanhNormal
 
-EXPONENT = 2.0
+SPELL_EXPONENT = 2.0
 """How fast long spells become rare."""
 
 
@@ -51,5 +51,5 @@ def held_explorer(policy: Callable[[PyTree, PyTree], TanhNormal], action_dim: in
 
 def spells(key: Array, n: int, max_steps: int) -> Array:
     """Returns ``n`` numbers of steps up to ``max_steps``, ``int32 (n,)``, with probabilities proportional to ``steps^-2``."""
-    weights = -EXPONENT * jnp.log(jnp.arange(1, max_steps + 1, dtype=jnp.float32))
+    weights = -SPELL_EXPONENT * jnp.log(jnp.arange(1, max_steps + 1, dtype=jnp.float32))
     return 1 + jax.random.categorical(key, weights, shape=(n,)).astype(jnp.int32)

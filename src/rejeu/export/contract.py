@@ -20,7 +20,7 @@ from rejeu.exploration import explorer as exploration
 from rejeu.export.program import TracedProgram, trace
 
 Role = Literal["observation", "action_mask", "state", "episode_start", "noise", "action"]
-CARD = 1
+CARD_VERSION = 1
 """Version of the layout of cards."""
 
 

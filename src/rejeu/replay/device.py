@@ -301,7 +301,7 @@ def put(store: Array, index: Array, values: Array) -> Array:
     return jax.lax.dynamic_update_slice_in_dim(store, row, row_index, 0)
 
 
-def uploaded(replay: DeviceReplay, ring: Ring) -> DeviceRing:
+def upload(replay: DeviceReplay, ring: Ring) -> DeviceRing:
     """Returns the content of a ring of the host, in which every environment has begun an episode."""
     n = ring.rows * ring.n_envs if replay.strategy is not None else 0
     episode, begins, ends = (np.zeros(n, np.int32) for _ in range(3))

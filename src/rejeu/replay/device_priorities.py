@@ -165,7 +165,7 @@ def updated(
     return jax.lax.fori_loop(0, n_pending, one, priorities)
 
 
-def uploaded(
+def upload(
     priorities: Priorities, td_errors: Sequence[tuple[Draw, AnyArray]], most_updates: int, batch_size: int
 ) -> DevicePriorities:
     """Returns the priorities of the host, and the TD errors that are to change them, which must :func:`fit`."""

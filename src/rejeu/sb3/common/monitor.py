@@ -144,12 +144,6 @@ class Monitor(gym.Wrapper, gym.utils.RecordConstructorArgs):
         check_types(self, state, STATE)
         vars(self).update(state)
 
-    def close(self) -> None:
-        """Writes rows that could not be written before, if possible, and closes the environment."""
-        if self._file is not None:
-            self._file.close()
-        super().close()
-
     def get_total_steps(self) -> int:
         """Returns the total number of steps."""
         return self.total_steps

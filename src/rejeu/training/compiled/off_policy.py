@@ -23,7 +23,7 @@ from rejeu.core.prng import nth
 from rejeu.envs.functional.protocol import FunctionalEnv, GoalEnv, of_two_goals
 from rejeu.envs.masks import FunctionalMask
 from rejeu.replay import device_priorities
-from rejeu.replay.device import DeviceReplay, DeviceRing, DeviceRows, download, uploaded
+from rejeu.replay.device import DeviceReplay, DeviceRing, DeviceRows, download, upload
 from rejeu.replay.device_priorities import Pending, noted
 from rejeu.replay.hindsight import HerReplayBuffer
 from rejeu.replay.prioritized import Draw
@@ -124,9 +124,9 @@ class OffPolicyProgram(Program):
         random = lambda: spaces.random_action(run.env.action_space, self.n_envs, np.random.default_rng(0))  # noqa: E731
         return jnp.array(random() if run.action is None else run.action)
 
-    def uploaded(self, run: Run) -> DeviceRing:
+    def upload(self, run: Run) -> DeviceRing:
         replay, buffer = self.replay, run.replay
-        ring = uploaded(replay, buffer.ring)
+        ring = upload(replay, buffer.ring)
         if buffer.priorities is None:
             return ring
         sizes = replay.most_updates, replay.batch_size
@@ -134,7 +134,7 @@ class OffPolicyProgram(Program):
         if not device_priorities.fit(run.td_errors, *sizes):
             buffer.update_priorities(run.td_errors)
             run.td_errors = []
-        return ring._replace(priorities=device_priorities.uploaded(buffer.priorities, run.td_errors, *sizes))
+        return ring._replace(priorities=device_priorities.upload(buffer.priorities, run.td_errors, *sizes))
 
     def download(self, run: Run, experience: DeviceRing, counts: Counts) -> None:
         download(run.buffer.ring, experience)

@@ -75,7 +75,7 @@ class OnPolicyProgram(Program):
     def action_of(self, run: Run) -> None:
         return None
 
-    def uploaded(self, run: Run) -> Rollout:
+    def upload(self, run: Run) -> Rollout:
         steps: PyTree = jax.tree.map(jnp.array, run.replay.rollout())
         return steps if steps.carry != () else steps._replace(carry=jax.tree.map(jnp.array, run.carry))
 

@@ -202,7 +202,7 @@ class Program(ABC):
         """Returns :attr:`Carry.action`; where none was chosen yet, any of its shape."""
 
     @abstractmethod
-    def uploaded(self, run: Run) -> PyTree:
+    def upload(self, run: Run) -> PyTree:
         """Returns the experience of a run, on the device."""
 
     @abstractmethod
@@ -365,8 +365,8 @@ def random_action(space: gym.Space, n: int, key: Array, mask: Array | None = Non
     """Returns :func:`rejeu.core.spaces.random_action` with the random numbers of a key."""
     if isinstance(space, gym.spaces.Dict | gym.spaces.Tuple):
         keys = [jax.random.fold_in(key, i) for i in range(len(space.spaces))]
-        pairs = zip(spaces.members(space), keys, strict=True)
-        parts = [random_action(member, n, part_key).reshape(n, -1).astype(jnp.float32) for member, part_key in pairs]
+        members = zip(spaces.members(space), keys, strict=True)
+        parts = [random_action(member, n, part_key).reshape(n, -1).astype(jnp.float32) for member, part_key in members]
         return jnp.concatenate(parts, axis=-1)
     return jnp.asarray(spaces.random_action(space, n, KeyGenerator(key), mask))
 

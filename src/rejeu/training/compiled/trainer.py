@@ -80,9 +80,9 @@ class DeviceTrainer:
         """Puts the runs onto the device, with the counters of the run ``leader``."""
         carries = [self.carry_of(i, progress) for i in range(len(self.runs))]
         if len(self.runs) == 1:
-            self.carry, self.experience = carries[0], self.program.uploaded(self.runs[0])
+            self.carry, self.experience = carries[0], self.program.upload(self.runs[0])
         else:
-            stores = [jax.device_get(self.program.uploaded(run)) for run in self.runs]
+            stores = [jax.device_get(self.program.upload(run)) for run in self.runs]
             self.carry = with_shared(stacked(carries), carries[leader])
             self.experience = with_shared(stacked(stores), stores[leader])
 
