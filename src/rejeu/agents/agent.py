@@ -751,10 +751,6 @@ class Agent(AnyAgent):
             env.venv = rejeu.to_vec_env(env)
         return env.venv
 
-    def set_logger(self, logger: Logger) -> None:
-        """Replaces the console and the outputs of ``log`` by those of a logger."""
-        self.logger = logger
-
     def set_env(self, env: Any, force_reset: bool = True) -> None:
         """Replaces the environment by another with the same spaces; new episodes start there.
 

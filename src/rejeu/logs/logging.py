@@ -309,19 +309,15 @@ def import_tensorboard() -> tuple[Any, Any]:
 class Logger:
     """Collects metrics of callbacks until they are written.
 
-    Args:
-        folder: folder of its files, None for none.
-        output_formats: sinks that replace console and TensorBoard.
-
     >>> logger = Logger()
     >>> logger.record("game/score", 3)
     >>> logger.take()
     {'game/score': 3}
     """
 
-    def __init__(self, folder: str | Path | None = None, output_formats: Iterable[Sink] = ()) -> None:
-        self.dir = None if folder is None else str(folder)
-        self.outputs = list(output_formats)
+    def __init__(self) -> None:
+        self.outputs: list[Sink] = []
+        """The outputs of the current ``learn``."""
         self.name_to_value: dict[str, float] = {}
         """Metrics recorded since the last row."""
         self.name_to_count: dict[str, int] = {}
@@ -333,7 +329,7 @@ class Logger:
         Args:
             key: name of the metric, ``group/name``.
             value: a number.
-            exclude: accepted without effect; every output gets every metric.
+            exclude: for callbacks of Stable-Baselines3; every output gets every metric.
 
         Raises:
             TypeError: if the value is not a number.
@@ -369,34 +365,8 @@ class Logger:
             if isinstance(output, Tracker):
                 output.write_video(step, Path(path))
 
-    def get_dir(self) -> str | None:
-        """Returns the folder of its files."""
-        return self.dir
 
-    def close(self) -> None:
-        """Closes the outputs."""
-        for output in self.outputs:
-            output.close()
-
-
-def configure(folder: str | Path | None = None, format_strings: Sequence[str] | None = None) -> Logger:
-    """Returns a logger for ``agent.set_logger``.
-
-    Args:
-        folder: folder of the files, None for the current folder.
-        format_strings: any of ``"stdout"``, ``"csv"`` (``progress.csv``), ``"json"`` (``progress.json``, JSON lines),
-            ``"tensorboard"``, ``"wandb"``, ``"mlflow"`` and ``"trackio"``; None for ``"stdout"``.
-
-    Raises:
-        ValueError: for another format.
-        MissingExtra: if its package is not installed.
-    """
-    folder = Path("." if folder is None else folder)
-    names = ["stdout"] if format_strings is None else check_logs("format_strings", format_strings, ("stdout", *LOGS))
-    return Logger(folder, [Console() if name == "stdout" else open_log(name, folder) for name in names])
-
-
-def check_logs(name: str, value: str | Iterable[str], among: Sequence[str] = LOGS) -> tuple[str, ...]:
+def check_logs(name: str, value: str | Iterable[str]) -> tuple[str, ...]:
     """Returns the names of logs that an argument gives, each once.
 
     Raises:
@@ -404,8 +374,8 @@ def check_logs(name: str, value: str | Iterable[str], among: Sequence[str] = LOG
     """
     names = tuple(dict.fromkeys([value] if isinstance(value, str) else value))
     for log_name in names:
-        if log_name not in among:
-            raise ValueError(f"{name} contains {log_name!r}, expected any of {', '.join(map(repr, among))}")
+        if log_name not in LOGS:
+            raise ValueError(f"{name} contains {log_name!r}, expected any of {', '.join(map(repr, LOGS))}")
     return names
 
 

@@ -555,8 +555,7 @@ class Original(Agent):
 
     def set_logger(self, logger: Any) -> None:
         """Replaces the logger for all further training."""
-        super().set_logger(logger)
-        self.has_own_logger = True
+        self.logger, self.has_own_logger = logger, True
 
     def save(self, path: Any, exclude: Iterable[str] | None = None, include: Iterable[str] | None = None) -> Any:
         """Writes the model to exactly this path, or to a file object; ``.zip`` is added to a path without a suffix.

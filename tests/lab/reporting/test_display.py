@@ -100,11 +100,10 @@ def test_verbose_training_keeps_one_table_up_to_date(notebook, tmp_path, capsys)
     assert capsys.readouterr().out == ""
 
 
-def test_a_configured_logger_prints_every_row(capsys):
-    logger = rejeu.logs.logging.configure(format_strings=["stdout"])
+def test_a_console_without_pauses_prints_every_row(capsys):
+    console = rejeu.logs.logging.Console()
     for step in range(3):
-        logger.record("train/loss", 0.5)
-        logger.dump(step)
+        console.write(step, {"train/loss": 0.5})
     assert capsys.readouterr().out.count("step ") == 3
 
 

@@ -327,7 +327,9 @@ class Logger(logging.Logger):
     """
 
     def __init__(self, folder: str | Path | None, output_formats: Sequence[KVWriter]) -> None:
-        super().__init__(folder, [_Rows(self)])
+        super().__init__()
+        self.dir = None if folder is None else str(folder)
+        self.outputs = [_Rows(self)]
         self.output_formats = [*output_formats]
         self.level = INFO
         self.name_to_excluded: dict[str, str | tuple[str, ...] | None] = {}
@@ -380,6 +382,10 @@ class Logger(logging.Logger):
     def set_level(self, level: int) -> None:
         """Sets the lowest level that is printed."""
         self.level = level
+
+    def get_dir(self) -> str | None:
+        """Returns the folder of its files."""
+        return self.dir
 
     def close(self) -> None:
         """Closes the outputs."""
