@@ -14,7 +14,7 @@ import pytest
 import rejeu
 from rejeu.callbacks import Checkpoint, Evaluate
 from rejeu.checkpoints.run_folder import checkpoint_files
-from rejeu.core import checkpoint, xla
+from rejeu.core import checkpoint, hardware, xla
 from rejeu.core.errors import BadEnvironmentError, CheckpointError, RunInUseError
 from rejeu.envs.functional.gym_env import GymnasiumEnv
 from rejeu.envs.make import InProcess
@@ -296,7 +296,7 @@ def test_the_number_of_threads_is_saved_and_a_resumed_run_says_if_it_has_another
     assert header["threads"] == xla.threads()
     asked = []
     monkeypatch.setattr(xla, "start_device", asked.append)
-    monkeypatch.setattr(xla, "cores", lambda: 64)
+    monkeypatch.setattr(hardware, "cores", lambda: 64)
     assert rejeu.SAC.resume(tmp_path).resumed.exact
     assert asked == [header["threads"]]  # and not what suits an agent with one environment
     monkeypatch.setattr(xla, "threads", lambda: header["threads"] + 1)

@@ -159,8 +159,6 @@ def test_a_pool_that_does_not_repeat_its_episodes_begins_new_ones(tmp_path):
         obs = one.reset().copy()
         with pytest.raises(DivergedError, match="does not repeat"):
             one.restore(one.snapshot(), obs + 1.0)
-        with pytest.raises(DivergedError, match=r"before version 0\.1"):
-            one.restore({"seed": 1, "n_operations": 0, "blocks": []}, obs)
     settings = {"policy_kwargs": {"net_arch": [8]}, "learning_starts": 10, "batch_size": 8, "buffer_size": 200}
     stop = lambda agent, turn: turn.step < 40  # noqa: E731
     rejeu.DQN("MlpPolicy", env(), seed=1, **settings).learn(100, [stop, Checkpoint(tmp_path)])

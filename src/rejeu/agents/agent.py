@@ -298,10 +298,9 @@ class Agent(AnyAgent):
 
     def n_threads(self, n_envs: int) -> int:
         """Returns how many threads JAX should use: all for images and large layers, else one."""
-        if any(leaf.kind == "image" for leaf in self.obs_leaves):
-            return hardware.cores()
         weights = [leaf.size for leaf in jax.tree.leaves(self.learner.shapes) if len(leaf.shape) > 1]
-        return xla.threads_for(self.gradient_batch_size(n_envs) * max(weights, default=0))
+        is_much = self.gradient_batch_size(n_envs) * max(weights, default=0) > xla.LITTLE_WORK
+        return hardware.cores() if is_much or any(leaf.kind == "image" for leaf in self.obs_leaves) else 1
 
     def start_run(self, env: VectorEnv | None, state: PackedState | None = None) -> None:
         """Starts a run on ``env`` with an empty buffer; without ``env`` the agent only predicts.

@@ -26,8 +26,6 @@ class RolloutConfig(AlgorithmConfig):
 
     max_grad_norm: float | None = 0.5
 
-    needs_whole_episodes: ClassVar[bool] = False
-    """Whether an episode that was cut at the end of a run would be taken for a whole one."""
     hidden_layers: ClassVar[Widths] = Widths((64, 64), (64, 64))
     hidden_layers_on_images: ClassVar[Widths] = Widths((), ())
     search_space: ClassVar[SearchSpace] = search.ROLLOUT

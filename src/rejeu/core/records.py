@@ -171,8 +171,7 @@ def utf8(text: object) -> str:
 
 def brief(error: BaseException) -> str:
     """Returns the message of an error on one line, shortened."""
-    text = printable(" ".join((str(error) or type(error).__name__).split()))
-    return text if len(text) <= 400 else text[:397] + "..."
+    return shown(" ".join((str(error) or type(error).__name__).split()), 400)
 
 
 def _received(value: Any, path: str) -> str:

@@ -64,11 +64,6 @@ def enable_cache() -> None:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 
-def threads_for(work: float) -> int:
-    """Returns the number of threads for an update whose largest layer takes ``work`` multiplications."""
-    return 1 if work <= LITTLE_WORK else cores()
-
-
 def start_device(n_threads: int) -> None:
     """Starts JAX's device, on a CPU with ``n_threads`` threads.
 

@@ -54,11 +54,6 @@ class ActionLog:
         self._codes, self._flags, self._actions = bytearray(), bytearray(), bytearray()
 
     @property
-    def n_operations(self) -> int:
-        """Number of steps and resets."""
-        return len(self._codes)
-
-    @property
     def most_operations(self) -> int:
         """Maximum number of operations of a log: steps of single environments, each followed by a reset."""
         return 4 * self._most_steps + 2

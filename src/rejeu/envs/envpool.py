@@ -117,8 +117,6 @@ class EnvPool(VectorEnv):
         return {"seed": seed, **self._log.to_plain()}
 
     def restore(self, saved: object, obs: Observation) -> list[int]:
-        if isinstance(saved, dict) and "blocks" in saved:
-            raise DivergedError(f"the actions in {self.env_id} were recorded before version 0.1, in another form")
         if not isinstance(saved, dict) or {*saved} != {"seed", "codes", "flags", "actions"}:
             raise ValueError("the record of actions is not one of EnvPool")
         self._pool.close()

@@ -286,9 +286,7 @@ def time_chart(table: Table) -> Chart | None:
     return {"y": "", "percent": True, "range": [0, 1], "series": shown_series, "note": ""}
 
 
-def histogram(
-    values: np.ndarray, columns: Mapping[str, np.ndarray], command: str = "", listed: int = LISTED
-) -> Chart | None:
+def histogram(values: np.ndarray, columns: Mapping[str, np.ndarray], command: str = "") -> Chart | None:
     """Returns the histogram of returns, with the episodes behind each bar; None without any return.
 
     The bars cover all but the extreme half percent, which the first and the last bar contain too.
@@ -297,7 +295,6 @@ def histogram(
         values: returns of the episodes, ``(n,)``.
         columns: what is listed of each episode, by name, ``(n,)``.
         command: how to see the episode of seed ``N``, if the columns contain seeds.
-        listed: most episodes of a bar that are listed, evenly spaced in time.
     """
     rows_known = np.flatnonzero(usable(values))
     if not len(rows_known):
@@ -311,7 +308,7 @@ def histogram(
     edges = np.linspace(low, high, n_bars + 1)
     bar = np.clip(np.searchsorted(edges, values[rows_known], "right") - 1, 0, n_bars - 1)
     members = [rows_known[bar == i] for i in range(n_bars)]
-    listed_rows = [rows_of_bar[thinned(len(rows_of_bar), listed)] for rows_of_bar in members]
+    listed_rows = [rows_of_bar[thinned(len(rows_of_bar), LISTED)] for rows_of_bar in members]
     rows = [
         [plain(row) for row in np.array([column[rows_of_bar] for column in columns.values()]).T]
         for rows_of_bar in listed_rows
