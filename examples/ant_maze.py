@@ -120,7 +120,7 @@ walk = presets.Preset(
 directed = presets.Preset(
     **SHARED | {"evaluate_every": 5_000},
     env_id="AntMazeDirected-v0",
-    total_steps=20_000,
+    total_steps=10_000,
     hyperparameters={
         "action_repeat": 10,
         "replay_buffer_class": "HerReplayBuffer",
