@@ -79,7 +79,6 @@ OPENED_ELSEWHERE = {
     ("c_file.py", "c_run"),
     ("c_file.py", "run"),
     ("algorithms.py", "readable"),
-    ("interrupt.py", "by_parent"),  # the lock that the scheduler has made
     ("atomic.py", "open_file"),
     ("atomic.py", "lock"),
 }
@@ -130,7 +129,7 @@ def test_warnings_are_not_written_to_the_target_of_a_link(link):
 
 def test_the_log_of_a_process_is_no_link(link, tmp_path):
     with pytest.raises(OSError, match="is a symbolic link; remove it"):
-        Process(["list"], link, tmp_path / "lock", dict(os.environ))
+        Process(["list"], link, dict(os.environ))
 
 
 def test_a_curve_takes_the_place_of_a_link(link):

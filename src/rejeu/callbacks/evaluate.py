@@ -135,12 +135,10 @@ class Evaluate(TrainingCallback):
         """Restores what :meth:`state_dict` returned."""
         ends = np.cumsum(state["counts"])[:-1]
         returns, lengths, successes = (np.split(state[key], ends) for key in EVALUATED)
-        steps = state["steps"]
-        cut = state["cut"]
-        parts = zip(steps.tolist(), returns, lengths, successes, cut.tolist(), strict=False)
+        parts = zip(state["steps"].tolist(), returns, lengths, successes, state["cut"].tolist(), strict=False)
         self.results = [Evaluated(step, Evaluation(r, n.astype(int), s, c)) for step, r, n, s, c in parts]
         self.best = None if state["best"] is None else self.results[state["best"]]
-        self._is_due = state.get("due", False)
+        self._is_due = state["due"]
 
     def close(self) -> None:
         """Closes the environments, unless they were given as objects."""

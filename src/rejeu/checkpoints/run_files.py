@@ -94,12 +94,11 @@ class CheckpointFolder:
         self._lock = atomic.lock(folder / "lock")
         self._named: dict[Path, list[str]] = {}
 
-    def open(self) -> None:
-        """Makes the folder and locks it for this process.
+    def lock(self) -> None:
+        """Makes the folder and locks it for this process, until it is closed as often as it was locked and opened.
 
         Raises:
             RunInUseError: if another process holds the lock.
-            FileExistsError: if the folder contains the checkpoints of another run.
         """
         atomic.make_folder(self.folder)
         try:
@@ -108,6 +107,15 @@ class CheckpointFolder:
             raise RunInUseError(
                 f"another process is training in {self.folder}; wait for it, stop it, or give Checkpoint another folder"
             ) from None
+
+    def open(self) -> None:
+        """Locks the folder, and removes incomplete files of a process that died.
+
+        Raises:
+            RunInUseError: if another process holds the lock.
+            FileExistsError: if the folder contains the checkpoints of another run.
+        """
+        self.lock()
         try:
             self._check_owner()
             for path in self.folder.glob(".*.tmp"):  # of a process that died while it wrote

@@ -1,9 +1,9 @@
 """Requests to stop training after the current step, and the end of the command ``rejeu``.
 
 They come by Ctrl-C, SIGTERM and SIGHUP, and in a process that trains for another, such as a run of a sweep, from that
-supervisor: it sets the environment variable :data:`LOCK` and keeps the standard input of the process open. The process holds
-the lock as long as it lives. When its standard input ends, because the supervisor asks it to stop or has died, it stops as
-after SIGTERM: with a checkpoint. This needs no signals, so it works on every system.
+supervisor: it sets the environment variable :data:`SUPERVISED` and keeps the standard input of the process open. When this
+ends, because the supervisor asks it to stop or has died, the process stops as after SIGTERM: with a checkpoint. This needs no
+signals, so it works on every system.
 
 A signal handler here only raises an exception if a second signal arrives. Python runs handlers between any two
 instructions of the main thread, also inside callbacks of C libraries (JAX's garbage collection), which print and
@@ -177,14 +177,12 @@ def is_command() -> bool:
     return path.name.lower() in ("rejeu", "rejeu.exe", "rejeu-script.py") or path.parts[-2:] == ("rejeu", "__main__.py")
 
 
-LOCK = "REJEU_SUPERVISED"
-"""Environment variable with the path of the lock."""
-PATIENCE = 60.0
-"""Seconds to wait for the lock, which an earlier process of the run may still hold."""
+SUPERVISED = "REJEU_SUPERVISED"
+"""Environment variable of a process that another one supervises."""
 GRACE = 300.0
 """Seconds after which a process that does not stop is ended."""
 TAKEN = 75
-"""Exit status if another process holds the lock all the time."""
+"""Exit status of such a process if another one trains the same run."""
 
 
 def program(*words: str) -> list[str]:
@@ -192,26 +190,10 @@ def program(*words: str) -> list[str]:
     return [sys.executable, "-P", *words]
 
 
-@contextmanager
-def by_parent() -> Iterator[None]:
-    """Context of a process that another one supervises; without the environment variable it does nothing."""
-    path = os.environ.pop(LOCK, None)
-    if path is None:
-        yield
-        return
-    threading.Thread(target=stop_at_end, args=(detached_input(),), daemon=True).start()
-    from filelock import FileLock, Timeout
-
-    lock = FileLock(path)
-    try:
-        lock.acquire(timeout=PATIENCE)
-    except Timeout:
-        print(f"rejeu: another process of this run holds {path}", flush=True)
-        raise SystemExit(TAKEN) from None
-    try:
-        yield
-    finally:
-        lock.release()
+def by_parent() -> None:
+    """Lets a process end with the one that supervises it; without the environment variable it does nothing."""
+    if os.environ.pop(SUPERVISED, None) is not None:
+        threading.Thread(target=stop_at_end, args=(detached_input(),), daemon=True).start()
 
 
 def detached_input() -> int:

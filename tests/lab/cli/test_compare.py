@@ -130,7 +130,6 @@ def test_runs_are_followed_until_ctrl_c(runs):
         if "PPO_2" in line:
             break
     (runs / "DQN_0" / "agent.safetensors").unlink()
-    (runs / "DQN_0" / "lock").touch()
     for line in ended.stdout:
         if "DQN_0" in line:
             break

@@ -29,11 +29,11 @@ def other_program(monkeypatch):
     """Runs another program in the place of ``rejeu``, and writes the run folders."""
     start = process.LocalLauncher.start
 
-    def start_other(self, task, log, lock):
+    def start_other(self, task, log):
         content = json.loads(task.read_text(encoding="utf-8"))
         seed = content["run"]["seed"]
         write_run(Path(content["folder"]), seed=seed, level=10.0 + seed)
-        return start(self, task, log, lock)
+        return start(self, task, log)
 
     monkeypatch.setattr(process.LocalLauncher, "start", start_other)
     monkeypatch.setattr(process, "program", lambda task: [sys.executable, "-c", PROGRAM, str(task)])
@@ -110,10 +110,10 @@ def test_a_mistake_is_found_before_anything_starts(tmp_path, capsys):
 def test_a_seed_that_cannot_be_started_is_left_and_said(tmp_path, monkeypatch, other_program, capsys):
     start = process.LocalLauncher.start
 
-    def full(self, task, log, lock):
+    def full(self, task, log):
         if "seed_1" in log.name:
             raise OSError(28, "No space left on device")
-        return start(self, task, log, lock)
+        return start(self, task, log)
 
     monkeypatch.setattr(process.LocalLauncher, "start", full)
     out = tmp_path / "out"

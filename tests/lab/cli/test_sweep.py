@@ -32,10 +32,10 @@ CHILD = """
 import signal, sys, time
 from rejeu.core import interrupt
 signal.signal(signal.SIGTERM, lambda *_: (print("stopping", flush=True), sys.exit(143)))
-with interrupt.by_parent():
-    print(repr(sys.stdin.read()), flush=True)
-    for _ in range(600):  # Python handles a signal of another thread between two calls
-        time.sleep(0.1)
+interrupt.by_parent()
+print(repr(sys.stdin.read()), flush=True)
+for _ in range(600):  # Python handles a signal of another thread between two calls
+    time.sleep(0.1)
 """
 
 
@@ -57,16 +57,15 @@ def assert_equal(one, other):
 
 
 @pytest.fixture
-def child(tmp_path):
-    lock = tmp_path / "lock"
+def child():
     process = subprocess.Popen(
         [sys.executable, "-c", CHILD],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
-        env={**os.environ, interrupt.LOCK: str(lock)},
+        env={**os.environ, interrupt.SUPERVISED: "1"},
         text=True,
     )
-    yield process, lock
+    yield process
     process.kill()
     process.wait()
     process.stdin.close()
@@ -74,12 +73,10 @@ def child(tmp_path):
 
 
 def test_a_supervised_process_stops_when_its_input_ends(child):
-    process, lock = child
-    assert process.stdout.readline() == "''\n"  # what it starts does not read from the pipe
-    assert lock.is_file()
-    process.stdin.close()
-    assert process.stdout.readline() == "stopping\n"
-    assert process.wait(10) == 143
+    assert child.stdout.readline() == "''\n"  # what it starts does not read from the pipe
+    child.stdin.close()
+    assert child.stdout.readline() == "stopping\n"
+    assert child.wait(10) == 143
 
 
 def test_a_mistake_in_the_plan(tmp_path, capsys):

@@ -21,7 +21,7 @@ SMALL = ["--steps", "40", "--evaluate-every", "10", "--only", "learning_rate", "
 @pytest.fixture
 def pretend(monkeypatch):
     """Lets trainings pretend, in this process."""
-    monkeypatch.setattr(process.LocalLauncher, "start", lambda self, task, log, lock: Pretended(task, log, lock))
+    monkeypatch.setattr(process.LocalLauncher, "start", lambda self, task, log: Pretended(task, log))
     monkeypatch.setattr("rejeu.lab.experiments.scheduler.POLL", 0)
 
 
@@ -81,12 +81,12 @@ def test_a_study_without_a_complete_trial_exits_with_2(pretend, tmp_path, capsys
 def test_a_study_of_which_a_trial_cannot_be_started_goes_on_later(pretend, tmp_path, monkeypatch, capsys):
     words, start, n_started = ["--trials", "2", "--final-seeds", "0", "--workers", "1"], process.LocalLauncher.start, 0
 
-    def full(self, task, log, lock):
+    def full(self, task, log):
         nonlocal n_started
         n_started += 1
         if n_started > 1:
             raise OSError(28, "No space left on device")
-        return start(self, task, log, lock)
+        return start(self, task, log)
 
     monkeypatch.setattr(process.LocalLauncher, "start", full)
     assert tune(*words, out=tmp_path / "study") == 1

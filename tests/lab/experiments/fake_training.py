@@ -71,7 +71,7 @@ def train(task: dict, say: Callable[[str], object] = print) -> Iterator[None]:
 class Pretended:
     """A process that the scheduler looks at: each look is a turn."""
 
-    def __init__(self, task, log, lock):
+    def __init__(self, task, log):
         self.turns, self.status = train(json.loads(task.read_text()), lambda text: log.write_text(text + "\n")), None
 
     def poll(self):

@@ -125,7 +125,7 @@ def test_ctrl_c_stops_the_runs_with_a_checkpoint(nodes, undisturbed, tmp_path):
 def make_spec(tmp_path, code, **changes):
     marker = launcher.write_marker(tmp_path)
     (tmp_path / "task").write_text(code, encoding="utf-8")
-    paths = (str(tmp_path / name) for name in ("task", "log", "lock", "stop"))
+    paths = (str(tmp_path / name) for name in ("task", "log", "stop"))
     spec = launcher.Spec(*paths, marker, str(tmp_path), {}, cluster.versions(launcher.PACKAGES))
     return spec._replace(**changes)
 

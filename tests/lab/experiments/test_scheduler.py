@@ -51,7 +51,7 @@ class Launcher:
         self.most = 0
         self.handles = []
 
-    def start(self, task, log, lock):
+    def start(self, task, log):
         content = json.loads(task.read_text())
         run = Path(content["folder"])
         self.started.append(("resume" if content["resume"] else "train", run.name))
@@ -302,7 +302,8 @@ def test_code_that_the_command_line_names_again_is_trusted(tmp_path):
 def test_a_run_waits_for_a_process_that_still_ends(tmp_path):
     folder, launcher = make_folder(tmp_path, 1), Launcher()
     (work,) = folder.works()
-    orphan = FileLock(work.lock)  # of a process that outlived the one that started it
+    work.files.checkpoints.mkdir(parents=True)
+    orphan = FileLock(work.files.lock)  # of a process that outlived the one that started it
     orphan.acquire()
     looks = iter(range(100))
 

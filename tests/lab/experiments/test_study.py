@@ -30,7 +30,7 @@ RATE = {"learning_rate": LogUniform(1e-5, 4e-3)}
 def pretend():
     """Lets trainings pretend, in this process."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(process.LocalLauncher, "start", lambda self, task, log, lock: Pretended(task, log, lock))
+        patch.setattr(process.LocalLauncher, "start", lambda self, task, log: Pretended(task, log))
         patch.setattr("rejeu.lab.experiments.scheduler.POLL", 0)
         yield
 
@@ -119,7 +119,7 @@ def test_an_interrupted_study_continues_as_if_it_had_not_been_interrupted(whole,
     assert (first.complete, first.signal) == (False, 2)
     assert [record["state"] for record in records(first)] == ["complete", "complete", "running"]
     monkeypatch.undo()
-    monkeypatch.setattr(process.LocalLauncher, "start", lambda self, task, log, lock: Pretended(task, log, lock))
+    monkeypatch.setattr(process.LocalLauncher, "start", lambda self, task, log: Pretended(task, log))
     monkeypatch.setattr("rejeu.lab.experiments.scheduler.POLL", 0)
     assert facts(run(resumed(tmp_path / "study"))) == facts(whole)
     begun = commands(tmp_path / "study")

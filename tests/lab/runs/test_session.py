@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+import os
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -13,9 +14,12 @@ from filelock import FileLock
 from rejeu.callbacks.evaluate import Evaluated
 from rejeu.checkpoints.run_folder import RunFolder
 from rejeu.core import xla
+from rejeu.core.interrupt import TAKEN
 from rejeu.lab.cli import main
 from rejeu.lab.reporting import rows, run_list
 from rejeu.lab.runs import output, session
+from rejeu.lab.runs.config import RunConfig, Task, write_task
+from rejeu.lab.runs.read import read_run
 from rejeu.lab.runs.session import TrainingLimits
 from rejeu.logs.evaluation import Evaluation
 from rejeu.logs.logging import CsvFile
@@ -107,6 +111,30 @@ def test_a_run_in_use_is_not_resumed_and_its_files_stay(tmp_path, capsys):
         assert main(["resume", str(tmp_path)]) == 2
     assert "another process is training in" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["checkpoints"]
+
+
+def test_a_run_without_checkpoints_is_running_while_it_trains_and_not_in_its_report(tmp_path, monkeypatch):
+    states, out = [], tmp_path / "run"
+
+    def look(*_):
+        os.utime(out / "config.json", (0, 0))  # as if nothing was written for a long time
+        states.append(read_run(out).state)
+
+    monkeypatch.setattr(session.Requests, "before_training", look)
+    monkeypatch.setattr(session.Session, "write_report", lambda _: states.append(read_run(out).state))
+    argv = ["train", "CartPole-v1", "--algo", "DQN", "--steps", "20", "--no-video", "--out", str(out)]
+    assert main([*argv, "--checkpoint-minutes", "0", "--evaluate-episodes", "1"]) == 0
+    assert states == ["running", "finished"]
+
+
+def test_a_process_of_a_sweep_says_that_another_one_trains_its_run(tmp_path):
+    folder, task = RunFolder(tmp_path / "run"), tmp_path / "run.task"
+    folder.checkpoints.mkdir(parents=True)
+    for is_begun in (False, True):
+        run = RunConfig(env="CartPole-v1", algorithm="DQN", steps=20, seed=0)
+        write_task(task, Task(folder=str(folder.path), run=run, resume=is_begun))
+        with FileLock(folder.lock):
+            assert main(["--task", str(task)]) == TAKEN
 
 
 @pytest.mark.parametrize(("steps", "is_due"), [([], True), ([100], True), ([100, 200], False)])

@@ -5,10 +5,12 @@ import math
 import os
 import threading
 import time
+from contextlib import nullcontext
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from filelock import FileLock
 
 pytest.importorskip("nicegui", reason="needs nicegui, which is in the extra studio")
 
@@ -51,6 +53,12 @@ def watched(folder, monkeypatch):
     one.close()
 
 
+def locked(folder):
+    """Returns the lock that the process of a run holds while it trains."""
+    folder.checkpoints.mkdir(exist_ok=True)
+    return FileLock(folder.lock)
+
+
 def until(condition):
     end = time.monotonic() + 60
     while not condition():
@@ -84,8 +92,8 @@ def test_new_weights_are_taken_while_the_run_trains(watched, agents, folder):
 
 @pytest.mark.usefixtures("watched")
 def test_nobody_is_asked_once_the_run_has_ended_and_no_request_is_left(folder):
-    until(lambda: folder.watch.exists())  # nothing says that no process trains
-    (folder.path / "lock").touch()
+    with locked(folder):
+        until(lambda: folder.watch.exists())
     folder.watch.unlink()
     time.sleep(0.2)  # four looks for new weights
     assert not folder.watch.exists()
@@ -135,12 +143,11 @@ def test_an_environment_of_any_speed_is_stepped_at_a_thousand_a_second(folder, m
 def test_a_run_that_has_ended_without_a_model_does_not_promise_one(folder):
     for path in (folder.agent, folder.best, folder.models / "step_000000000021.safetensors"):
         path.unlink()
-    for is_over, text in ((False, "within seconds"), (True, "the run has ended before it wrote one")):
-        if is_over:
-            (folder.path / "lock").touch()
-        one = LivePlayer(folder.path, RunOptions(), lambda *_: None)
-        until(lambda one=one: one.problem)
-        one.close()
+    for lock, text in ((locked(folder), "within seconds"), (nullcontext(), "the run has ended before it wrote one")):
+        with lock:
+            one = LivePlayer(folder.path, RunOptions(), lambda *_: None)
+            until(lambda one=one: one.problem)
+            one.close()
         assert text in one.problem
 
 

@@ -54,7 +54,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
     hardware.quiet_sdl()
-    with interrupt.leaving(), interrupt.by_parent(), warnings.catch_warnings():
+    with interrupt.leaving(), warnings.catch_warnings():
+        interrupt.by_parent()
         warnings.showwarning = show_warning
         status = run_command(argv)
     if status in (128 + number for number in interrupt.NAMES):
@@ -64,8 +65,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def run_command(argv: Sequence[str]) -> int:
     """Parses a command line, runs the command and returns the exit status."""
+    is_task = [*argv[:1]] == ["--task"] and len(argv) == 2
     try:
-        is_task = [*argv[:1]] == ["--task"] and len(argv) == 2
         command, arguments = (
             of_task(read_task(Path(argv[1]))) if is_task else parsing.parse(argv, COMMANDS, TASKS, DESCRIPTION)
         )
@@ -88,7 +89,8 @@ def run_command(argv: Sequence[str]) -> int:
             raise
         has_trace = isinstance(error, errors.WorkerError)  # of the environment's code
         print(f"rejeu: error: {error if has_trace else errors.one_line(error)}{place_of(error)}", file=sys.stderr)
-        return 2
+        was_slower = is_task and isinstance(error, errors.RunInUseError | FileExistsError)
+        return interrupt.TAKEN if was_slower else 2
 
 
 def show_warning(message: Warning | str, *_: object, **__: object) -> None:

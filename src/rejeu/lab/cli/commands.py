@@ -329,8 +329,6 @@ class Report(RunOptions):
     """File to write; by default report.html in the folder of a single run, else in the current folder."""
     open: bool = False
     """Open the page in the web browser."""
-    live: bool = False
-    """Is now rejeu studio RUN, which follows runs while they train."""
     replay: Count = None
     """First let the trained agent play this many episodes, from the seeds 0, 1, 2 ...; the page lists them by return."""
 

@@ -23,8 +23,6 @@ def run_report(arguments: Report) -> tuple[int, None]:
     Raises:
         ValueError: for a file that is no page.
     """
-    if arguments.live:
-        raise ValueError("--live is now the studio, which follows runs while they train: rejeu studio RUN")
     if arguments.out is not None and arguments.out.suffix.lower() not in SUFFIXES:
         raise ValueError(f"--out {arguments.out} must end in {' or '.join(SUFFIXES)}")
     for path in arguments.runs if arguments.replay is not None else ():

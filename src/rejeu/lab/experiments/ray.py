@@ -50,7 +50,6 @@ class Spec(NamedTuple):
     task: str
     """File with what the process is asked to do."""
     log: str
-    lock: str
     stop: str
     """File that asks the run to stop."""
     marker: str
@@ -80,7 +79,7 @@ def train(spec: Spec) -> int:
     check_node(*look(spec.marker), where, spec.versions, spec.marker)
     folder, stop = Path(spec.folder), Path(spec.stop)
     environ = {**os.environ, **spec.environ}
-    process = Process(Path(spec.task), Path(spec.log), Path(spec.lock), environ, folder if folder.is_dir() else None)
+    process = Process(Path(spec.task), Path(spec.log), environ, folder if folder.is_dir() else None)
     kill_at = math.inf
     try:
         while (status := process.poll()) is None:
@@ -190,16 +189,15 @@ class RayLauncher:
             self._capacity = room if self._workers is None else min(room, self._workers)
         return self._capacity
 
-    def start(self, task: Path, log: Path, lock: Path) -> RayRun:
+    def start(self, task: Path, log: Path) -> RayRun:
         """Starts a run."""
         description = read_task(task)
         write_task(task, replace(description, folder=str(Path(description.folder).resolve())))
-        stop = lock.with_suffix(".stop")
+        stop = task.with_suffix(".stop")
         stop.unlink(missing_ok=True)
         spec = Spec(
             task=str(task.resolve()),
             log=str(log.resolve()),
-            lock=str(lock.resolve()),
             stop=str(stop.resolve()),
             marker=self._marker,
             folder=os.getcwd(),

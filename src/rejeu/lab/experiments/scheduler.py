@@ -61,7 +61,7 @@ class Launcher(Protocol):
     def capacity(self) -> int:
         """Runs at once; may change."""
 
-    def start(self, task: Path, log: Path, lock: Path) -> Handle:
+    def start(self, task: Path, log: Path) -> Handle:
         """Starts a run with the command line ``rejeu --task FILE``."""
 
     def close(self) -> None:
@@ -194,9 +194,9 @@ class Scheduler:
         """Starts a run, from its newest checkpoint if there is one."""
         try:
             first = newest_step(work.files.checkpoints)
-            file = work.lock.with_suffix(".task")
+            file = work.claim.with_suffix(".task")
             write_task(file, work.task())
-            handle = self.launcher.start(file, work.log, work.lock)
+            handle = self.launcher.start(file, work.log)
         except OSError as error:
             claim.release()
             self._leave(work, error)

@@ -5,7 +5,6 @@ The state of a run follows from its files, so several processes and machines may
     NAME/                   run folder
     NAME.log                what its processes printed
     .sweep/NAME.claim       locked by the process that looks after the run
-    .sweep/NAME.run         locked by the process that trains
     .sweep/NAME.exit        exit status of a run that is done (0) or has failed
     .sweep/aside/           run folders that ended before their first checkpoint
 """
@@ -23,7 +22,6 @@ from msgspec import Meta
 
 from rejeu.checkpoints.run_folder import RunFolder, newest_step
 from rejeu.core import atomic
-from rejeu.core.errors import CheckpointError
 from rejeu.envs.registry import are_plain
 from rejeu.lab.runs.config import RunConfig, Task, written
 from rejeu.lab.runs.process import LOST
@@ -83,13 +81,8 @@ class Job:
         """Raises ``CheckpointError`` if the job imports something that the command line does not name."""
         kwargs, of_line = ({key: written(value) for key, value in run.env_kwargs.items()} for run in (self.run, typed))
         is_named = self.run.env == typed.env and self.run.wrappers == typed.wrappers and kwargs == (of_line or kwargs)
-        if not self.run.names_code or (is_named and (of_line or are_plain(self.run.env_kwargs))):
-            return
-        options = again([self], RunConfig(env=""))
-        raise CheckpointError(
-            f"{where} names an environment that is imported or made with more than numbers, which no file may ask for; "
-            f"if you trust it, name it again:{options if len(options) < 500 and options.isprintable() else ' --env ENV'}"
-        )
+        if self.run.names_code and not (is_named and (of_line or are_plain(self.run.env_kwargs))):
+            raise self.run.refusal(where)
 
 
 def again(jobs: Iterable[Job], typed: RunConfig) -> str:
@@ -147,12 +140,12 @@ class Work:
         self.folder, self.job, self.imports, self.keeps_checkpoints = folder, job, imports, keeps_checkpoints
         self.name, self.path, self.log = name or job.label, folder / job.name, folder / f"{job.name}.log"
         self.files = RunFolder(self.path)
-        self.lock, self.claim, self.exit = (folder / HIDDEN / f"{job.name}.{end}" for end in ("run", "claim", "exit"))
+        self.claim, self.exit = (folder / HIDDEN / f"{job.name}.{end}" for end in ("claim", "exit"))
         self.is_retried = is_retried and bool(self.exit_status())
 
     def is_training(self) -> bool:
         """Returns whether a process trains its run, which may outlive the process that started it."""
-        return self.lock.is_file() and is_locked(self.lock)
+        return is_locked(self.files.lock)
 
     def exit_status(self) -> int | None:
         """Returns the exit status of a job that is done or has failed; None for another."""
@@ -168,7 +161,7 @@ class Work:
     @property
     def state(self) -> State:
         """Its state, by its files."""
-        if self.is_training() or (self.claim.is_file() and is_locked(self.claim)):
+        if self.is_training() or is_locked(self.claim):
             return "running"
         status = self.exit_status()
         if status == 0 and self.has_result():

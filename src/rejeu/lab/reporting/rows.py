@@ -16,7 +16,7 @@ import numpy as np
 from rejeu.checkpoints.run_folder import RunFolder
 from rejeu.core.records import shown, utf8
 from rejeu.lab.reporting import run_list
-from rejeu.lab.runs.read import RunSummary, best_row, has_process, is_file, is_recent
+from rejeu.lab.runs.read import RunSummary, best_row, is_file, is_locked
 from rejeu.logs import charts
 from rejeu.logs.tables import EMPTY
 
@@ -112,9 +112,8 @@ class RowReader:
 
 def stamp(path: Path) -> object:
     """Returns a value that changes when a run does: times and sizes of its files, and whether a process trains it."""
-    process = has_process(path)
     watched = files(path) if run_list.is_ours(path) else others(path)
-    return process, is_recent(path) if process is None else None, *map(time_of, watched)
+    return is_locked(RunFolder(path).lock), *map(time_of, watched)
 
 
 def files(path: Path) -> tuple[Path, ...]:

@@ -91,14 +91,9 @@ def describe_backend(env: VectorEnv, environment: Environment, preset: Preset | 
 def decide(
     run: RunConfig, preset: Preset | None, observations: gym.Space, actions: gym.Space, is_long: bool
 ) -> tuple[Preset, configs.AlgorithmConfig]:
-    """Returns the preset of a run, else the defaults, and with what is asked of the run the configuration of its algorithm.
+    """Returns the preset, else the defaults, and the configuration of the algorithm: what ``run`` asks for, then these.
 
-    Args:
-        run: what is asked of it, with the id of its environment.
-        preset: that of the environment, None if there is none.
-        observations: space.
-        actions: space.
-        is_long: whether the algorithm may be one for long runs without hyperparameters of one's own.
+    ``run`` has the id of its environment. With ``is_long`` the algorithm may be one for long runs.
 
     Raises:
         TypeError: for an unknown hyperparameter, with the nearest known one.

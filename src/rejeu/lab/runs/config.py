@@ -293,6 +293,14 @@ class RunConfig(EnvironmentOptions):
 
         return not is_plain_id(self.typed) or bool(self.wrappers) or not are_plain(self.env_kwargs)
 
+    def refusal(self, where: object) -> CheckpointError:
+        """Returns the error for a file that names code which nobody has typed, with the options to type."""
+        options = self.again()
+        return CheckpointError(
+            f"{where} names an environment that is imported or made with more than numbers, which no file may ask for; "
+            f"if you trust it, name it again:{options if len(options) < 500 and options.isprintable() else ' --env ENV'}"
+        )
+
     def environment_words(self, option: bool = False) -> list[str]:
         """Returns the words of a command line that make the environment.
 

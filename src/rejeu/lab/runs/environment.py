@@ -23,7 +23,7 @@ from rejeu.core import checkpoint
 from rejeu.core.errors import CheckpointError
 from rejeu.envs.functional import REGISTRY
 from rejeu.envs.make import VectorEnv, WorkerOptions, make_vector
-from rejeu.envs.registry import are_plain, is_plain_id, maker
+from rejeu.envs.registry import is_plain_id, maker
 from rejeu.envs.rendering import make_rendering_env
 from rejeu.lab.runs.arguments import RunOptions
 from rejeu.lab.runs.config import EnvironmentOptions, RunConfig, merged, read_folder
@@ -246,14 +246,10 @@ def from_run(run: RunConfig, where: object, options: RunOptions) -> Environment:
         )
     typed = merged(options.env_kwargs, {}, "--env-kwargs")
     recorded = {key: value for key, value in run.env_kwargs.items() if key not in typed}
-    if not is_plain_id(run.typed) or (run.wrappers and not options.wrappers) or not are_plain(recorded):
-        wrappers = options.wrappers or run.wrappers
-        again = RunConfig(env=run.typed, env_kwargs={**recorded, **typed}, wrappers=wrappers).again()
-        raise CheckpointError(
-            f"{where} was trained on an environment that is imported or made with more than numbers, which no file may ask "
-            f"for; if you trust it, name it again:{again if len(again) < 500 and again.isprintable() else ' --env ENV'}"
-        )
     kwargs = {**recorded, **typed}
+    wrappers = () if options.wrappers else run.wrappers
+    if RunConfig(env=run.typed, env_kwargs=recorded, wrappers=wrappers).names_code:
+        raise RunConfig(env=run.typed, env_kwargs=kwargs, wrappers=options.wrappers or wrappers).refusal(where)
     description = RunConfig(env=run.env, env_kwargs=kwargs, wrappers=options.wrappers, imports=options.imports)
     return Environment(run.env, description, tuple(find_wrapper(name) for name in options.wrappers))
 

@@ -22,13 +22,12 @@ LOST = -1
 class Process:
     """A process that trains, supervised by this one: it stops, with a checkpoint, when this one does. Mutable."""
 
-    def __init__(self, task: Path, log: Path, lock: Path, environ: dict[str, str], folder: Path | None = None) -> None:
+    def __init__(self, task: Path, log: Path, environ: dict[str, str], folder: Path | None = None) -> None:
         """Starts it.
 
         Args:
             task: file with what it is asked to do.
             log: file to which what it prints is appended.
-            lock: file that it keeps locked while it lives.
             environ: its environment variables.
             folder: its current folder; None for that of this process.
 
@@ -42,7 +41,7 @@ class Process:
                 stdout=file,
                 stderr=subprocess.STDOUT,
                 cwd=folder,
-                env={**environ, interrupt.LOCK: str(lock)},
+                env={**environ, interrupt.SUPERVISED: "1"},
                 process_group=0 if os.name == "posix" else None,  # Ctrl-C reaches it once, through stop
                 creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),
             )
@@ -122,9 +121,9 @@ class LocalLauncher:
         self.capacity = workers
         self._environ = environment(threads or threads_of(workers))
 
-    def start(self, task: Path, log: Path, lock: Path) -> Process:
+    def start(self, task: Path, log: Path) -> Process:
         """Starts a run."""
-        return Process(task, log, lock, self._environ)
+        return Process(task, log, self._environ)
 
     def close(self) -> None:
         """Does nothing: the processes end with this one."""

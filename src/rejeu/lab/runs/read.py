@@ -10,7 +10,6 @@ import math
 import os
 import re
 import stat
-import time
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -43,8 +42,6 @@ MAX_STEP = 2**53
 """Upper limit on environment steps; larger numbers are damage."""
 ERROR = re.compile(r"[A-Z]\w*(Error|Exception): ")
 """Beginning of the warning that names the error which ended a run, if it is the last one."""
-RECENT = 60.0
-"""Seconds since the last write up to which a run without a lock counts as running."""
 
 UNKNOWN = RunConfig(env="", algorithm="")
 """The description of a run of which nothing is known."""
@@ -232,11 +229,10 @@ def ordered(table: Table) -> Table:
 
 
 def state_of(run: RunSummary) -> State:
-    """Returns the state of a run, from its lock and from what was written; a file says only that a pause was meant."""
+    """Returns the state of a run: running while it is locked, else by what was written."""
     files = RunFolder(run.path)
     has_model = files.agent in run.models
-    process = has_process(run.path)
-    if process or (process is None and not has_model and is_recent(run.path)):
+    if is_locked(files.lock):
         return "running"
     reached_steps = run.config.steps is not None and run.steps >= run.config.steps
     reached_minutes = run.config.minutes is not None and run.seconds >= 0.98 * 60 * run.config.minutes
@@ -249,17 +245,11 @@ def state_of(run: RunSummary) -> State:
     return "paused" if is_file(files.paused) else "interrupted"
 
 
-def has_process(folder: Path) -> bool | None:
-    """Returns whether a process holds a lock of a run; None if there is no lock."""
-    locks = [is_locked(path) for path in (folder / "lock", RunFolder(folder).lock) if is_file(path)]
-    return any(locks) if locks else None
-
-
 def is_locked(path: Path) -> bool:
     """Returns whether another process holds the lock on a file; the file is not changed."""
+    if not is_file(path):  # on Windows the lock would create it
+        return False
     if os.name != "posix":
-        if not is_file(path):  # the lock would create it
-            return False
         try:
             with atomic.lock(path).acquire(timeout=0):
                 return False
@@ -280,13 +270,6 @@ def is_locked(path: Path) -> bool:
         return True
     finally:
         os.close(handle)
-
-
-def is_recent(folder: Path) -> bool:
-    """Returns whether a table of a run was written in the last minute."""
-    run = RunFolder(folder)
-    paths = filter(is_file, (*run.marks, run.evaluations))
-    return any(0 <= time.time() - path.lstat().st_mtime < RECENT for path in paths)
 
 
 def read_warnings(path: Path) -> tuple[str, ...]:

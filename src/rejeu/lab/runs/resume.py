@@ -34,7 +34,7 @@ def resume(arguments: Resume, report: Report) -> tuple[int, JsonObject]:
         RunInUseError: if another process trains there.
     """
     folder = RunFolder(arguments.run)
-    if is_locked(folder.lock):  # before the tables are opened, which the other process writes
+    if is_locked(folder.lock):  # before the request to the other process is removed
         raise RunInUseError(f"another process is training in {folder.path}; wait for it, or stop it")
     drop(folder.stop)  # a later one is for this process
     return train_on(arguments, folder.checkpoints, report, lambda agent, config: (folder, config), arguments.finish)
@@ -77,6 +77,7 @@ def train_on(
         if arguments.hyperparameters:
             config = dataclasses.replace(config, hyperparameters=configs.to_json(agent.config))
         folder, config = begin(agent, config)
+        agent.checkpoint_folder(folder.checkpoints).lock()
         if config is not before:
             configs_of_runs.write(folder.config, config)
         echo(f"run folder    {folder.path}: {environment}, {config.algorithm}, seed {config.seed}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -112,7 +112,8 @@ class Session(NamedTuple):
         return self.in_folder(create(out, self.config.env, self.config.algorithm, self.config.seed))
 
     def in_folder(self, folder: RunFolder, label: str = "") -> Session:
-        """Returns the session in an empty folder, to which its configuration is written."""
+        """Returns the session in an empty folder, which is locked, and to which its configuration is written."""
+        self.agent.checkpoint_folder(folder.checkpoints).lock()  # before others see a run
         runs.write(folder.config, self.config)
         return self._replace(folder=folder, label=label)
 
@@ -191,14 +192,18 @@ class Session(NamedTuple):
 
     @contextmanager
     def training(self, stop: Interrupt) -> Iterator[Learning]:
-        """Context in which the agent learns, with what ``learn`` is to be given; models and tables are written at its end."""
+        """Context in which the agent learns, with what ``learn`` is to be given.
+
+        At its end models and tables are written, and then the folder is unlocked.
+        """
         agent, folder = self.agent, self.folder
         outputs = self.outputs()
         agent.report_folder = folder.path
         evaluate, callbacks = self.callbacks(stop)
         learning = Learning(evaluate, callbacks, outputs)
         try:
-            with noted_in(folder.warnings), saved_at_exit(agent, folder, evaluate):
+            lock = closing(agent.checkpoint_folder(folder.checkpoints))
+            with lock, noted_in(folder.warnings), saved_at_exit(agent, folder, evaluate):
                 yield learning
         except BaseException as error:
             if isinstance(error, Exception):

@@ -35,7 +35,7 @@ from rejeu.lab.runs import requests
 from rejeu.lab.runs.arguments import RunOptions
 from rejeu.lab.runs.config import read_folder
 from rejeu.lab.runs.environment import from_run
-from rejeu.lab.runs.read import has_process, is_recent
+from rejeu.lab.runs.read import is_locked
 from rejeu.lab.studio.deciding import Bar, bars_of
 from rejeu.lab.studio.screen import jpeg
 from rejeu.logs import charts
@@ -240,7 +240,7 @@ class LivePlayer:
 
     def _load(self, agent: Agent | None) -> Agent:
         """Returns the agent with the weights that are asked for; an older agent is given them if they have changed."""
-        if self.model == CURRENT and has_process(self.folder.path) is not False:
+        if self.model == CURRENT and is_locked(self.folder.lock):
             requests.ask(self.folder.watch)
         self._renew_at = time.monotonic() + RENEW
         path = self._path()
@@ -267,7 +267,7 @@ class LivePlayer:
         for path in files.get(self.model, matching):
             if path.is_file():
                 return path
-        if has_process(folder.path) is False or not is_recent(folder.path):
+        if not is_locked(folder.lock):
             raise FileNotFoundError("there is no model; the run has ended before it wrote one")
         raise FileNotFoundError("there is no model yet; the first is written within seconds or at the first evaluation")
 

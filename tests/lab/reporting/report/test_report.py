@@ -213,7 +213,6 @@ def test_command_writes_where_asked(tmp_path, capsys):
     [
         (["report"], "rejeu report needs RUN"),
         (["report", "nowhere"], "there is no run folder nowhere"),
-        (["report", ".", "--live"], "--live is now the studio"),
         (["report", ".", "--out", "x.pdf"], "--out x.pdf must end in .html or .htm"),
         (["report", "seeds"], "is no run folder: it holds no config.json; the newest of the 1 in it is"),
         (["report", "file"], "file is no folder"),
