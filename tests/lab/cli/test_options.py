@@ -299,7 +299,7 @@ def decided(**changes):
 
 
 def test_resume(spy, sessions, monkeypatch, tmp_path):
-    agent = mock.Mock(training_call=mock.Mock(last_step=100, **{"is_over.return_value": False}))
+    agent = mock.Mock(**{"call.training_call.last_step": 100, "call.training_call.is_over.return_value": False})
     agent.run.step = 30
     kind = mock.Mock(**{"resume.return_value": agent})
     spy(resume, "read_folder", decided(hyperparameters={"policy_kwargs": {"net_arch": [4]}}))
