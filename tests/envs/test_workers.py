@@ -18,6 +18,7 @@ import pytest
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 
+from rejeu.core import interrupt
 from rejeu.core.errors import BadEnvironmentError, WorkerError
 from rejeu.envs.make import GymnasiumVector, make_vector
 from rejeu.envs.workers import pool
@@ -283,12 +284,13 @@ def test_spaces_that_differ_are_noticed(tmp_path):
     assert not children()
 
 
-def test_ctrl_c_leaves_the_workers_at_work():
-    """A terminal sends it to every process; the main one may want to finish the step that it is in."""
+@pytest.mark.parametrize("number", [*interrupt.NAMES], ids=[*interrupt.NAMES.values()])
+def test_a_request_to_stop_leaves_the_workers_at_work(number):
+    """Terminals, timeout and SLURM send it to every process; the main one may want to finish the step that it is in."""
     vector = make("nothing")
     vector.reset()
     for worker in vector.workers.workers:
-        os.kill(worker.process.pid, signal.SIGINT)
+        os.kill(worker.process.pid, number)
     np.testing.assert_array_equal(vector.step(np.zeros((2, 1), np.float32)).obs[:, 1], 1)
     vector.close()
 

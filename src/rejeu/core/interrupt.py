@@ -121,6 +121,10 @@ def install(handler: Handler) -> dict[int, Any]:
     return {number: signal.signal(number, handler) for number in numbers}
 
 
+def disregard(number: int, frame: FrameType | None) -> None:
+    """A handler that does nothing. Unlike ``SIG_IGN``, programs that the process starts do not inherit it."""
+
+
 def restore(previous: dict[int, Any]) -> None:
     """Restores the handlers that :func:`install` returned."""
     for number, handler in previous.items():

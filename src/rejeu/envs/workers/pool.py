@@ -420,7 +420,7 @@ class ProcessWorker(Worker):
 
     def stop(self) -> None:
         if self.alive:
-            self.process.terminate()
+            self.process.kill()  # SIGTERM is ignored there
 
     def join(self, seconds: float) -> None:
         self.process.join(seconds)
@@ -464,7 +464,8 @@ class Processes(Starter):
         self._context: Any = multiprocessing.get_context(start_method)
         if start_method == "forkserver":
             # Imported once, in the server, so that a worker starts in milliseconds. The import starts no threads.
-            self._context.set_forkserver_preload([process.__name__, *([] if preload is None else [preload])])
+            modules = [process.__name__, "rejeu.envs.workers.fork_server", *([] if preload is None else [preload])]
+            self._context.set_forkserver_preload(modules)
         self._handover_of = (lambda number: process.as_declared) if handovers is None else handovers(self._context)
 
     def start(self, number: int, make: Callable[[], gym.Env]) -> ProcessWorker:

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import os
 import random
-import signal
 import socket
-import threading
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -19,6 +17,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector.utils import CloudpickleWrapper
 
+from rejeu.core import interrupt
 from rejeu.core.errors import BadEnvironmentError
 from rejeu.core.spaces import leaves
 from rejeu.core.types import Action, Info, Observation, Settings
@@ -138,8 +137,7 @@ def serve(pipe: Connection, make: CloudpickleWrapper, handover: Handover) -> Non
         make: makes the environment.
         handover: how observations are handed over.
     """
-    if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # the main process handles Ctrl-C, and may take another step
+    interrupt.install(interrupt.disregard)  # the main process handles Ctrl-C and SIGTERM, and may take another step
     env: gym.Env | None = None
     _end_safe_path()
     seed_globals(None)  # the fork server has imported NumPy, so that all its children would draw the same
