@@ -15,7 +15,6 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -211,18 +210,7 @@ def board_of(
     return Leaderboard(env_id, episodes, rows, tuple(problems), language, equal)
 
 
-def result_of(path: Path, *how: Any) -> Entrant | Unranked:
-    """Returns a model with its evaluation, or why it has none; the arguments are those of :func:`evaluated`."""
-    try:
-        return evaluated(path, *how)
-    except Unranked as error:
-        return error
-    except PROBLEMS as error:
-        text = str(error).replace(f"{path}: ", "").replace(str(path), "the file") or type(error).__name__
-        return Unranked("it cannot be evaluated: {}", shown(" ".join(text.split()), 300))
-
-
-def evaluated(
+def result_of(
     path: Path,
     name: str,
     env_id: str,
@@ -231,8 +219,8 @@ def evaluated(
     seed: int,
     seconds: float,
     success_threshold: float | None,
-) -> Entrant:
-    """Returns a model with its evaluation.
+) -> Entrant | Unranked:
+    """Returns a model with its evaluation, or why it has none.
 
     Args:
         path: the model.
@@ -244,32 +232,34 @@ def evaluated(
         seconds: time of the model, without compilation.
         success_threshold: return of a successful episode, the same for all models, if the environment does not report success;
             None for the environment's own. That of a file is not used: its author could choose it.
-
-    Raises:
-        Unranked: if it is too large or of another environment, takes too long, or has returns that are not finite.
-        ValueError: if it is damaged.
     """
-    trained_on = header(path).get("env_id")
-    if trained_on != env_id:
-        raise Unranked("it was trained on {}, not on {}", shown(trained_on), env_id)
-    end = xla.clock() + seconds
-    agent = load(path)
     try:
-        env.limit_actions(agent.config.action_share)
-        agent.check_spaces(env, env_id)
-    except ValueError as error:
-        raise Unranked("its spaces are others: {0}", error, env_id) from None
-    choose = policy(agent, deterministic=True)
+        trained_on = header(path).get("env_id")
+        if trained_on != env_id:
+            return Unranked("it was trained on {}, not on {}", shown(trained_on), env_id)
+        end = xla.clock() + seconds
+        agent = load(path)
+        try:
+            env.limit_actions(agent.config.action_share)
+            agent.check_spaces(env, env_id)
+        except ValueError as error:
+            return Unranked("its spaces are others: {0}", error, env_id)
+        choose = policy(agent, deterministic=True)
 
-    def within_budget(obs: Observation, started: np.ndarray) -> np.ndarray:
-        if xla.clock() > end:
-            raise Unranked("it needs more than {:g} seconds for {} episodes", seconds, episodes)
-        return choose(obs, started)
+        def within_budget(obs: Observation, started: np.ndarray) -> np.ndarray:
+            if xla.clock() > end:
+                raise Unranked("it needs more than {:g} seconds for {} episodes", seconds, episodes)
+            return choose(obs, started)
 
-    result = evaluate(within_budget, env, episodes, success_threshold, seed)
-    if not np.isfinite(result.returns).all():
-        raise Unranked("the return of an episode is not a finite number")
-    return Entrant(name, agent.name, agent.num_timesteps, agent.seed, result)
+        result = evaluate(within_budget, env, episodes, success_threshold, seed)
+        if not np.isfinite(result.returns).all():
+            return Unranked("the return of an episode is not a finite number")
+        return Entrant(name, agent.name, agent.num_timesteps, agent.seed, result)
+    except Unranked as error:
+        return error
+    except PROBLEMS as error:
+        text = str(error).replace(f"{path}: ", "").replace(str(path), "the file") or type(error).__name__
+        return Unranked("it cannot be evaluated: {}", shown(" ".join(text.split()), 300))
 
 
 def ranked(models: Iterable[Entrant]) -> tuple[Entrant, ...]:
