@@ -335,7 +335,7 @@ class GoalPlace(NamedTuple):
     """The share of the episodes in which the goal was reached."""
 
 
-PLACES = 24
+PLACES = 16
 """Goals are one place if they are closer than about this fraction of the extent of all."""
 OUTCOMES = (
     ("always reached", "good", "circle", "\N{BLACK CIRCLE}"),
@@ -377,7 +377,8 @@ def goal_chart(episodes: Table) -> Chart | None:
         marks = {"kind": "places", "name": f"{name} ({len(at):,})", "color": color, "symbol": symbol, "sign": sign}
         shown_series.append({**marks, "places": at, "text": texts, "x": plain(x), "t": plain(x), "y": plain(y)})
     seeds, step = episodes.column("seed")[rows], episodes.column("step")[rows]
-    last = "" if np.isnan(step).all() else f", evaluated up to step {np.nanmax(step):,.0f}"
+    ends = [f"step {end:,.0f}" for end in np.unique([np.min(step), np.max(step)]) if np.isfinite(end)]
+    last = f", evaluated from {' to '.join(ends)}" if ends else ""
     rate = f"{100 * np.mean(success[rows] > 0.5):.0f} % of {counted(len(rows), 'episode')} reached the goal{last}"
     return {
         **{"x": "number 1 of the goal", "y": "number 2 of the goal", "percent": False, "is_equal": True},

@@ -269,13 +269,20 @@ def test_one_failure_does_not_hide_the_successes_at_its_place():
     assert [chart["places"][one["places"][0]]["seeds"] for one in chart["series"]] == [[0, 1, 2, 3, 4], [5, 6]]
 
 
+def test_neighboring_spots_of_a_lot_are_places_of_their_own_and_neighbors_in_a_cell_of_a_maze_are_not():
+    spots = np.stack([np.repeat(np.arange(14) * 4.0 - 26, 2), np.tile([-14.0, 14.0], 14)], axis=1)
+    assert len(charts.goal_places(spots, np.ones(28))) == 28
+    cells = np.array([[0, 0], [0.05, 0.05], [0, 2], [2, 2], [2.5, 2.5]])
+    assert sorted(place.rows.tolist() for place in charts.goal_places(cells, np.ones(5))) == [[0, 1], [2], [3], [4]]
+
+
 def test_goals_of_the_newest_evaluations_are_a_map_too(tmp_path):
     folder = write(tmp_path / "run")
     (folder / "goals.csv").write_text(
         "step,success,goal_0,goal_1,goal_2\n8000,1,1,2,5\n9000,0,3,4,6\n", encoding="utf-8"
     )
     chart = data_of(text_of(folder))["charts"]["run0-evaluated_goals"]
-    assert chart["note"] == "50 % of 2 episodes reached the goal, evaluated up to step 9,000"
+    assert chart["note"] == "50 % of 2 episodes reached the goal, evaluated from step 8,000 to step 9,000"
     assert sorted(place["goal"] for place in chart["places"]) == [[1, 2, 5], [3, 4, 6]]
 
 

@@ -59,7 +59,7 @@ const RejeuCharts = (() => {
       } else if (series.kind === "places") {
         found.push({
           ...common, y: series.y, mode: "markers", customdata: series.places, text: series.text.map(plain), hovertemplate: "%{text}<extra></extra>",
-          marker: { color: own, size: 13, symbol: series.symbol, line: { color: color("card"), width: 1.5 } },
+          marker: { color: own, size: Math.min(13, Math.max(7, 400 / chart.places.length)), symbol: series.symbol, line: { color: color("card"), width: 1.5 } },
         });
       } else if (series.kind === "band") {
         const keep = x.map((_, i) => i).filter((i) => series.low[i] != null && series.high[i] != null);
