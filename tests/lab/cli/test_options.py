@@ -28,7 +28,7 @@ from rejeu.lab.runs.environment import Environment
 from rejeu.lab.runs.session import Session, TrainingLimits
 from rejeu.logs.evaluation import Evaluation
 from rejeu.teaching import play
-from rejeu.teaching.courses.leaderboard import Leaderboard
+from rejeu.teaching.courses.leaderboard import Leaderboard, Unranked
 
 TYPED = "CartPole-v1"
 
@@ -152,15 +152,16 @@ def test_push_and_pull(spy, tmp_path, private, capsys):
     assert f"rejeu import {tmp_path / 'a.zip'}" in capsys.readouterr().out
 
 
-def test_class(spy, tmp_path, monkeypatch):
-    built = spy(courses.leaderboard, "build", Leaderboard(TYPED, 7, (), (), "fr"))
-    found, made = spy(courses.leaderboard, "models", [Path("a")]), spy(Environment, "vector")
+def test_class(spy, tmp_path):
+    evaluated = spy(courses.leaderboard, "result_of", Unranked("it is no model"))
+    board = spy(courses.leaderboard, "board_of", Leaderboard(TYPED, 7, (), (), "fr"))
+    listed, vectors = spy(courses.leaderboard, "models", [Path("a")]), spy(Environment, "vector", mock.Mock())
     argv = ["class", "pupils", "--env", TYPED, "--episodes", "7", "--minutes", "2", "--seed", "5", "--language", "fr"]
     assert main([*argv, "--success-threshold", "3", "--out", str(tmp_path / "board.md")]) == 0
-    assert includes(found, folder=Path("pupils"))
-    assert includes(built, env_id=TYPED, episodes=7, seconds=120.0, seed=5, language="fr", success_threshold=3.0)
-    built[-1]["make_vector"](9)
-    assert includes(made, n_envs=9, seed=5)
+    assert includes(listed, folder=Path("pupils"))
+    assert includes(vectors, n_envs=7, seed=5)
+    assert includes(evaluated, path=Path("a"), env_id=TYPED, episodes=7, seconds=120.0, seed=5, success_threshold=3.0)
+    assert includes(board, env_id=TYPED, episodes=7, language="fr")
     assert (tmp_path / "board.md").is_file()
 
 
