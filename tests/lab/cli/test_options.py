@@ -155,7 +155,7 @@ def test_push_and_pull(spy, tmp_path, private, capsys):
 def test_class(spy, tmp_path):
     evaluated = spy(courses.leaderboard, "result_of", Unranked("it is no model"))
     board = spy(courses.leaderboard, "board_of", Leaderboard(TYPED, 7, (), (), "fr"))
-    listed, vectors = spy(courses.leaderboard, "models", [Path("a")]), spy(Environment, "vector", mock.Mock())
+    listed, vectors = spy(courses.leaderboard, "models", [Path("pupils/a")]), spy(Environment, "vector", mock.Mock())
     argv = ["class", "pupils", "--env", TYPED, "--episodes", "7", "--minutes", "2", "--seed", "5", "--language", "fr"]
     assert main([*argv, "--success-threshold", "3", "--out", str(tmp_path / "board.md")]) == 0
     assert includes(listed, folder=Path("pupils"))
