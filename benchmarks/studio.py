@@ -1,7 +1,8 @@
 """What the studio costs: watching an agent, a table of many runs, a server that is killed while runs train, keys of games.
 
     python benchmarks/studio.py watching CartPole-v1 5
-    python benchmarks/studio.py table 500
+    python benchmarks/studio.py table 2000
+    python benchmarks/studio.py busy 2 10
     python benchmarks/studio.py kills 10
     python benchmarks/studio.py memory MINUTES
     python benchmarks/studio.py keys CartPole-v1 FrozenLake-v1 parking-v0
@@ -175,7 +176,7 @@ def table(n: int, priority: int) -> None:
                 page.wait_for_selector("tbody tr td .quiet", state="attached")
                 first = time.monotonic() - asked
                 page.wait_for_selector(f"text={n} runs")
-                page.wait_for_function("!document.body.innerText.includes('unread')")
+                page.wait_for_function("!document.body.innerText.includes('not read yet')", timeout=600_000)
                 whole = time.monotonic() - asked
                 with (root / "run_000" / "episodes.csv").open("a") as file:
                     file.write("3999,0,7,7,1,40\n")
@@ -183,8 +184,8 @@ def table(n: int, priority: int) -> None:
                 page.wait_for_selector("text=3,999")
                 follow = time.monotonic() - changed
                 page.evaluate(PAUSES)
-                page.get_by_label("filter").fill("run_00")
-                page.wait_for_selector("text=10 runs")
+                page.get_by_label("filter").fill("run_000")
+                page.wait_for_selector("text=run_000")
                 longest = page.evaluate("window.longest")
             print(
                 f"{n} runs: listening after {listening:.2f} s, first rows after {first:.2f} s, all after {whole:.2f} s"
@@ -193,6 +194,35 @@ def table(n: int, priority: int) -> None:
                 f"a change is shown after {follow:.2f} s; the longest pause of the page while filtering is {longest:.0f} ms"
             )
             print(f"memory of the server: {memory(process.pid) / 1e6:.0f} MB")
+
+
+def busy(n_runs: int, n_tabs: int, priority: int) -> None:
+    """Prints how long pages take until they are there, while runs train and tabs show them live."""
+    with tempfile.TemporaryDirectory() as folder, served(Path(folder)) as (_, address):
+        runs = [train(Path(folder), f"run_{i}", "CartPole-v1", 100_000_000) for i in range(n_runs)]
+        while not all(last_row(Path(folder) / f"run_{i}")[1] > LOADING for i in range(n_runs)):
+            time.sleep(0.5)
+        with opened(address, "/", priority) as page:
+            base, seconds = page.url, {}  # type: str, dict[str, list[float]]
+            tabs = [page.context.new_page() for _ in range(n_tabs)]
+            for i, tab in enumerate(tabs):
+                tab.goto(f"{base}run?run=run_{i % n_runs}", wait_until="commit")
+            for path, selector in (
+                ("", "text=run_0"),
+                ("run?run=run_0", "text=Environment steps"),
+                ("new", "text=Start"),
+                ("compare", ".plot.js-plotly-plot"),
+            ):
+                for _ in range(5):
+                    began = time.monotonic()
+                    page.goto(base + path)
+                    page.wait_for_selector(selector)
+                    seconds.setdefault(path or "runs", []).append(time.monotonic() - began)
+        for run in runs:
+            run.terminate()
+            run.wait()
+    for path, values in seconds.items():
+        print(f"{path}: median {statistics.median(values):.2f} s, {min(values):.2f} to {max(values):.2f} s", flush=True)
 
 
 def keys(env: str, n_agents: int, priority: int) -> None:
@@ -274,7 +304,7 @@ def grows(minutes: float, priority: int) -> None:
 def main() -> None:
     """Runs one of the measurements."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["watching", "table", "kills", "memory", "keys"])
+    parser.add_argument("what", choices=["watching", "table", "busy", "kills", "memory", "keys"])
     parser.add_argument("values", nargs="*")
     parser.add_argument("--browser-priority", type=int, default=19)
     given = parser.parse_args()
@@ -283,6 +313,8 @@ def main() -> None:
         watching(values[0], int(values[1]), given.browser_priority)
     elif given.what == "table":
         table(int(values[0]), given.browser_priority)
+    elif given.what == "busy":
+        busy(int(values[0]), int(values[1]), given.browser_priority)
     elif given.what == "kills":
         kills(int(values[0]))
     elif given.what == "keys":

@@ -60,6 +60,8 @@ class RunFolder:
     """Goals of the newest episodes of evaluations, one row each, and whether they were reached."""
     report = File("report.html")
     """The page about the run."""
+    remarks = File("remarks.json")
+    """Note and tags of a person; read by :mod:`rejeu.lab.runs.read`."""
     warnings = File("warnings.txt")
     """Warnings of the training, and the error that ended it, one a line; read by :mod:`rejeu.lab.runs.read`."""
     video = File("video.mp4")

@@ -1,9 +1,10 @@
-"""The language of what students read: windows, grades and leaderboards. Everything else is in English."""
+"""The language of windows, grades, leaderboards and the pages of the studio. Everything else is in English."""
 
 from __future__ import annotations
 
 import os
 import tomllib
+from contextvars import ContextVar
 from functools import cache
 from importlib import resources
 from typing import Literal, get_args
@@ -16,13 +17,17 @@ SETTING = "REJEU_LANGUAGE"
 """Environment variable with the language, English by default; ``speak`` in the notebooks of the courses sets it."""
 
 
+spoken: ContextVar[Language | None] = ContextVar("spoken", default=None)
+"""The language of a thread, where it is not that of all."""
+
+
 def chosen(language: str | None = None) -> Language:
-    """Returns a language, by default that of :data:`SETTING`.
+    """Returns a language, by default that of this thread, or else of :data:`SETTING`.
 
     Raises:
         ValueError: for an unknown one.
     """
-    return choice("language", language or os.environ.get(SETTING) or "en", LANGUAGES)
+    return choice("language", language or spoken.get() or os.environ.get(SETTING) or "en", LANGUAGES)
 
 
 @cache

@@ -1,8 +1,8 @@
 """Curves and histograms as plain data: smoothed here, drawn by Plotly in pages and by matplotlib in pictures.
 
 A chart is a dictionary of JSON values: titles ``x`` and ``y``, ``percent`` for shares, ``range`` of the vertical axis,
-``note`` and ``series``. A series has ``kind`` ("dots", "line", "points", "band", "marks", "area" or "places"), ``name``,
-``color``, ``x`` (steps), ``t`` (minutes) and ``y``, with ``low`` and ``high`` for a band or error bars.
+``note`` and ``series``. A series has ``kind`` ("dots", "line", "thin", "points", "band", "marks", "area" or "places"),
+``name``, ``color``, ``x`` (steps), ``t`` (minutes) and ``y``, with ``low`` and ``high`` for a band or error bars.
 """
 
 from __future__ import annotations
@@ -425,6 +425,8 @@ def value_chart(values: np.ndarray, to_go: np.ndarray, expected: float | None = 
     return {"x": "step of the episode", "y": "", "percent": False, "range": None, "series": shown_series, "note": ""}
 
 
+MAX_THIN = 20
+"""Most runs of a group that are drawn one by one."""
 GROUP_COLORS = (
     ("#1d4f91", "#8cc0f5"),
     ("#d9631e", "#f59a56"),
@@ -454,6 +456,10 @@ def group_chart(form: str, comparison: Any, env_id: str | None = None) -> Chart:
         color = f"group{labels.index(group.label) % len(GROUP_COLORS)}"
         x, (value, low, high) = (group.x, group.curve) if form == "curve" else (group.levels, group.profile)
         common = {"color": color, "x": plain(x), "t": plain(x)}
+        if form == "curve" and 1 < len(group.runs) <= MAX_THIN:
+            names = [run.name for run in group.runs]
+            lines = zip(names, group.run_curves, strict=True)
+            shown_series += [{**common, "kind": "thin", "name": name, "y": plain(line)} for name, line in lines]
         shown_series.append({**common, "kind": "band", "name": "", "low": plain(low), "high": plain(high)})
         shown_series.append({**common, "kind": "line", "name": f"{group.label} ({len(group.runs)})", "y": plain(value)})
     if form == "profile":

@@ -78,6 +78,21 @@ def number(value: float) -> str:
     return f"{value:,.0f}" if 1000 <= abs(value) < 1e12 else f"{value:.4g}"
 
 
+def duration(seconds: float) -> str:
+    """Returns a time in words, a dash if it is unknown.
+
+    >>> duration(75), duration(4000), duration(7.25)
+    ('1 min 15 s', '1 h 6 min', '7.2 s')
+    """
+    if not math.isfinite(seconds) or seconds < 0:
+        return "\N{EN DASH}"
+    if seconds < 60:
+        return f"{seconds:.1f} s"
+    minutes, seconds = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours:,} h {minutes} min" if hours else f"{minutes} min {seconds} s"
+
+
 def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """Returns a Markdown table."""
     lines = [head, ["---"] * len(head), *rows]

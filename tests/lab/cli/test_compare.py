@@ -44,7 +44,17 @@ def test_compare_as_json(runs, capsys):
         line for line in (ROOT / "docs" / "cli.md").read_text(encoding="utf-8").split("\n") if "| `compare` |" in line
     )
     documented = set(re.findall(r"`(\w+)`", row)) - {"compare", "steps_to_threshold"}
-    assert documented == {*content, *content["groups"][0], "label", "other", "env_id", "probability", "low", "high"}
+    assert documented == {
+        *content,
+        *content["groups"][0],
+        "label",
+        "other",
+        "env_id",
+        "probability",
+        "low",
+        "high",
+        "pairs",
+    }
 
 
 @pytest.mark.parametrize(

@@ -4,12 +4,15 @@ import csv
 import io
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import rejeu
 from rejeu.lab.reporting.comparison import compare
+from rejeu.lab.reporting.grouping import differing_settings
+from rejeu.logs.charts import group_chart
 
 
 def write_run(folder, algorithm="DQN", env="CartPole-v1", seed=0, level=10.0, steps=1000, every=10, **config):
@@ -60,11 +63,34 @@ def test_two_algorithms(runs):
     assert math.isnan(dqn.curve[0, 0])
     (improvement,) = comparison.improvements
     assert (improvement.label, improvement.other, improvement.probability) == ("PPO", "DQN", 1.0)
+    assert improvement.cells[3] == "100% (in all 25 pairs of runs)"
+    assert comparison.standings == ["", "best"]
+    assert comparison.settings == [["setting", "DQN", "PPO"], ["algorithm", "DQN", "PPO"]]
+    thin = [series for series in group_chart("curve", comparison)["series"] if series["kind"] == "thin"]
+    assert [(series["name"], series["color"], series["y"][-1]) for series in thin][::9] == [
+        ("DQN_0", "group0", 10.0),
+        ("PPO_4", "group1", 24.0),
+    ]
     assert dqn.reached is ppo.reached is None
     assert dqn.profile[0, 0] == pytest.approx(0.8)  # four of five are above the lowest score
     assert comparison.notes == (
         "intervals of few runs are too narrow: those of 5 runs contain the true score in 90 % of cases, not in 95 %",
     )
+
+
+def test_groups_whose_intervals_meet_may_both_be_best_and_settings_that_differ_are_listed(tmp_path):
+    for rate, levels in ((0.1, (10.0, 30.0)), (0.2, (20.0, 28.0)), (0.3, (1.0, 2.0))):
+        for seed, level in enumerate(levels):
+            hyperparameters = {"gamma": 0.9, "learning_rate": rate, "net": {"width": 8 * seed}}
+            write_run(tmp_path / f"{rate}_{seed}", seed=seed, level=level, hyperparameters=hyperparameters)
+    comparison = rejeu.compare(tmp_path, "algorithm", samples=50)
+    assert (comparison.standings, comparison.settings) == ([""], [])
+    runs = [run for group in comparison.groups for run in group.runs]
+    by_rate = [[run for run in runs if run.config.hyperparameters["learning_rate"] == rate] for rate in (0.1, 0.2, 0.3)]
+    assert differing_settings(by_rate) == [["learning_rate", "0.1", "0.2", "0.3"]]
+    assert differing_settings([by_rate[0][:1], by_rate[0][1:]]) == [["net.width", "0", "8"]]
+    by_folder = [replace(run, config=replace(run.config, algorithm=run.name[:3])) for run in runs]
+    assert rejeu.compare(by_folder, "algorithm", samples=50).standings == ["may be best", "may be best", ""]
 
 
 def test_steps_to_the_threshold_are_the_median_of_the_runs(tmp_path):
@@ -149,7 +175,7 @@ def test_groups_by_the_settings_that_differ_within_an_algorithm_and_a_note_where
     comparison = compare(tmp_path, "setting", samples=10)
     assert [(group.label, len(group.runs)) for group in comparison.groups] == [*groups, ("PPO", 3)]
     assert compare(tmp_path, samples=10).notes == (
-        "DQN: the runs of this group differ in their settings; --by setting separates them",
+        "DQN: the runs of this group differ in their settings; group by setting to separate them",
         "intervals of few runs are too narrow: those of 3 runs contain the true score in 75 % of cases, not in 95 %",
     )
 

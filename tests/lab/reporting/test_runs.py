@@ -10,8 +10,9 @@ import pytest
 from filelock import FileLock
 
 from rejeu.agents import BUILT_IN
+from rejeu.checkpoints.run_folder import RunFolder
 from rejeu.lab.runs import config
-from rejeu.lab.runs.read import best_row, default_hyperparameters, read_run
+from rejeu.lab.runs.read import Remarks, best_row, default_hyperparameters, read_run
 
 CONFIG = {
     "env": "CartPole-v1",
@@ -227,3 +228,18 @@ def test_folder_without_a_run(tmp_path):
 
 def test_the_defaults_of_every_algorithm_are_known():
     assert [name for name in BUILT_IN if not default_hyperparameters(name)] == []
+
+
+@pytest.mark.parametrize("content", [b"{", b"[]", b'{"note": 3}', b'{"tags": "x"}', b"\xff"])
+def test_remarks_that_are_damaged_are_left_out(folder, content):
+    (folder / "remarks.json").write_bytes(content)
+    assert read_run(folder).remarks == Remarks()
+
+
+def test_remarks_are_read_as_they_were_written_and_shortened(folder):
+    remarks = Remarks("first\n<b>second</b>", ("paper", "é"))
+    remarks.write(RunFolder(folder))
+    assert read_run(folder).remarks == remarks
+    Remarks("x" * 20_000, ("t" * 300,) * 50).write(RunFolder(folder))
+    long = read_run(folder).remarks
+    assert (len(long.note), len(long.tags)) == (10_000, 20)

@@ -2,8 +2,10 @@
 
 import shutil
 import time
+from dataclasses import replace
 
 import rejeu
+from rejeu.lab.reporting.rows import nothing
 from rejeu.lab.studio import judging as module
 from rejeu.lab.studio.classroom import lines
 from rejeu.lab.studio.judging import Judging
@@ -56,8 +58,8 @@ def test_models_are_evaluated_again_when_they_change_while_somebody_looks(tmp_pa
     rejeu.DQN("MlpPolicy", "CartPole-v1", policy_kwargs={"net_arch": [8]}, seed=7).save(path)
     until(lambda: [row.seed for row in judging.board("en").rows] == [7])
     assert before.seed == 0
-    running = {"state": "running", "steps": 3, "steps_asked": 10}
-    studio.rows = [{**running, "run": "run"}, {**running, "run": "new"}]
+    running = replace(nothing(path, "unread"), state="running", steps=3, steps_asked=10)
+    studio.rows = [replace(running, run="run"), replace(running, run="new")]
     first, second = lines(studio, judging, judging.board("fr"))
     assert (first["name"], first["training"]) == ("run", "s'entraîne : 30\N{NARROW NO-BREAK SPACE}%")
     assert first["link"] == "/play?agent=run.safetensors&watch=1"

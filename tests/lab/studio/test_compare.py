@@ -13,16 +13,26 @@ def test_rows_that_are_chosen_are_compared_in_groups(browser, common):
             page.locator("tr", has_text=group).get_by_role("checkbox").click()
         page.get_by_role("button", name="Compare").click()
         page.wait_for_selector(".plot.js-plotly-plot >> nth=1")
-        groups, improvements = (page.locator("table").nth(i).locator("tbody tr").all_inner_texts() for i in (0, 1))
-        assert [text.split("\t")[:4] for text in groups] == [
-            [HOSTILE, "CartPole-v1", "3", "21"],
+        groups, settings, pairs = (page.locator("table").nth(i).locator("tbody tr").all_inner_texts() for i in range(3))
+        assert [text.replace("\n", "").split("\t")[:4] for text in groups] == [
+            [f"{HOSTILE} best", "CartPole-v1", "3", "21"],
             ["DQN", "CartPole-v1", "3", "11"],
         ]
-        assert improvements == [f"{HOSTILE}\tDQN\tCartPole-v1\t100% (100% to 100%)"]
+        assert settings == [f"algorithm\t{HOSTILE}\tDQN"]
+        assert pairs == [f"{HOSTILE}\t\t100%", "DQN\t0%\t"]
+        assert page.locator("td[title='" + HOSTILE + " > DQN: 100% (in all 9 pairs of runs)']").count() == 2
+        with page.expect_download() as saved:
+            page.get_by_role("button", name="CSV: CartPole-v1: returns").click()
+        assert '\n"DQN (3)",1000,11,,' in saved.value.path().read_text(encoding="utf-8")
         page.get_by_role("combobox", name="score").click()
         page.get_by_role("option", name="last evaluation").click()
         page.wait_for_selector("text=Final score: mean return of the last evaluation")
         assert page.locator("tbody tr").nth(1).inner_text().split("\t")[3] == "12"
+        page.reload()
+        page.wait_for_selector("text=Final score: mean return of the last evaluation")
+        with page.expect_download() as saved:
+            page.get_by_role("link", name="table").click()
+        assert saved.value.path().read_text(encoding="utf-8").splitlines()[2].startswith("DQN,CartPole-v1,3,12.0")
         check_widths(page)
 
 

@@ -21,7 +21,7 @@ def served(tmp_path_factory):
 @pytest.fixture(scope="module")
 def names(served):
     """The names of the runs, as addresses have them."""
-    return [row["run"] for row in RowReader(served.folder).read()]
+    return [row.run for row in RowReader(served.folder).read()]
 
 
 def test_no_row_is_missing(browser, served, names):
@@ -83,3 +83,12 @@ def test_files_are_served_only_if_they_are_pictures_of_runs(browser, served):
                     "image/png",
                     "nosniff",
                 )
+
+
+def test_reports_are_saved_of_runs_alone_and_shown_by_no_browser(browser, served):
+    with opened(browser, served) as page:
+        answer = page.request.get(f"http://{served.host}/save/run?run=odd_0")
+        assert answer.status == 200
+        assert answer.headers["content-disposition"] == "attachment; filename*=UTF-8''odd_0.html"
+        for path in ("run?run=..%2Fodd_0", "run?run=no-run", "comparison/py?run=odd_0"):
+            assert page.request.get(f"http://{served.host}/save/{path}").status == 404

@@ -2,7 +2,8 @@
 
 import asyncio
 import os
-from dataclasses import fields
+import shlex
+from dataclasses import fields, replace
 from pathlib import Path, PureWindowsPath
 from types import SimpleNamespace
 
@@ -12,10 +13,23 @@ pytest.importorskip("nicegui", reason="needs nicegui, which is in the extra stud
 
 from fastapi import Request
 
+from rejeu.agents import presets
+from rejeu.lab.reporting.rows import nothing
 from rejeu.lab.runs.arguments import Train
 from rejeu.lab.runs.config import options
 from rejeu.lab.studio import new, processes
-from rejeu.lab.studio.new import LEFT_OUT, command, lead_to, new_folder, prefilled, problem_of, require_known
+from rejeu.lab.studio.new import (
+    LEFT_OUT,
+    command,
+    command_text,
+    completed,
+    lead_to,
+    new_folder,
+    prefilled,
+    preset_texts,
+    problem_of,
+    require_known,
+)
 from rejeu.lab.studio.state import Studio, is_below
 from tests.lab.reporting.report.folders import write
 
@@ -85,8 +99,33 @@ def test_an_address_puts_no_environment_into_the_form_that_a_click_would_import(
 
 
 def test_a_field_says_what_is_wrong_while_it_is_filled():
-    assert problem_of(OPTIONS["seed"], "x") == "--seed 'x' must be a whole number"
+    assert problem_of(OPTIONS["seed"], "x") == "seed 'x' must be a whole number"
     assert [problem_of(OPTIONS["seed"], text) for text in ("", None, "3")] == [None] * 3
+
+
+def test_the_form_shows_the_values_of_the_preset_and_the_command_that_does_the_same():
+    texts = preset_texts({"env": "CartPole-v1", "algorithm": ""})
+    preset = presets.find("CartPole-v1")
+    assert (texts["algorithm"], texts["steps"]) == (preset.algorithm, str(preset.total_steps))
+    assert (
+        dict(word.split("=", 1) for word in shlex.split(texts["hyperparameters"])).keys()
+        == preset.hyperparameters.keys()
+    )
+    assert {*preset_texts({"env": "my_env.py"}).values()} == {""}
+    assert {*preset_texts({"env": None}).values()} == {""}
+    studio = Studio(Path("runs"))
+    filled = {"env": "CartPole-v1", "hyperparameters": "gamma=0.9 net_arch=[8,8]", "out": "mine", "no_video": True}
+    text = command_text(filled, studio)
+    assert shlex.split(text) == ["rejeu", *command(filled, studio)[0]]
+    assert command_text({"env": "CartPole-v1", "seed": "x"}, studio) == "seed 'x' must be a whole number"
+
+
+@pytest.mark.parametrize(
+    ("typed", "env_id"),
+    [("CartPole", "CartPole-v1"), ("LUNARLANDER-v", "LunarLander-v3"), ("Walk-v0", "Walk-v0"), (None, None)],
+)
+def test_the_beginning_of_an_id_is_completed(typed, env_id):
+    assert completed(typed) == env_id
 
 
 def test_every_option_is_in_the_form_but_those_for_windows_and_programs():
@@ -174,11 +213,11 @@ def test_two_starts_with_the_same_name_begin_one_run_and_the_log_of_it_is_not_to
     log.write_text("of the first", encoding="utf-8")
     for others in (words, [*words, "--seed", "1"], ["branch", "runs/a", *words[2:]]):
         with pytest.raises(ValueError, match="is under way for mine"):
-            asyncio.run(lead_to(studio, others, tmp_path / "mine"))
+            asyncio.run(lead_to(studio, others, tmp_path / "mine", str))
     processes.STARTED.clear()
     write(tmp_path / "mine", videos=False)
     with pytest.raises(ValueError, match="exists; name another"):
-        asyncio.run(lead_to(studio, words, tmp_path / "mine"))
+        asyncio.run(lead_to(studio, words, tmp_path / "mine", str))
     assert len(page.started) == 1
     assert log.read_text(encoding="utf-8") == "of the first"
     assert page.addresses == []
@@ -188,16 +227,17 @@ def test_a_run_that_is_over_before_it_was_read_has_its_page_and_one_of_a_removed
     tmp_path, page, monkeypatch
 ):
     studio, path = Studio(tmp_path), tmp_path / "mine"
-    studio.rows = [{"run": "mine", "state": "gone"}]
+    row = replace(nothing(path, "unread"), run="mine", state="gone")
+    studio.rows = [row]
     process = Beginning(lambda: None, lambda: write(path, videos=False))
     monkeypatch.setattr(processes, "start", lambda *_: process)
 
     async def follow():
-        leading = asyncio.create_task(lead_to(studio, ["train"], path))
+        leading = asyncio.create_task(lead_to(studio, ["train"], path, str))
         while process.returncode is None:
             await asyncio.sleep(0)
         assert page.addresses == []
-        studio.rows = [{"run": "mine", "state": "finished"}]
+        studio.rows = [replace(row, state="finished")]
         return await leading
 
     assert asyncio.run(follow()) == ""
@@ -208,7 +248,7 @@ def test_a_run_that_is_over_before_it_was_read_has_its_page_and_one_of_a_removed
 def test_a_run_can_be_stopped_before_it_has_a_folder(tmp_path, page, monkeypatch):
     process = Beginning(lambda: page.buttons[0].press(), *[lambda: None] * 100, status=-15)
     monkeypatch.setattr(processes, "start", lambda *_: process)
-    said = asyncio.run(lead_to(Studio(tmp_path), ["train"], tmp_path / "mine"))
+    said = asyncio.run(lead_to(Studio(tmp_path), ["train"], tmp_path / "mine", str))
     assert said == "rejeu train ended with exit status -15"
     assert (page.addresses, [button.is_there for button in page.buttons]) == ([], [False])
 

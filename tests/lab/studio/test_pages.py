@@ -86,7 +86,7 @@ def test_a_run_is_started_from_the_form_watched_stopped_and_resumed(browser, ser
         for label, text in settings.items():
             page.get_by_label(label, exact=True).fill(text)
         page.get_by_label("seed", exact=True).fill("x")
-        page.get_by_text("--seed 'x' must be a whole number").wait_for()
+        page.get_by_text("seed 'x' must be a whole number").first.wait_for()
         page.get_by_label("seed", exact=True).fill("3")
         page.get_by_text("Output").click()
         check_hints(page)
@@ -98,7 +98,8 @@ def test_a_run_is_started_from_the_form_watched_stopped_and_resumed(browser, ser
         live = page.locator("figcaption", has_text="the policy at step")
         live.wait_for(timeout=60_000)
         seen = live.inner_text()
-        page.wait_for_function("seen => document.querySelector('figcaption').innerText !== seen", arg=seen)
+        changes = "seen => document.querySelector('figcaption').innerText !== seen"
+        page.wait_for_function(changes, arg=seen, timeout=60_000)
         page.get_by_text("of 400,000").first.wait_for()
         page.get_by_role("button", name="Stop").click()
         page.locator(".q-badge", has_text="interrupted").wait_for(timeout=60_000)

@@ -144,8 +144,10 @@ def test_an_empty_folder_says_so_and_leads_to_a_new_run(browser, served):
     with opened(browser, served, "/run?run=mistyped") as page:
         page.wait_for_selector("text=there is no run of this name below the folder: mistyped")
     with opened(browser, served) as page:
-        page.wait_for_selector("text=There are no runs below this folder yet.")
-        page.locator(".page").get_by_role("link", name="New run").click()
+        page.wait_for_selector("text=There is no run in this folder yet.")
+        assert page.get_by_role("button", name="Watch it learn").count() == 4
+        assert not page.locator("table").is_visible()
+        page.locator(".page").get_by_role("link", name="Another environment").click()
         page.wait_for_url("**/new")
 
 

@@ -99,8 +99,12 @@ def test_pages_find_the_environment_of_the_command_line_by_its_id_and_no_setting
     assert [studio.typed(name).env for name in ("CartPole-v1", "evil.py", "")] == [None] * 3
 
 
-MADE = {"from_run": "typed(", "environment_of": "given(", "LivePlayer": "given(", "start": "words"}
+OPTIONS = dict.fromkeys(("environment_of", "LivePlayer", "ThenAndNow"), "given(")
+MADE = {"from_run": "typed(", **OPTIONS, "start": "words"}
 """What makes an environment or starts a process for a run, and where its last argument but the path comes from."""
+
+HANDED = ("player.py", "then_and_now.py")
+"""Files whose classes are handed the options, by the calls that are checked."""
 
 
 def test_all_that_makes_an_environment_or_starts_a_process_asks_what_was_typed():
@@ -114,7 +118,7 @@ def test_all_that_makes_an_environment_or_starts_a_process_asks_what_was_typed()
         (file, name, text) for file, name, text in calls if name in MADE and ("processes." in text or name != "start")
     ]
     assert len(asked) >= 5
-    assert [call for call in asked if MADE[call[1]] not in call[2] and call[0] != "player.py"] == []
+    assert [call for call in asked if MADE[call[1]] not in call[2] and call[0] not in HANDED] == []
     makers = {
         "from_arguments",
         "make",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from rejeu.core.interrupt import leaving
@@ -33,13 +34,13 @@ def run_runs(arguments: Runs) -> tuple[int, JsonObject]:
     return 0, {"runs": rows}
 
 
-def run_status(arguments: Status) -> tuple[int, Row]:
+def run_status(arguments: Status) -> tuple[int, JsonObject]:
     """Prints the row of a run; the exit status is 3 if it was interrupted or paused, 4 if it crashed."""
-    row = {"run": utf8(arguments.run.name), **describe(run_list.read(arguments.run))}
+    row = replace(describe(run_list.read(arguments.run)), run=utf8(arguments.run.name))
     if not arguments.json:
         show([row], arguments.run)
-        print("".join(f"warning: {text}\n" for text in row["warnings"]), end="")
-    return EXIT[row["state"]], row
+        print("".join(f"warning: {text}\n" for text in row.warnings), end="")
+    return EXIT[row.state], vars(row)
 
 
 def show(rows: Sequence[Row], folder: Path) -> None:
@@ -48,7 +49,7 @@ def show(rows: Sequence[Row], folder: Path) -> None:
         print(f"there are no runs in {folder}; rejeu train ENV makes one")
         return
     show_table(COLUMNS, map(texts, rows), N_TEXT)
-    print("".join(f"note: {cells(row)['run']}: {note}\n" for row in rows for note in row["notes"]), end="")
+    print("".join(f"note: {cells(row)['run']}: {note}\n" for row in rows for note in row.notes), end="")
 
 
 def follow(reader: RowReader) -> None:

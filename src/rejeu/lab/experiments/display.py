@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
+from dataclasses import replace
 from pathlib import Path
 
 from rejeu.lab.experiments.scheduler import Scheduler
@@ -51,9 +52,9 @@ def shown(scheduler: Scheduler, summary: Callable[[], str], progress: bool = Tru
 def rows_of(scheduler: Scheduler, reader: RowReader) -> list[Row]:
     """Returns the rows of the runs that train."""
     works = [attempt.work for attempt in scheduler.running]
-    return [{**reader.row(work.path), "run": work.name, "state": "running"} for work in works]
+    return [replace(reader.row(work.path), run=work.name, state="running") for work in works]
 
 
 def line(rows: Sequence[Row]) -> list[str]:
     """Returns how far the first runs are."""
-    return [f"{row['run']} {steps_text(row)} steps, return {best_text(row)}" for row in rows[:MAX_NAMED]]
+    return [f"{row.run} {steps_text(row)} steps, return {best_text(row)}" for row in rows[:MAX_NAMED]]

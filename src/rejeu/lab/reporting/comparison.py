@@ -24,6 +24,7 @@ from rejeu.lab.reporting.grouping import (
     Curve,
     Score,
     cut_to_shortest,
+    differing_settings,
     group_labels,
     scale,
     settings,
@@ -72,6 +73,8 @@ class Group:
     """``(3, N_POINTS)``: the statistic at each point, and the bounds of its interval; NaN before the first episodes."""
     x: np.ndarray
     """``(N_POINTS,)``: steps or seconds; the share of training where environments are mixed."""
+    run_curves: np.ndarray
+    """``(n_runs, N_POINTS)``: the curve of each run, in the order of ``runs``."""
     profile: np.ndarray
     """``(3, N_LEVELS)``: share of runs whose final score is above each level, and the bounds of its interval."""
     levels: np.ndarray
@@ -96,11 +99,19 @@ class Improvement:
     probability: float
     low: float
     high: float
+    pairs: int
+    """Of a run of each group."""
 
     @property
     def cells(self) -> list[str]:
-        """The two labels, the environment and the probability with its interval as text."""
-        return [self.label, self.other, self.env_id, f"{self.probability:.0%} ({self.low:.0%} to {self.high:.0%})"]
+        """The two labels, the environment and the probability with its interval as text.
+
+        Where all pairs have the same winner, the bootstrap has no interval, and their number says how much that is.
+        """
+        interval = (
+            f"{self.low:.0%} to {self.high:.0%}" if self.low < self.high else f"in all {self.pairs} pairs of runs"
+        )
+        return [self.label, self.other, self.env_id, f"{self.probability:.0%} ({interval})"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -123,6 +134,26 @@ class Comparison:
         if self.score == "evaluation":
             return "final score: mean return of the last evaluation"
         return f"final score: mean return of the training episodes in the last {FINAL:.0%} of what is compared"
+
+    @property
+    def standings(self) -> list[str]:
+        """For each group "best", "may be best" or nothing; intervals that reach that of the highest score are equal."""
+        texts = []
+        for group in self.groups:
+            peers = [peer.score for peer in self.groups if peer.env_id == group.env_id]
+            _, low, _ = max(peers)
+            reaching = [score for score in peers if score[2] >= low]
+            is_reaching = len(peers) > 1 and group.score in reaching
+            texts.append(("best" if len(reaching) == 1 else "may be best") if is_reaching else "")
+        return texts
+
+    @property
+    def settings(self) -> list[list[str]]:
+        """The settings in which the groups differ, as a table of texts with a row of headings."""
+        rows = differing_settings([group.runs for group in self.groups])
+        envs = {group.env_id for group in self.groups}
+        heads = [group.label if len(envs) == 1 else f"{group.label} on {group.env_id}" for group in self.groups]
+        return [["setting", *heads], *rows] if rows else []
 
     def table(self) -> list[JsonObject]:
         """Returns one row for each group, ready for ``pandas.DataFrame``."""
@@ -313,7 +344,7 @@ def compare(
     elif len(envs) > 1 and by != "env":
         notes.append(
             f"the runs are of {len(envs)} environments; each has rows of its own, because their returns cannot be averaged; "
-            "normalize them (--normalize range, or --reference ENV=LOW,HIGH) to average"
+            "normalize them to average"
         )
     mixes = normalize is not None and by != "env"
     keyed = by_group(curves, mixes)
@@ -362,7 +393,7 @@ def warnings_of(curves: Sequence[Curve]) -> list[str]:
         )
         repeated += [label] if seeds and max(seeds.values()) > 1 else []
     notes = [
-        f"{shown(label, 100)}: the runs of this group differ in their settings; --by setting separates them"
+        f"{shown(label, 100)}: the runs of this group differ in their settings; group by setting to separate them"
         for label in dict.fromkeys(mixed)
     ]
     notes += [
@@ -444,6 +475,7 @@ def make_group(
         mean=float(statistics.mean(scores)),
         median=float(statistics.median(scores)),
         curve=np.stack([middle, *band]),
+        run_curves=np.array(points),
         x=np.linspace(0, 1 if mixed else members[0].end, N_POINTS),
         profile=np.stack([statistics.above(scores, levels), *statistics.interval(statistics.above(samples, levels).T)]),
         levels=levels,
@@ -467,7 +499,8 @@ def compared(first: Key, second: Key, finals: Finals, draws: Mapping[Key, list[n
         first, second, probability = second, first, 1 - probability
     samples = [statistics.resampled(finals[key], draws[key]) for key in (first, second)]
     low, high = statistics.interval(statistics.improvement(*samples))
-    return Improvement(first[1], second[1], first[0], probability, float(low), float(high))
+    pairs = sum(len(scores) * len(others) for scores, others in zip(finals[first], finals[second], strict=True))
+    return Improvement(first[1], second[1], first[0], probability, float(low), float(high), pairs)
 
 
 def page_of(comparison: Comparison) -> str:
@@ -501,6 +534,7 @@ def page_of(comparison: Comparison) -> str:
         definition=f"{comparison.definition.capitalize()}. Intervals are 95 % stratified bootstrap intervals.",
         curves=entries["curve"],
         profiles=entries["profile"],
+        settings=comparison.settings,
         improvements=[improvement.cells for improvement in comparison.improvements[:MAX_LISTED]],
         runs=run_rows(comparison)[:MAX_LISTED],
     )

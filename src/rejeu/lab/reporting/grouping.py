@@ -9,6 +9,7 @@ import hashlib
 import itertools
 import json
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Literal
 
@@ -43,8 +44,7 @@ def group_labels(runs: Sequence[RunSummary], by: By | None) -> tuple[By, list[st
 
 def settings(runs: Sequence[RunSummary]) -> list[str]:
     """Returns for each run the algorithm, and the settings in which the runs of this algorithm differ."""
-    values = [dict(flat(run.config.hyperparameters)) | {"n_envs": run.config.n_envs} for run in runs]
-    written = [{name: whole_text(value) for name, value in setting.items()} for setting in values]
+    written = [*map(settings_of, runs)]
     members: dict[str, list[dict[str, str]]] = {}
     for run, setting in zip(runs, written, strict=True):
         members.setdefault(algorithm_label(run), []).append(setting)
@@ -55,6 +55,28 @@ def settings(runs: Sequence[RunSummary]) -> list[str]:
         parts = [algorithm, *(f"{name}={setting[name]}" for name in differing[algorithm] if name in setting)]
         labels.append(shortened(", ".join(parts)))
     return labels
+
+
+def settings_of(run: RunSummary) -> dict[str, str]:
+    """Returns the hyperparameters of a run and the number of its environments, as texts."""
+    values = dict(flat(run.config.hyperparameters)) | {"n_envs": run.config.n_envs}
+    return {name: whole_text(value) for name, value in values.items()}
+
+
+def differing_settings(groups: Sequence[Sequence[RunSummary]]) -> list[list[str]]:
+    """Returns the settings in which groups of runs differ, that two of them have at least.
+
+    Each is a row of texts: its name, then its values in each group, empty where there are none.
+    """
+    columns: list[dict[str, str]] = []
+    for runs in groups:
+        values: dict[str, set[str]] = {"algorithm": {algorithm_label(run) for run in runs}}
+        for name, text in (setting for run in runs for setting in settings_of(run).items()):
+            values.setdefault(name, set()).add(text)
+        columns.append({name: shortened(", ".join(sorted(texts - {""}))) for name, texts in values.items()})
+    common = {name for name, n in Counter(name for column in columns for name in column).items() if n > 1}
+    shared = [{name: column.get(name, "") for name in common} for column in columns]
+    return [[name, *(column[name] for column in shared)] for name in differing_names(shared)]
 
 
 def differing_names(settings: Sequence[Mapping[str, str]]) -> list[str]:

@@ -9,15 +9,16 @@ from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Literal
 
 import numpy as np
 
 from rejeu.checkpoints.run_folder import RunFolder
 from rejeu.core.records import shown, utf8
 from rejeu.lab.reporting import run_list
-from rejeu.lab.runs.read import RunSummary, best_row, is_file, is_locked
+from rejeu.lab.runs.read import Remarks, RunSummary, best_row, is_file, is_locked
 from rejeu.logs import charts
+from rejeu.logs.formatting import duration
 from rejeu.logs.tables import EMPTY
 
 WINDOW = 100
@@ -36,7 +37,73 @@ LONGEST = 10.0
 SLICE = 64
 """Most files of another program's run whose times are looked at."""
 
-Row = dict[str, Any]
+BEGINS = "begins; functions are compiled, which takes up to a minute"
+"""Note on a run that has not taken a step."""
+
+
+@dataclass(frozen=True)
+class BestEvaluation:
+    """The best evaluation of a run, with the 95 % interval of its mean return."""
+
+    step: int
+    mean_return: float
+    low: float
+    high: float
+    success_rate: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """A run as a row of a table, as plain values."""
+
+    run: str = ""
+    """Path below the folder that is listed."""
+    path: Path
+    name: str
+    format: str
+    env: str
+    algorithm: str | None
+    seed: int | None
+    state: str
+    """As of :attr:`rejeu.lab.runs.read.RunSummary.state`, "unread" or "gone"."""
+    steps: int
+    steps_asked: int | None
+    seconds: float
+    steps_per_second: float
+    seconds_left: float | None
+    """Until its goal of steps or of time; None unless it runs."""
+    episodes: int
+    mean_return: float
+    """Of the last :data:`WINDOW` training episodes."""
+    best: BestEvaluation | None
+    evaluations: int
+    curve: list[float]
+    changed: float
+    """When a file of it was written last, in seconds since 1970."""
+    pictures: tuple[str, ...]
+    """Names of its files."""
+    warnings: tuple[str, ...]
+    remarks: Remarks
+    """By a person."""
+    notes: tuple[str, ...]
+    """One for each thing that was missing or damaged, and the error that has ended it."""
+
+    @property
+    def share(self) -> float | None:
+        """Share of its steps, or of its time, that is done; None unless it runs towards a goal."""
+        if self.seconds_left is None:
+            return None
+        if self.steps_asked:
+            return min(self.steps / self.steps_asked, 1.0)
+        total = self.seconds + self.seconds_left
+        return self.seconds / total if 0 < total < math.inf else None
+
+    @property
+    def reason(self) -> str:
+        """Why it is in its state, as far as that is known: the error that has ended it, or that it compiles."""
+        if self.state == "running":
+            return "" if self.steps else BEGINS
+        return next(iter(self.notes), "") if self.state in ("damaged", "gone", "crashed") else ""
 
 
 @dataclass
@@ -56,6 +123,8 @@ class RowReader:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
+        self.moved: set[Path] = set()
+        """Runs that somebody has moved away, which have no row while they are not there. Other threads may add to it."""
         self._known: dict[Path, Known] = {}
 
     def read(self, seconds: float = math.inf) -> list[Row]:
@@ -69,15 +138,19 @@ class RowReader:
             paths = run_list.find(self.folder)
         except OSError:  # it is not there, or not any more
             paths = []
+        self.moved -= {*paths}
         for path in self._known.keys() - {*paths}:
-            row = {**self._known[path].row, "state": "gone", "notes": ("its folder is no longer there",)}
+            if path in self.moved:
+                del self._known[path]
+                continue
+            row = replace(self._known[path].row, state="gone", notes=("its folder is no longer there",))
             self._known[path] = Known(None, row, None, 0.0)
         for path in paths:
             if time.monotonic() < until:
                 self._update(path)
             elif path not in self._known:
                 self._known[path] = Known(None, nothing(path, "unread"), None, 0.0)
-        return [{**self._known[path].row, "run": self.name_of(path)} for path in sorted(self._known)]
+        return [replace(self._known[path].row, run=self.name_of(path)) for path in sorted(self._known)]
 
     def row(self, path: Path) -> Row:
         """Returns the row of one run."""
@@ -105,7 +178,7 @@ class RowReader:
             row = describe(run)
             run = replace(run, episodes=EMPTY, evaluations=EMPTY, metrics=EMPTY, goals=EMPTY, replays=EMPTY)
         except Exception as error:  # files can hold anything, and one run may not hide the others
-            row = {**nothing(path, "damaged"), "notes": (shown(str(error) or repr(error), 300),)}
+            row = replace(nothing(path, "damaged"), notes=(shown(str(error) or repr(error), 300),))
         now = time.monotonic()
         self._known[path] = Known(current, row, run, now + min(SHARE * (now - began), LONGEST))
 
@@ -119,7 +192,7 @@ def stamp(path: Path) -> object:
 def files(path: Path) -> tuple[Path, ...]:
     """Returns the files of a run that say that it has changed."""
     run = RunFolder(path)
-    return *run.marks, run.evaluations, run.warnings, run.agent, run.checkpoints, run.paused, run.video
+    return *run.marks, run.evaluations, run.warnings, run.remarks, run.agent, run.checkpoints, run.paused, run.video
 
 
 def others(path: Path) -> Iterator[Path]:
@@ -138,9 +211,9 @@ def time_of(path: Path) -> tuple[int, int] | None:
     return status.st_mtime_ns, status.st_size
 
 
-def nothing(path: Path, state: str) -> Row:
+def nothing(path: Path, state: Literal["unread", "damaged"]) -> Row:
     """Returns the row of a run of which nothing is known but its state."""
-    return {**describe(RunSummary(path=path, name=shown(path.name, 200))), "state": state}
+    return replace(describe(RunSummary(path=path, name=shown(path.name, 200))), state=state)
 
 
 def describe(run: RunSummary) -> Row:
@@ -158,39 +231,40 @@ def describe(run: RunSummary) -> Row:
     means = run.metrics.column("rollout/ep_rew_mean")
     folder = RunFolder(run.path)
     recent = returns if len(returns) else means[np.isfinite(means)][-1:]
-    return {
-        "path": run.path,
-        "name": run.name,
-        "format": run.format,
-        "env": config.env,
-        "algorithm": config.algorithm,
-        "seed": config.seed,
-        "state": run.state,
-        "steps": run.steps,
-        "steps_asked": config.steps,
-        "seconds": run.seconds,
-        "steps_per_second": rate,
-        "seconds_left": seconds_left if run.state == "running" else None,
-        "episodes": len(run.episodes),
-        "mean_return": float(np.mean(recent[np.isfinite(recent)])) if np.isfinite(recent).any() else math.nan,
-        "best": best_evaluation(run),
-        "evaluations": len(run.evaluations),
-        "curve": curve(run),
-        "changed": max((time_of(path) or (0, 0))[0] for path in files(run.path)) / 1e9,
-        "pictures": tuple(path.name for path in (folder.video, folder.curve) if is_file(path)),
-        "warnings": run.warnings,
-        "notes": (*filter(None, [run.error if run.state == "crashed" else ""]), *run.notes),
-    }
+    return Row(
+        path=run.path,
+        name=run.name,
+        format=run.format,
+        env=config.env,
+        algorithm=config.algorithm,
+        seed=config.seed,
+        state=run.state,
+        steps=run.steps,
+        steps_asked=config.steps,
+        seconds=run.seconds,
+        steps_per_second=rate,
+        seconds_left=seconds_left if run.state == "running" else None,
+        episodes=len(run.episodes),
+        mean_return=float(np.mean(recent[np.isfinite(recent)])) if np.isfinite(recent).any() else math.nan,
+        best=best_evaluation(run),
+        evaluations=len(run.evaluations),
+        curve=curve(run),
+        changed=max((time_of(path) or (0, 0))[0] for path in files(run.path)) / 1e9,
+        pictures=tuple(path.name for path in (folder.video, folder.curve) if is_file(path)),
+        warnings=run.warnings,
+        remarks=run.remarks,
+        notes=(*filter(None, [run.error if run.state == "crashed" else ""]), *run.notes),
+    )
 
 
-def best_evaluation(run: RunSummary) -> dict[str, float] | None:
-    """Returns the best evaluation, with the 95 % interval of its mean return; None if there is none."""
+def best_evaluation(run: RunSummary) -> BestEvaluation | None:
+    """Returns the best evaluation; None if there is none."""
     row = best_row(run.evaluations)
     if row is None:
         return None
     step, value, success = (run.evaluations.column(name)[row] for name in ("step", "mean_return", "success_rate"))
     low, high = (float(end[row]) for end in charts.interval(run.evaluations, "return"))
-    return {"step": int(step), "mean_return": float(value), "low": low, "high": high, "success_rate": float(success)}
+    return BestEvaluation(int(step), float(value), low, high, float(success))
 
 
 def curve(run: RunSummary) -> list[float]:
@@ -203,8 +277,8 @@ def curve(run: RunSummary) -> list[float]:
 
 def cells(row: Row) -> dict[str, str]:
     """Returns a row as texts, by the titles of :data:`COLUMNS`."""
-    names = (row["run"], row["env"], row["algorithm"], row["state"])
-    numbers = (steps_text(row), best_text(row), rate_text(row), bars(row["curve"]))
+    names = (row.run, row.env, row.algorithm, row.state)
+    numbers = (steps_text(row), best_text(row), rate_text(row), bars(row.curve))
     return dict(zip(COLUMNS, (shown(text, 300) for text in (*names, *numbers)), strict=True))
 
 
@@ -215,24 +289,24 @@ def texts(row: Row) -> list[str]:
 
 def steps_text(row: Row) -> str:
     """Returns the steps done, with those asked for unless all are done."""
-    done, asked = row["steps"], row["steps_asked"]
+    done, asked = row.steps, row.steps_asked
     return f"{done:,} of {asked:,} ({done / asked:.0%})" if asked and done < asked else f"{done:,}"
 
 
 def best_text(row: Row) -> str:
     """Returns the best evaluation with its interval; of a run without one the mean return of the last training episodes."""
-    best = row["best"]
+    best = row.best
     if best is None:
-        return f"{row['mean_return']:,.2f} in training" if math.isfinite(row["mean_return"]) else "-"
-    interval = f" ({best['low']:,.2f} to {best['high']:,.2f})" if math.isfinite(best["low"]) else ""
-    success = f", {best['success_rate']:.0%} success" if math.isfinite(best["success_rate"]) else ""
-    return f"{best['mean_return']:,.2f}{interval}{success}"
+        return f"{row.mean_return:,.2f} in training" if math.isfinite(row.mean_return) else "-"
+    interval = f" ({best.low:,.2f} to {best.high:,.2f})" if math.isfinite(best.low) else ""
+    success = f", {best.success_rate:.0%} success" if math.isfinite(best.success_rate) else ""
+    return f"{best.mean_return:,.2f}{interval}{success}"
 
 
 def rate_text(row: Row) -> str:
     """Returns the steps a second, and the time that is left."""
-    rate, seconds = row["steps_per_second"], row["seconds_left"]
-    remaining = f", {seconds:,.0f} s left" if seconds is not None and math.isfinite(seconds) else ""
+    rate, seconds = row.steps_per_second, row.seconds_left
+    remaining = f", {duration(seconds)} left" if seconds is not None and math.isfinite(seconds) else ""
     return f"{rate:,.0f}/s{remaining}" if math.isfinite(rate) else "-"
 
 

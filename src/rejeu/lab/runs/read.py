@@ -25,7 +25,7 @@ from rejeu.algorithms.catalog import CATALOG
 from rejeu.checkpoints.run_folder import RunFolder, newest_inside, newest_step
 from rejeu.core import atomic
 from rejeu.core.errors import CheckpointError
-from rejeu.core.records import Malformed, convert, parse_json, shown
+from rejeu.core.records import Malformed, convert, json_text, parse_json, shown
 from rejeu.core.types import Settings
 from rejeu.lab.runs.config import MAX_BYTES, RunConfig
 from rejeu.logs.formatting import quoted
@@ -43,9 +43,28 @@ MAX_STEP = 2**53
 ERROR = re.compile(r"[A-Z]\w*(Error|Exception): ")
 """Beginning of the warning that names the error which ended a run, if it is the last one."""
 
+MAX_NOTE, MAX_TAGS = 10_000, 20
+"""Upper limits on the length of a note, in characters, and on the number of tags."""
+
 UNKNOWN = RunConfig(env="", algorithm="")
 """The description of a run of which nothing is known."""
 State = Literal["running", "finished", "paused", "interrupted", "crashed", "damaged", "unknown"]
+
+
+@dataclass(frozen=True)
+class Remarks:
+    """Note and tags of a person about a run."""
+
+    note: str = ""
+    tags: tuple[str, ...] = ()
+
+    def write(self, folder: RunFolder) -> None:
+        """Writes them into the folder of a run, shortened to what is read."""
+        content = {"note": self.note[:MAX_NOTE], "tags": [tag[:MAX_NAME] for tag in self.tags[:MAX_TAGS]]}
+        atomic.write(folder.remarks, json_text(content))
+
+
+NO_REMARKS = Remarks()
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -80,6 +99,7 @@ class RunSummary:
     """Paths of mp4 files inside the folder, oldest first; the video of the best model is last."""
     models: tuple[Path, ...] = ()
     """Paths of the model files, the best first."""
+    remarks: Remarks = NO_REMARKS
     notes: tuple[str, ...] = ()
     """One line for each thing that was missing or damaged."""
 
@@ -168,6 +188,7 @@ def read_run(path: str | Path, columns: Collection[str] | None = None) -> RunSum
         warnings=read_warnings(files.warnings),
         videos=tuple(find_videos(files)),
         models=tuple(path for path in (files.best, files.agent) if is_file(path)),
+        remarks=read_remarks(files.remarks),
         notes=(*notes, *(note for table in (*tables, goals, replays) for note in table.notes)),
     )
     state = state_of(run)
@@ -207,6 +228,14 @@ def read_config(path: Path) -> tuple[RunConfig, dict[str, str | None], list[str]
         return UNKNOWN, {}, [f"there is no {path.name}, so the configuration is not known"]
     except (OSError, Malformed, CheckpointError) as error:
         return UNKNOWN, {}, [f"{path.name} is damaged: {shown(error)}"]
+
+
+def read_remarks(path: Path) -> Remarks:
+    """Returns the note and the tags of a run; empty ones of a damaged file."""
+    try:
+        return convert(parse_json(read_bytes(path, MAX_WARNINGS_BYTES)), Remarks)
+    except (OSError, Malformed, CheckpointError):
+        return NO_REMARKS
 
 
 def ordered(table: Table) -> Table:

@@ -10,7 +10,9 @@ from nicegui import ui
 from rejeu.checkpoints.run_folder import RunFolder, checkpoint_files, step_of
 from rejeu.lab.runs import parsing
 from rejeu.lab.runs.arguments import Branch
+from rejeu.lab.studio.layout import form_buttons
 from rejeu.lab.studio.new import lead_to, new_folder
+from rejeu.lab.studio.speech import say
 from rejeu.lab.studio.state import Studio
 
 
@@ -18,11 +20,11 @@ def open_form(studio: Studio, name: str, path: Path) -> None:
     """Opens the form over the page of a run; ``name`` is that of its row."""
     steps = {step_of(file): f"{step_of(file):,}" for file in checkpoint_files(RunFolder(path).checkpoints)}
     with ui.dialog(value=True) as form, ui.card().classes("w-full").style("max-width: 30rem"):
-        ui.label("A new run from a checkpoint of this one").classes("text-weight-medium")
-        step = ui.select(steps, label="from step", value=next(iter(steps), None)).classes("w-full")
-        settings = ui.input("settings that change", placeholder="learning_rate=1e-4 gamma=0.9").classes("w-full")
-        more = ui.input("train for so many more steps (empty: to the goal of this run)").classes("w-full")
-        folder = ui.input("new folder", value=f"{name}-branch").classes("w-full")
+        ui.label(say("A new run from a checkpoint of this one")).classes("text-weight-medium")
+        step = ui.select(steps, label=say("from step"), value=next(iter(steps), None)).classes("w-full")
+        settings = ui.input(say("settings that change"), placeholder="learning_rate=1e-4 gamma=0.9").classes("w-full")
+        more = ui.input(say("train for so many more steps (empty: to the goal of this run)")).classes("w-full")
+        folder = ui.input(say("new folder"), value=f"{name}-branch").classes("w-full")
         message = ui.label().classes("text mono")
 
         async def begin() -> None:
@@ -33,14 +35,12 @@ def open_form(studio: Studio, name: str, path: Path) -> None:
                 words += ["--steps", more.value] if more.value else []
                 words += ["--set", *shlex.split(settings.value)] if settings.value else []
                 parsing.parse(words, {"branch": Branch}, {}, "")
-                message.text = await lead_to(studio, words, out)
+                message.text = await lead_to(studio, words, out, message.set_text)
             except (ValueError, OSError) as error:
                 message.text = str(error)
             button.enable()
 
-        with ui.row():
-            button = ui.button("Start", icon="call_split", on_click=begin).props("no-caps")
-            ui.button("Cancel", on_click=form.delete).props("flat no-caps")
+        button = form_buttons(form, say("Start"), begin, "call_split")
         if not steps:
             button.disable()
-            message.text = "This run has no checkpoint yet."
+            message.text = say("This run has no checkpoint yet.")

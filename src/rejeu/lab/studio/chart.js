@@ -1,7 +1,7 @@
 // A chart or a histogram of rejeu.logs.charts, drawn again when its data change. Texts become text nodes.
 export default {
-  template: `<div class="chart"><div class="legend" ref="legend"></div><div class="plot" ref="plot" :style="{height: height}"></div></div>`,
-  props: { chart: Object, axis: String, height: String, chosen: Number },
+  template: `<div class="chart"><div class="legend" ref="legend"></div><div class="plot" ref="plot" role="img" :aria-label="name" :style="{height: height}"></div></div>`,
+  props: { chart: Object, name: String, axis: String, height: String, chosen: Number },
   mounted() {
     this.draw();
     this.colors = new MutationObserver(() => this.draw());
@@ -23,8 +23,9 @@ export default {
     draw() {
       const { plot, legend } = this.$refs;
       if (!this.chart || !plot || !plot.offsetWidth) return;
-      if (this.chart.counts) RejeuCharts.histogram(plot, this.chart, this.chosen, (bar) => this.$emit("choose", bar));
-      else RejeuCharts.draw(plot, this.chart, this.axis, legend, (place) => this.$emit("choose", place));
+      const choose = (number) => this.$emit("choose", number);
+      if (this.chart.counts) RejeuCharts.histogram(plot, this.chart, this.chosen, choose, legend);
+      else RejeuCharts.draw(plot, this.chart, this.axis, legend, choose);
     },
   },
 };

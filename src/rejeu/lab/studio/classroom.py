@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from functools import cache, partial
+from functools import cache
 
 from fastapi import Request
 from nicegui import ui
 
-from rejeu.core.language import LANGUAGES, Language, chosen, said
+from rejeu.core.language import Language, said
 from rejeu.core.types import JsonObject
 from rejeu.lab.reporting.rows import Row
 from rejeu.lab.studio.judging import Judging
 from rejeu.lab.studio.layout import EVERY, address
+from rejeu.lab.studio.speech import language_here, say
 from rejeu.lab.studio.state import Studio
 from rejeu.teaching.courses import leaderboard
 from rejeu.teaching.courses.leaderboard import Leaderboard
@@ -21,11 +22,12 @@ CSS = """
 .class a { text-decoration: none; }
 .class svg { width: 7rem; height: 1rem; display: block; }
 .projector .header { display: none; }
-.projector .page { max-width: none; padding: 2vw; }
-.projector .class td, .projector .class th { font-size: min(2.2rem, 3.2vw); line-height: 1.5; }
-.projector .class td .quiet { font-size: min(1.4rem, 2.2vw); line-height: 1.3; }
+.projector .page { max-width: none; padding: 1.5vh 2vw; gap: 1vh; }
+.projector .class td, .projector .class th { font-size: min(2.2rem, 3.2vw, 4vh); line-height: 1.35; padding: 0.3vh 8px; }
+.projector .class td, .projector .class th { height: auto; }
+.projector .class td .quiet { font-size: min(1.4rem, 2.2vw, 2.4vh); line-height: 1.2; }
 .projector .class svg { width: 16vw; height: 1.6rem; }
-.projector .title { font-size: min(3rem, 5vw); line-height: 1.2; }
+.projector .title { font-size: min(3rem, 5vw, 5.5vh); line-height: 1.2; }
 .projector .small { display: none; }
 """
 PLACES = "Models whose intervals overlap may be equally good: the place is the range that the intervals allow."
@@ -56,18 +58,15 @@ def judging_of(studio: Studio) -> Judging:
 def build(studio: Studio, request: Request) -> None:
     """Makes the page; its address may name a ``language``, and ``projector`` for large letters."""
     ui.add_css(CSS)
-    judging, asked = judging_of(studio), request.query_params
-    language = chosen(asked.get("language") if asked.get("language") in LANGUAGES else None)
-    is_large = "projector" in asked
-    say = partial(said, language=language)
+    judging, language = judging_of(studio), language_here()
+    is_large = "projector" in request.query_params
     ui.query("body").classes("projector" if is_large else "")
-    alternative: Language = "en" if language == "fr" else "fr"
-    large = {} if is_large else {"projector": "1"}
     with ui.row().classes("items-center w-full"):
         title = ui.label().classes("text-h5 title")
         ui.space()
-        ui.link(say("français"), address("/class", language=alternative, **({} if large else {"projector": "1"})))
-        ui.link(say("projector"), address("/class", language=language, **large))
+        ui.link(
+            say("projector"), address("/class", language=language, **({} if is_large else {"projector": "1"}))
+        ).classes("run")
     table = ui.table(rows=[], columns=columns(leaderboard.columns(language)), row_key="name", pagination=0)
     table.classes("w-full class").props("flat bordered dense hide-pagination")
     for name, template in SLOTS.items():
@@ -114,7 +113,7 @@ def lines(studio: Studio, judging: Judging, board: Leaderboard) -> list[JsonObje
     """Returns the lines of the table: the models by mean return, then the runs that train and have no model yet."""
     ends = [end for row in board.rows for end in row.interval] or [0.0]
     scale = 100 / max(max(ends) - min(ends), 1e-9)
-    running = {row["run"]: progress(row, board.language) for row in studio.rows if row["state"] == "running"}
+    running = {row.run: progress(row, board.language) for row in studio.rows if row.state == "running"}
     ranked: list[JsonObject] = []
     for row in board.rows:
         low, high = ((end - min(ends)) * scale for end in row.interval)
@@ -130,6 +129,6 @@ def lines(studio: Studio, judging: Judging, board: Leaderboard) -> list[JsonObje
 
 def progress(row: Row, language: Language) -> str:
     """Returns how far a run is."""
-    asked = row["steps_asked"]
-    share = f"{row['steps'] / asked:.0%}" if asked else f"{row['steps']:,}"
+    asked = row.steps_asked
+    share = f"{row.steps / asked:.0%}" if asked else f"{row.steps:,}"
     return said("trains: {}", leaderboard.written(share, language), language=language)

@@ -10,6 +10,7 @@ from nicegui import app, ui
 from nicegui.element import Element
 
 from rejeu.lab.reporting.report.page import TEMPLATES
+from rejeu.lab.studio.speech import say
 from rejeu.logs.charts import Chart
 
 SCRIPTS = ("/plotly.min.js", "/charts.js")
@@ -19,26 +20,39 @@ class Figure(Element, component="chart.js"):
     """A chart or a histogram. Mutable: ``show`` replaces it.
 
     Args:
+        name: title, which a picture of it has too.
         chart: as the functions of :mod:`rejeu.logs.charts` return it; None draws nothing yet.
         height: in CSS.
         choose: called with the number of the bar of a histogram, or of the place of a map, that was clicked.
     """
 
     def __init__(
-        self, chart: Chart | None = None, height: str = "240px", choose: Callable[[int], object] | None = None
+        self,
+        name: str,
+        chart: Chart | None = None,
+        height: str = "240px",
+        choose: Callable[[int], object] | None = None,
     ) -> None:
         super().__init__()
-        self.props.update(chart=chart, axis="x", height=height)
+        self.props.update(chart=in_language(chart), name=name, axis="x", height=height)
         self.classes("w-full")
         if choose is not None:
             self.on("choose", lambda event: choose(int(event.args)))
 
     def show(self, chart: Chart | None = None, **props: object) -> None:
         """Draws another chart, or the same over another ``axis`` ("x" are steps, "t" minutes), or with a ``chosen`` bar."""
-        changed = props if chart is None else {"chart": chart, **props}
+        changed = props if chart is None else {"chart": in_language(chart), **props}
         if any(self.props.get(name) != value for name, value in changed.items()):
             self.props.update(changed)
             self.update()
+
+
+def in_language(chart: Chart | None) -> Chart | None:
+    """Returns a chart with its texts in the language of the page, as far as that has them."""
+    if chart is None or "series" not in chart:
+        return chart
+    axes: dict[str, str] = {name: say(chart[name]) for name in ("x", "y") if name in chart}
+    return {**chart, **axes, "series": [{**series, "name": say(series["name"])} for series in chart["series"]]}
 
 
 def serve_scripts() -> None:

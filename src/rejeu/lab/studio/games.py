@@ -17,6 +17,7 @@ from rejeu.core.language import said
 from rejeu.core.types import JsonObject
 from rejeu.lab.runs.config import RunConfig
 from rejeu.lab.runs.environment import Environment, environment_of, from_run
+from rejeu.lab.studio.speech import speaking
 from rejeu.lab.studio.state import Studio
 from rejeu.teaching.play import Opened, opened
 from rejeu.teaching.play.game import Event, Game, Player
@@ -90,7 +91,7 @@ class HostedGame:
         self._start, self._show = start, show
         self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
         self._presses = 0
-        threading.Thread(target=self._run, daemon=True).start()
+        threading.Thread(target=speaking(self._run), daemon=True).start()
 
     def handle(self, event: Event) -> None:
         """Passes an event to the game."""

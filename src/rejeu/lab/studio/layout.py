@@ -6,13 +6,18 @@ into ``ui.html``, ``ui.markdown``, ``ui.code``, the slots of a table as HTML, or
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from copy import copy
+from types import MappingProxyType
 from urllib.parse import urlencode
 
+from fastapi import Request
 from nicegui import ui
 
+from rejeu.core.language import LANGUAGES, Language, chosen
 from rejeu.lab.studio import figures
+from rejeu.lab.studio.speech import QUASAR, say
 from rejeu.lab.studio.state import Studio
 
 EVERY = 1.0
@@ -33,6 +38,8 @@ a.run { color: var(--line); overflow-wrap: anywhere; }
 .charts { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 420px), 1fr)); gap: 12px; }
 .mono { font-family: ui-monospace, monospace; font-size: 12px; }
 .warning { background: var(--mark); color: var(--mark-ink); border-radius: 8px; padding: 4px 10px; width: 100%; }
+.unseen { position: absolute; width: 1px; height: 1px; overflow: hidden; clip-path: inset(50%); }
+.body--dark .text-primary { --q-primary: var(--line); }
 .text { white-space: pre-wrap; overflow-wrap: anywhere; }
 .body--dark { --bar: #16263d; }
 @media (max-width: 600px) { .page { padding: 8px; } }
@@ -41,31 +48,62 @@ MODES = {None: "brightness_auto", False: "light_mode", True: "dark_mode"}
 """Symbols of the colors of a page: those of the system, light and dark."""
 
 
+COOKIE = "rejeu_language"
+"""Cookie of the browser with the language of the pages."""
+
+
 @contextmanager
-def frame(title: str, path: str, links: Sequence[tuple[str, str]]) -> Iterator[None]:
+def frame(request: Request, title: str, path: str, links: Sequence[tuple[str, str]]) -> Iterator[None]:
     """Context whose elements are the content of a page.
 
     Args:
+        request: whose address may name a ``language``, and a ``run`` for the title.
         title: of the page.
         path: of the page.
         links: path and title of each page in the navigation.
     """
+    client = ui.context.client
+    client.page = copy(client.page)  # its own, with the language of this browser
+    language = asked_language(request)
+    client.page.language = QUASAR[language]
+    client.title = " · ".join(
+        filter(None, [request.query_params.get("run") if path == "/run" else "", say(title), "rejeu"])
+    )
     figures.add_scripts()
     ui.add_css(STYLE)
-    ui.colors(primary="#2f6db5")
+    ui.colors(primary="#2f6db5", positive="#1b7a43")
     dark = ui.dark_mode(None)
     with ui.header().classes("header items-center gap-1 no-wrap"):
         ui.label("rejeu").classes("text-subtitle1 text-weight-bold q-mr-sm gt-xs")
         with ui.row().classes("gap-0 no-wrap").style("overflow-x: auto"):
             for target, name in links:
                 line = "text-decoration: underline; text-underline-offset: 6px" if target == path else ""
-                ui.link(name, target).classes("text-white q-px-sm no-underline").style(line)
+                ui.link(say(name), target).classes("text-white q-px-sm no-underline text-no-wrap").style(line)
         ui.space()
+        other_language: Language = "en" if language == "fr" else "fr"
+        ui.button(other_language, on_click=lambda: speak(other_language)).props(
+            f"flat dense color=white aria-label='{say('français')}'"
+        )
         ui.button(icon=MODES[None], on_click=lambda event: next_mode(event.sender, dark)).props(
-            "flat round dense color=white aria-label='light or dark'"
+            f"flat round dense color=white aria-label='{say('light or dark')}'"
         )
     with ui.column().classes("page"):
+        ui.label(client.title).classes("unseen").props("role=heading aria-level=1")
         yield
+
+
+def asked_language(request: Request) -> Language:
+    """Returns the language that an address names, or a browser's cookie, or else the usual one."""
+    asked = request.query_params.get("language") or request.cookies.get(COOKIE)
+    return chosen(asked if asked in LANGUAGES else None)
+
+
+def speak(language: Language) -> None:
+    """Shows the page of this browser again, and later all pages, in a language."""
+    ui.run_javascript(
+        f"document.cookie = '{COOKIE}={language}; path=/; samesite=lax; max-age=31536000';"
+        "const url = new URL(location); url.searchParams.delete('language'); location.replace(url);"
+    )
 
 
 def next_mode(button: ui.button, dark: ui.dark_mode) -> None:
@@ -78,6 +116,14 @@ def next_mode(button: ui.button, dark: ui.dark_mode) -> None:
 def action(text: str, icon: str | None, on_click: Callable[..., object]) -> ui.button:
     """Makes a small button."""
     return ui.button(text, icon=icon, on_click=on_click).props("outline dense no-caps padding='2px 10px'")
+
+
+def form_buttons(form: ui.dialog, text: str, on_click: Callable[..., object], icon: str | None = None) -> ui.button:
+    """Makes the buttons below a form over a page, which removes it when it is cancelled; returns the first."""
+    with ui.row():
+        button = ui.button(text, icon=icon, on_click=on_click).props("no-caps")
+        ui.button(say("Cancel"), on_click=form.delete).props("flat no-caps")
+    return button
 
 
 def follow(studio: Studio, show: Callable[[], object], every: float = EVERY) -> None:
@@ -101,3 +147,45 @@ def address(path: str, **query: str | Sequence[str]) -> str:
     '/run?run=a+b%2F%3Cc%3E'
     """
     return f"{path}?{urlencode(query, doseq=True, errors='surrogateescape')}" if query else path
+
+
+class Choice:
+    """The choices on a page. Mutable: the address has them, so that they survive a reload and can be sent.
+
+    Args:
+        request: whose address may name it. What is invalid there is as usual.
+        usual: texts by parameter. What is as usual is left out of the address.
+        valid: whether a text is valid, by parameter; without an entry all are.
+        fixed: parameters that keep all their values.
+    """
+
+    def __init__(
+        self,
+        request: Request,
+        usual: Mapping[str, str],
+        valid: Mapping[str, Callable[[str], object]] = MappingProxyType({}),
+        fixed: Sequence[str] = (),
+    ) -> None:
+        query = request.query_params
+        asked = {name: query[name] for name in usual if name in query and valid.get(name, str)(query[name])}
+        self.path, self.usual = request.url.path, usual
+        self.values = {**usual, **asked}
+        self.fixed = {name: query.getlist(name) for name in fixed if name in query}
+
+    def __getitem__(self, name: str) -> str:
+        return self.values[name]
+
+    def change(self, **changed: str) -> None:
+        """Chooses otherwise."""
+        self.values |= changed
+        ui.navigate.history.replace(self.address())
+
+    def address(self, path: str | None = None, **more: str) -> str:
+        """Returns the address of the page, or of another path with the same parameters."""
+        changed = {name: value for name, value in self.values.items() if value != self.usual[name]}
+        return address(path or self.path, **self.fixed, **changed, **more)
+
+
+def is_number(text: str) -> bool:
+    """Returns whether a text of an address is a whole number, of so many digits as a seed may have."""
+    return text.isdecimal() and len(text) < 16

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import os
 import re
 import shlex
@@ -14,6 +15,7 @@ from typing import Any, Literal, get_args, get_origin
 
 from fastapi import Request
 from nicegui import ui
+from nicegui.events import ValueChangeEventArguments
 
 from rejeu.agents import AGENTS, presets
 from rejeu.checkpoints.run_folder import dated
@@ -28,12 +30,19 @@ from rejeu.lab.runs.config import Option, Topic, options
 from rejeu.lab.runs.read import MAX_NAME
 from rejeu.lab.studio import processes
 from rejeu.lab.studio.layout import action, address
+from rejeu.lab.studio.speech import say
 from rejeu.lab.studio.state import Studio
+from rejeu.logs.formatting import quoted
 
 LEFT_OUT = {"assist", "json", "fps"}
 """Options that need a window, or are for programs."""
 LABELS = {"hyperparameters": "hyperparameters", "n_envs": "environments at once", "out": "folder"}
 """Of fields, where the option is called otherwise."""
+PRESET = {
+    "algorithm": "algorithm", "total_steps": "steps", "n_envs": "n_envs", "evaluate_every": "evaluate_every",
+    "evaluate_episodes": "evaluate_episodes", "success_threshold": "success_threshold", "hyperparameters": "hyperparameters",
+}  # fmt: skip
+"""Fields of the form by those of a preset."""
 LOOK = 0.5
 """Seconds between two looks whether the run has begun."""
 NAME = re.compile(r"(?!(con|prn|aux|nul|com\d|lpt\d)(\.|$))[\w(][\w .,()+=@-]*(?<![ .])", re.IGNORECASE)
@@ -50,25 +59,43 @@ def build(studio: Studio, request: Request) -> None:
             lists[option.group].append(option)
     fields: dict[str, Any] = {}
     for topic, listed in lists.items():
-        container = ui.element("div") if topic is Topic.FIRST else ui.expansion(topic.capitalize()).classes("w-full")
+        container = (
+            ui.element("div") if topic is Topic.FIRST else ui.expansion(say(topic.capitalize())).classes("w-full")
+        )
         with container.classes("w-full"), ui.element("div").classes("charts w-full"):
             fields |= {option.field: make_field(option, docs.get(option.field, option.shown.help)) for option in listed}
     fields["env"].value = prefilled(request)
     with ui.row().classes("items-center"):
-        button = ui.button("Start", icon="play_arrow").props("no-caps")
+        button = ui.button(say("Start"), icon="play_arrow").props("no-caps")
         spinner = ui.spinner()
         spinner.set_visibility(False)
     message = ui.label().classes("text mono")
+    ui.label(say("The same on the command line:")).classes("quiet")
+    equivalent = ui.label().classes("text mono")
+
+    def show() -> None:
+        texts = {name: field.value for name, field in fields.items()}
+        for name, text in preset_texts(texts).items():
+            fields[name].props["placeholder"] = text
+        equivalent.text = command_text(texts, studio)
+
+    def complete(event: ValueChangeEventArguments) -> None:
+        fields["env"].value = completed(event.value)
+
+    fields["env"].on_value_change(complete)
+    for field in fields.values():
+        field.on_value_change(show)
+    show()
 
     async def begin() -> None:
         button.disable()
         spinner.set_visibility(True)
-        message.text, button.text = "", "Starting ..."
+        message.text, button.text = "", say("Starting ...")
         try:
             message.text = await start(studio, {name: field.value for name, field in fields.items()}, message.set_text)
         except (ValueError, OSError) as error:
             message.text = str(error)
-        button.text = "Start"
+        button.text = say("Start")
         button.enable()
         spinner.set_visibility(False)
 
@@ -81,22 +108,53 @@ def prefilled(request: Request) -> str | None:
     return env_id if is_plain_id(env_id) else None
 
 
+def completed(text: str | None) -> str | None:
+    """Returns an id of an environment that was typed, or that of a preset which begins like it.
+
+    >>> completed("cartpole"), completed("CartPole-v1"), completed("my_env.py")
+    ('CartPole-v1', 'CartPole-v1', 'my_env.py')
+    """
+    ids = [preset.env_id for preset in presets.every()]
+    matches = [env_id for env_id in ids if text and env_id.lower().startswith(text.lower())]
+    return text if text in ids else next(iter(matches), text)
+
+
+def preset_texts(texts: Texts) -> dict[str, str]:
+    """Returns the values that a run has where nothing is entered, by field: those of the preset, if there is one."""
+    preset = presets.find(texts.get("env") or "", texts.get("algorithm") or None)
+    if preset is None:
+        return dict.fromkeys(PRESET.values(), "")
+    values = {field: getattr(preset, name) for name, field in PRESET.items()}
+    settings = preset.hyperparameters.items()
+    hyperparameters = " ".join(quoted(f"{name}={json.dumps(value)}") for name, value in settings)
+    texts = {field: "" if value is None else str(value) for field, value in values.items()}
+    return {**texts, "hyperparameters": hyperparameters}
+
+
+def command_text(texts: Texts, studio: Studio) -> str:
+    """Returns the command that starts the run of a form, as it is typed; a mistake in the form is said instead."""
+    try:
+        return " ".join(map(quoted, ["rejeu", *command(texts, studio)[0]]))
+    except ValueError as error:
+        return in_form(str(error))
+
+
 def make_field(option: Option, doc: str) -> Any:
     """Returns the element in which an option is entered."""
-    label = LABELS.get(option.field, option.name.removeprefix("--").replace("-", " ").lower())
+    label = say(LABELS.get(option.field, option.name.removeprefix("--").replace("-", " ").lower()))
     if option.type is bool:
         element: Any = ui.switch(label)
     elif option.field == "env":
         names = sorted({preset.env_id for preset in presets.every()})
-        element = ui.select(names, label="environment", with_input=True, new_value_mode="add-unique")
+        element = ui.select(names, label=say("environment"), with_input=True, new_value_mode="add-unique")
     elif option.field == "algorithm":
-        element = ui.select(sorted(AGENTS), label="algorithm", with_input=True, clearable=True)
+        element = ui.select(sorted(AGENTS), label=say("algorithm"), with_input=True, clearable=True)
     elif get_origin(option.type) is Literal:
         element = ui.select([*get_args(option.type)], label=label, clearable=True)
     else:
         element = ui.input(label, validation=lambda text: problem_of(option, text))
     if option.type is not bool:
-        element.props("dense outlined stack-label bottom-slots hide-bottom-space").props.update(hint=in_form(doc))
+        element.props("dense outlined stack-label bottom-slots hide-bottom-space").props.update(hint=say(in_form(doc)))
     return element
 
 
@@ -106,7 +164,9 @@ def in_form(doc: str) -> str:
     >>> in_form("With --backend ray: one module; repeat for several.")
     'With backend ray: one module; several with spaces between them.'
     """
-    return re.sub(r"--(?=\w)", "", doc).replace("repeat for several", "several with spaces between them")
+    return re.sub(r"--(?=\w)|rejeu (?=resume|branch|tune)", "", doc).replace(
+        "repeat for several", "several with spaces between them"
+    )
 
 
 def problem_of(option: Option, text: str | None) -> str | None:
@@ -114,7 +174,7 @@ def problem_of(option: Option, text: str | None) -> str | None:
     try:
         words_of(option, text)
     except ValueError as error:
-        return str(error)
+        return in_form(str(error))
     return None
 
 
@@ -182,7 +242,7 @@ def check_new(path: Path) -> None:
         raise ValueError(f"folder {path} exists; name another, or remove it first")
 
 
-async def start(studio: Studio, texts: Texts, say: Callable[[str], object]) -> str:
+async def start(studio: Studio, texts: Texts, show: Callable[[str], object]) -> str:
     """Checks the environment and starts the run, and leads to its page; returns what went wrong, if anything did.
 
     An environment with a preset is not checked: the tests of rejeu do that.
@@ -190,13 +250,13 @@ async def start(studio: Studio, texts: Texts, say: Callable[[str], object]) -> s
     words, arguments = command(texts, studio)
     if presets.find(arguments.env, None) is None:
         await asyncio.to_thread(require_known, arguments)
-        say("rejeu check tries the environment for a few seconds ...")
+        show(say("The environment is tried for a few seconds ..."))
         status, printed = await check(arguments)
         if status:
             return printed
-        say(printed)
+        show(printed)
     studio.trust(arguments)
-    return await lead_to(studio, words, Path(arguments.out or ""))
+    return await lead_to(studio, words, Path(arguments.out or ""), show)
 
 
 def require_known(arguments: Train) -> None:
@@ -210,8 +270,11 @@ def require_known(arguments: Train) -> None:
         raise ValueError(unknown_environment(env_id))
 
 
-async def lead_to(studio: Studio, words: Sequence[str], path: Path) -> str:
-    """Starts a run by a command, and leads to its page once it has begun; returns what went wrong, if anything did."""
+async def lead_to(studio: Studio, words: Sequence[str], path: Path, show: Callable[[str], object]) -> str:
+    """Starts a run by a command, and leads to its page once it has begun; returns what went wrong, if anything did.
+
+    Until then ``show`` gets what the command has printed last.
+    """
     check_new(path)  # also a while after the form was read
     process = processes.start(words, path)
     name = path.relative_to(studio.folder).as_posix()
@@ -219,6 +282,8 @@ async def lead_to(studio: Studio, words: Sequence[str], path: Path) -> str:
         while not studio.holds(name):
             if process.poll() is not None and not (path.is_dir() and find(path)):
                 return processes.read_log(path) or f"rejeu {words[0]} ended with exit status {process.returncode}"
+            printed = processes.read_log(path).strip().rpartition("\n")[2]
+            show(printed or say("JAX is loaded, and environments are made ..."))
             await asyncio.sleep(LOOK)
     ui.navigate.to(address("/run", run=name))
     return ""
@@ -227,7 +292,7 @@ async def lead_to(studio: Studio, words: Sequence[str], path: Path) -> str:
 @contextmanager
 def stoppable(process: subprocess.Popen[bytes]) -> Iterator[None]:
     """Context in which a button ends a process, of which nothing is written yet."""
-    button = action("Stop", "stop", process.terminate)
+    button = action(say("Stop"), "stop", process.terminate)
     try:
         yield
     finally:

@@ -9,10 +9,10 @@ from fastapi import Request
 from nicegui import ui
 
 from rejeu.agents import presets
-from rejeu.core.language import said
 from rejeu.lab.studio.games import HostedGame, Wanted
 from rejeu.lab.studio.layout import address, follow
 from rejeu.lab.studio.screen import CSS, Screen
+from rejeu.lab.studio.speech import say
 from rejeu.lab.studio.state import Studio
 from rejeu.teaching.play.game import Event
 from rejeu.teaching.play.keys import KNOWN, KeyMap
@@ -34,31 +34,31 @@ def build(studio: Studio, request: Request) -> None:
     asked = request.query_params
     names = asked.getlist("agent")[:MOST_AGENTS]
     first = studio.row(names[0]) if names else None
-    env_id = asked.get("env") or (first["env"] if first is not None else None)
+    env_id = asked.get("env") or (first.env if first is not None else None)
     seed = asked.get("seed", "")
     with (
-        ui.expansion(said("Environment and players"), value=not (env_id or names))
+        ui.expansion(say("Environment and players"), value=not (env_id or names))
         .props("dense")
         .classes("w-full") as form,
         ui.row().classes("items-center w-full"),
     ):
         env = ui.select(
             environments(studio, env_id),
-            label=said("environment"),
+            label=say("environment"),
             value=env_id,
             with_input=True,
             new_value_mode="add-unique",
         ).classes("w-64")
-        agents = ui.select(offered(studio, env_id, names), label=said("agents"), value=names, multiple=True).classes(
+        agents = ui.select(offered(studio, env_id, names), label=say("agents"), value=names, multiple=True).classes(
             "w-64"
         )
         agents.props(f"use-chips max-values={MOST_AGENTS}")
-        by_hand = ui.switch(said("I play"), value="watch" not in asked)
-        record = ui.switch(said("record")).bind_enabled_from(by_hand, "value")
+        by_hand = ui.switch(say("I play"), value="watch" not in asked)
+        record = ui.switch(say("record")).bind_enabled_from(by_hand, "value")
         number = ui.number(
-            said("seed"), value=int(seed) if seed.isdecimal() and len(seed) < 16 else None, min=0, precision=0
+            say("seed"), value=int(seed) if seed.isdecimal() and len(seed) < 16 else None, min=0, precision=0
         ).classes("w-20")
-        start = ui.button(said("Start"), icon="play_arrow").props("no-caps")
+        start = ui.button(say("Start"), icon="play_arrow").props("no-caps")
     stage = ui.column().classes("stage w-full")
 
     def start_anew() -> None:
@@ -93,13 +93,13 @@ def build(studio: Studio, request: Request) -> None:
 
 def environments(studio: Studio, selected: str | None) -> list[str]:
     """Returns the ids of environments with presets, with keys, and of the runs, and the one that is chosen."""
-    ids = [*(preset.env_id for preset in presets.every()), *(row["env"] for row in studio.rows), selected]
+    ids = [*(preset.env_id for preset in presets.every()), *(row.env for row in studio.rows), selected]
     return sorted({*KNOWN, *filter(None, ids)})
 
 
 def offered(studio: Studio, env_id: str | None, selected: list[str]) -> list[str]:
     """Returns the names of the agents that play an environment, and of those that are chosen."""
-    runs = [row["run"] for row in studio.rows if row["env"] == env_id]
+    runs = [row.run for row in studio.rows if row.env == env_id]
     return [*dict.fromkeys([*selected, *studio.guests, *runs])]
 
 
@@ -120,7 +120,7 @@ def show(studio: Studio, wanted: Wanted, begun: Callable[[str], object], again: 
         for button, text in keycaps.items():
             button.text = labelled(text, labels)
 
-    status = ui.label(said("The environment is made, and agents are compiled ...")).classes("text")
+    status = ui.label(say("The environment is made, and agents are compiled ...")).classes("text")
     screen = Screen(lambda event: playing.handle(event), label)
     buttons = ui.row().classes("keys gap-1 items-center w-full")
     playing = HostedGame(lambda: wanted.open(studio), screen.show)
@@ -137,9 +137,9 @@ def show(studio: Studio, wanted: Wanted, begun: Callable[[str], object], again: 
             timer.deactivate()
             keycaps.clear()
             buttons.clear()
-            status.text = playing.said or said("The game has ended.")
+            status.text = playing.said or say("The game has ended.")
             with buttons:
-                ui.button(said("again"), icon="replay", on_click=again).props("no-caps")
+                ui.button(say("again"), icon="replay", on_click=again).props("no-caps")
 
     timer = ui.timer(LOOK, look)
 
@@ -160,7 +160,7 @@ def show_keys(playing: HostedGame, keys: KeyMap | None) -> dict[ui.button, str]:
     for key, label in HELP:
         with ui.row().classes(together):
             button = ui.button(key, on_click=partial(playing.handle_all, "press", [key])).props(CHIP).classes("key")
-            ui.label(said(label)).classes("text-caption")
+            ui.label(say(label)).classes("text-caption")
         keycaps[button] = key
     return keycaps
 

@@ -38,6 +38,7 @@ from rejeu.lab.runs.environment import from_run
 from rejeu.lab.runs.read import is_locked
 from rejeu.lab.studio.deciding import Bar, bars_of
 from rejeu.lab.studio.screen import jpeg
+from rejeu.lab.studio.speech import speaking
 from rejeu.logs import charts
 from rejeu.logs.charts import Chart
 from rejeu.logs.video import playback_fps
@@ -117,7 +118,7 @@ class LivePlayer:
         show: called with the pictures and captions of each step.
     """
 
-    def __init__(self, folder: Path, options: RunOptions, show: Callable[..., object]) -> None:
+    def __init__(self, folder: Path, options: RunOptions, show: Callable[..., object], is_seen: bool = True) -> None:
         self.folder, self.options, self.show = RunFolder(folder), options, show
         self.episode: LiveEpisode | None = None
         """The episode that is played, or was played last."""
@@ -128,8 +129,8 @@ class LivePlayer:
         self.gamma = 1.0
         self.problem = ""
         """Why nothing is shown."""
-        self.is_seen = True
-        """Whether anybody looks; else the agent rests."""
+        self.is_seen = is_seen
+        """Whether anybody looks; else the agent rests, and nothing is loaded."""
         self.model, self._next_seed = CURRENT, 0
         self.seed: int | None = None
         """From which its episodes begin; None for new ones."""
@@ -142,7 +143,7 @@ class LivePlayer:
         self._changed, self._closed, self._stepped = threading.Event(), threading.Event(), threading.Event()
         self._renew_at, self._step = 0.0, 0
         self._stamp: object = None
-        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread = threading.Thread(target=speaking(self._run), daemon=True)
         self._thread.start()
 
     def choose(self, model: str, seed: int | None = None, goal: Sequence[float] | None = None) -> None:
@@ -167,6 +168,9 @@ class LivePlayer:
         lower_priority()
         while not self._closed.is_set():
             self._changed.clear()
+            if not self.is_seen:
+                self._changed.wait(0.1)
+                continue
             try:
                 environment = from_run(read_folder(self.folder), self.folder.path, self.options)
                 with closing(environment.rendering()) as env:
@@ -269,7 +273,9 @@ class LivePlayer:
                 return path
         if not is_locked(folder.lock):
             raise FileNotFoundError("there is no model; the run has ended before it wrote one")
-        raise FileNotFoundError("there is no model yet; the first is written within seconds or at the first evaluation")
+        raise FileNotFoundError(
+            "there is no policy yet; the first is shown when functions are compiled and training has begun"
+        )
 
 
 def nearest_seed(env: gym.Env, goal: Sequence[float]) -> int:

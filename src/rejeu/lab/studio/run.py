@@ -6,6 +6,7 @@ import asyncio
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,22 +18,22 @@ from nicegui import ui
 from rejeu.checkpoints.run_folder import RunFolder
 from rejeu.core import atomic
 from rejeu.core.errors import one_line
-from rejeu.core.language import said
 from rejeu.core.records import brief
 from rejeu.core.types import JsonObject
 from rejeu.lab.experiments.work import HIDDEN
 from rejeu.lab.reporting import run_list
 from rejeu.lab.reporting.report import sections
-from rejeu.lab.reporting.rows import SHARE, Row
+from rejeu.lab.reporting.rows import SHARE, Row, rate_text, steps_text
 from rejeu.lab.runs import requests
-from rejeu.lab.runs.read import is_file
-from rejeu.lab.studio import processes
+from rejeu.lab.runs.read import Remarks, is_file
+from rejeu.lab.studio import moving, processes
 from rejeu.lab.studio.branch import open_form
 from rejeu.lab.studio.figures import Figure
-from rejeu.lab.studio.layout import EVERY, action, address
+from rejeu.lab.studio.layout import EVERY, Choice, action, address, form_buttons, is_number
 from rejeu.lab.studio.player import BEST, CURRENT, LiveEpisode, LivePlayer, lower_priority
 from rejeu.lab.studio.runs import COLORS
 from rejeu.lab.studio.screen import CSS, Screen
+from rejeu.lab.studio.speech import say, translated
 from rejeu.lab.studio.state import Studio
 from rejeu.lab.studio.then_and_now import ThenAndNow
 from rejeu.logs import charts
@@ -40,6 +41,13 @@ from rejeu.logs.charts import Chart
 
 FIRST = (sections.CURVES, sections.GOALS)
 """Headings of the charts that are open; the others are folded."""
+AXES = {"x": "steps", "t": "time"}
+USUAL = {"policy": CURRENT, "seed": "", "axis": "x"}
+VALID = {
+    "policy": lambda name: name in (CURRENT, BEST) or requests.MODEL.fullmatch(f"{name}.safetensors"),
+    "seed": is_number,
+    "axis": AXES.__contains__,
+}
 REPLAYS = 100
 SLOW = 0.2
 """Speed of slow motion."""
@@ -57,29 +65,29 @@ def build(studio: Studio, request: Request) -> None:
     """Makes the page of the run that the address names."""
     name = request.query_params.get("run", "")
     row = studio.row(name)
-    if row is None or row["state"] == "unread":
+    if row is None or row.state == "unread":
         message = ui.label().classes("text")
 
         def look() -> None:
             row = studio.row(name)
             is_missing = studio.version and row is None
             text = "there is no run of this name below the folder" if is_missing else "reading the folder"
-            message.text = f"{text}: {name}"
-            if row is not None and row["state"] != "unread":
+            message.text = f"{say(text)}: {name}"
+            if row is not None and row.state != "unread":
                 ui.navigate.reload()
 
         look()
         ui.timer(EVERY, look)
         return
     ui.add_css(CSS)
-    RunPage(studio, name, Path(row["path"]))
+    RunPage(studio, name, row.path, Choice(request, USUAL, VALID, ["run"]))
 
 
 class RunPage:
     """The page of one run. Mutable: it follows the run."""
 
-    def __init__(self, studio: Studio, name: str, path: Path) -> None:
-        self.studio, self.name, self.path = studio, name, path
+    def __init__(self, studio: Studio, name: str, path: Path, choice: Choice) -> None:
+        self.studio, self.name, self.path, self.choice = studio, name, path, choice
         self.figures: dict[str, Figure] = {}
         self.grids: dict[str, ui.element] = {}
         self.maps: dict[str, Chart] = {}
@@ -97,12 +105,12 @@ class RunPage:
         if self.is_ours:
             ThenAndNow(RunFolder(path), studio.given(name))
         with ui.row().classes("items-center w-full"):
-            self.axis = ui.toggle({"x": "steps", "t": "time"}, value="x", on_change=self.turn).props("dense no-caps")
+            self.axis = ui.toggle(translated(AXES), value=choice["axis"], on_change=self.turn).props("dense no-caps")
         self.groups = ui.column().classes("w-full gap-2")
         self.episodes = Episodes(self)
-        with ui.expansion("Settings").classes("w-full"):
+        with ui.expansion(say("Settings")).classes("w-full"):
             self.settings = ui.column().classes("w-full")
-        with ui.expansion("Log").classes("w-full") as log:
+        with ui.expansion(say("Log")).classes("w-full") as log:
             self.log = ui.label().classes("text mono quiet")
         log.on_value_change(self.show_log)
         ui.timer(EVERY, self.look)
@@ -110,6 +118,8 @@ class RunPage:
     async def look(self) -> None:
         """Shows the run again if it has changed."""
         row = self.studio.row(self.name)
+        if row is not None and row.state == "running":
+            self.head.show_progress(row)
         if row is None or row == self.row or time.monotonic() < self.due:
             return
         began, self.row = time.monotonic(), row
@@ -118,7 +128,7 @@ class RunPage:
             if self.name in self.studio.summaries:  # else its row says why it cannot be read
                 parts = await asyncio.get_running_loop().run_in_executor(READING, read, self.path)
         except Exception as error:  # files can hold anything; it is not read again each second
-            row = {**row, "notes": (*row["notes"], one_line(error))}
+            row = replace(row, notes=(*row.notes, one_line(error)))
         self.due = time.monotonic() + SHARE * (time.monotonic() - began)
         self.show(row, parts)
 
@@ -145,15 +155,16 @@ class RunPage:
         """Draws charts, and adds those that are new."""
         for title, entries in groups:
             if title not in self.grids:
-                with self.groups, ui.expansion(title, value=title in FIRST).classes("w-full"):
+                with self.groups, ui.expansion(say(title), value=title in FIRST).classes("w-full"):
                     self.grids[title] = ui.element("div").classes("charts w-full")
             for entry in entries:
                 is_map = "places" in data[entry.id]
                 if entry.id not in self.figures:
                     with self.grids[title], ui.card().classes("card").props("flat bordered"):
-                        ui.label(entry.title).classes("text-weight-medium text")
+                        ui.label(say(entry.title)).classes("text-weight-medium text")
                         choose = partial(self.watch_goal, entry.id) if is_map else None
-                        self.figures[entry.id] = Figure(height="340px" if is_map else "240px", choose=choose)
+                        height = "340px" if is_map else "240px"
+                        self.figures[entry.id] = Figure(say(entry.title), height=height, choose=choose)
                         self.map_notes |= {entry.id: ui.label().classes("text-caption quiet")} if is_map else {}
                 if is_map:
                     self.maps[entry.id] = data[entry.id]
@@ -176,19 +187,20 @@ class RunPage:
         seed = next_seed(places[number]["seeds"], self.live.player.seed)
         if seed is None:
             self.live.choose(CURRENT, goal=places[number]["goal"])
-            ui.notify(said("The current policy acts from a start with the goal nearest to this place."))
+            ui.notify(say("The current policy acts from a start with the goal nearest to this place."))
         else:
             self.episodes.watch({"seed": seed})
 
     def turn(self) -> None:
         """Draws all charts over another axis."""
+        self.choice.change(axis=self.axis.value)
         for figure in self.figures.values():
             figure.show(axis=self.axis.value)
 
     def show_log(self) -> None:
         """Shows the end of the log."""
-        self.log.text = (
-            processes.read_log(self.path) or "There is none: the studio did not start this run, nor a sweep."
+        self.log.text = processes.read_log(self.path) or say(
+            "There is none: the studio did not start this run, nor a sweep."
         )
 
 
@@ -211,15 +223,64 @@ def show_actions(page: RunPage, row: Row) -> None:
     """Shows buttons for what the state of a run allows."""
     folder = RunFolder(page.path)
     is_alone = not (page.path.parent / HIDDEN).is_dir()  # a sweep would continue a run that stops
-    if row["state"] == "running" and page.is_ours and is_alone:
-        action("Stop", "stop", lambda event: stop(event.sender, folder))
-    if row["state"] in ("paused", "interrupted", "crashed") and page.is_ours:
-        text = "The run continues from its newest checkpoint."
-        action("Resume", "play_arrow", lambda event: command(event.sender, "resume", page, text))
+    if row.state == "running" and page.is_ours and is_alone:
+        action(say("Stop"), "stop", lambda event: stop(event.sender, folder))
+    if row.state in ("paused", "interrupted", "crashed") and page.is_ours:
+        text = say("The run continues from its newest checkpoint.")
+        action(say("Resume"), "play_arrow", lambda event: command(event.sender, "resume", page, text))
     if page.is_ours:
         play = address("/play", agent=page.name)
-        action("Play", "sports_esports", lambda: ui.navigate.to(play))
-        action("Branch", "call_split", lambda: open_form(page.studio, page.name, page.path))
+        action(say("Play"), "sports_esports", lambda: ui.navigate.to(play))
+        action(say("Branch"), "call_split", lambda: open_form(page.studio, page.name, page.path))
+        action(say("Note"), "edit_note", lambda: edit_remarks(page, row))
+    if row.state != "running":
+        action(say("Rename"), "drive_file_rename_outline", lambda: rename_run(page))
+        action(say("Delete"), "delete", lambda: delete_run(page))
+    ui.link(say("save this page"), address("/save/run", run=page.name)).classes("run self-center")
+
+
+def edit_remarks(page: RunPage, row: Row) -> None:
+    """Opens a form for the note and the tags of a run."""
+
+    def save() -> None:
+        try:
+            Remarks(note.value or "", (*(tags.value or "").split(),)).write(RunFolder(page.path))
+        except OSError as error:
+            ui.notify(brief(error), type="negative")
+        else:
+            form.delete()
+
+    with ui.dialog(value=True) as form, ui.card().classes("w-full").style("max-width: 30rem"):
+        note = ui.textarea(say("note"), value=row.remarks.note).classes("w-full")
+        tags = ui.input(say("tags, with spaces between them"), value=" ".join(row.remarks.tags)).classes("w-full")
+        form_buttons(form, say("Save"), save)
+
+
+def rename_run(page: RunPage) -> None:
+    """Opens a form for another name of a run, and leads to its page."""
+
+    def save() -> None:
+        try:
+            moving.rename(page.studio, page.name, name.value or "")
+        except (OSError, ValueError) as error:
+            message.text = brief(error)
+        else:
+            ui.navigate.to(address("/run", run=name.value))
+
+    with ui.dialog(value=True) as form, ui.card().classes("w-full").style("max-width: 30rem"):
+        name = ui.input(say("folder"), value=page.name).classes("w-full")
+        message = ui.label().classes("text mono")
+        form_buttons(form, say("Rename"), save)
+
+
+def delete_run(page: RunPage) -> None:
+    """Moves a run into the bin, and leads to the page of all runs, where that can be undone."""
+    try:
+        moving.delete(page.studio, [page.name])
+    except (OSError, ValueError) as error:
+        ui.notify(brief(error), type="negative")
+    else:
+        ui.navigate.to("/")
 
 
 def stop(button: Any, folder: RunFolder) -> None:
@@ -229,7 +290,7 @@ def stop(button: Any, folder: RunFolder) -> None:
     except OSError as error:
         ui.notify(brief(error), type="negative")
     else:
-        ui.notify("The run stops after this step, and saves everything.")
+        ui.notify(say("The run stops after this step, and saves everything."))
         disable_while(button, lambda: is_file(folder.stop))
 
 
@@ -265,7 +326,8 @@ def disable_while(button: Any, is_under_way: Callable[[], bool]) -> None:
 def show_tile(tile: sections.Tile) -> None:
     """Shows a figure of the headline."""
     with ui.card().classes("card tile").props("flat bordered"):
-        ui.label(tile.title).classes("text-caption quiet")
+        texts = [say(tile.title), *([say("step {}", tile.step)] if tile.step else [])]
+        ui.label(", ".join(texts)).classes("text-caption quiet")
         ui.label(tile.value).classes("text-h6")
         for text in filter(None, (tile.note, tile.more)):
             ui.label(text).classes("text-caption quiet")
@@ -279,7 +341,7 @@ def show_settings(section: sections.RunSection) -> None:
     usual = [(name, value, "") for name, value in section.settings]
     for title, rows in (("Different from the defaults", changed), ("Run", usual), ("Others", section.unchanged)):
         if rows:
-            ui.label(title).classes("text-weight-medium")
+            ui.label(say(title)).classes("text-weight-medium")
             cells = [dict(zip(names, row, strict=True)) for row in rows]
             ui.table(rows=cells, columns=columns).props("flat dense hide-header wrap-cells").classes("w-full text")
     if section.command:
@@ -297,20 +359,28 @@ class Head:
             self.badge = ui.badge()
             ui.space()
             self.actions = ui.row().classes("gap-2")
-        self.facts = ui.label().classes("quiet text")
+        self.progress = ui.linear_progress(show_value=False).props(f"instant-feedback aria-label='{say('progress')}'")
+        self.status = ui.label().classes("text")
+        self.facts, self.remarks = ui.label().classes("quiet text"), ui.label().classes("text")
         self.notes = ui.column().classes("w-full gap-1")
 
     def show(self, row: Row, section: sections.RunSection | None) -> None:
         """Shows the row of a run, and its section of the report if it could be read. Buttons stay while the state does."""
-        self.env.text, self.algorithm.text = row["env"] or row["name"], row["algorithm"]
-        self.facts.text = " · ".join([row["run"], *(() if section is None else section.facts)])
-        if row["state"] != self.state:
-            self.state = self.badge.text = row["state"]
+        self.env.text, self.algorithm.text = row.env or row.name, row.algorithm
+        self.facts.text = " · ".join([row.run, *(() if section is None else section.facts)])
+        self.remarks.text = " · ".join(
+            filter(None, [" ".join(f"#{tag}" for tag in row.remarks.tags), row.remarks.note])
+        )
+        self.remarks.set_visibility(bool(self.remarks.text))
+        if row.state != self.state:
+            self.state, self.badge.text = row.state, say(row.state)
             self.badge.props(f"color={COLORS.get(self.state, 'grey-7')}")
             self.actions.clear()
             with self.actions:
                 show_actions(self.page, row)
-        problems = (*row["warnings"], *row["notes"]) if section is None else (*section.warnings, *section.notes)
+        for element in (self.progress, self.status):
+            element.set_visibility(row.state == "running")
+        problems = (*row.warnings, *row.notes) if section is None else (*section.warnings, *section.notes)
         if problems != self.problems:
             self.problems = problems
             self.notes.clear()
@@ -318,26 +388,37 @@ class Head:
                 for text in problems:
                     ui.label(text).classes("warning text")
 
+    def show_progress(self, row: Row) -> None:
+        """Shows how far training is: a bar, and what it has printed last; of one without a log what its files say."""
+        self.progress.value = row.share or 0.0
+        self.progress.props["indeterminate"] = row.share is None
+        printed = processes.read_log(self.page.path).strip().rpartition("\n")[2]
+        self.status.text = printed or say(row.reason) or f"{steps_text(row)} · {rate_text(row)}"
+
 
 class LiveView:
     """The agent that acts, and who of the course of training it is. Mutable."""
 
     def __init__(self, page: RunPage) -> None:
-        self.page, self.steps = page, [CURRENT]
+        self.page, self.steps = page, [CURRENT, BEST]
         self.screen = Screen()
-        self.status = ui.label(said("the agent is loaded")).classes("quiet text")
+        self.status = ui.label(say("the agent is loaded")).classes("quiet text")
         with ui.row().classes("items-center w-full no-wrap gap-4"):
-            self.slider = ui.slider(min=0, max=0, value=0, on_change=self.chosen).props("label-always=false")
+            self.slider = ui.slider(min=0, max=1, value=0, on_change=self.chosen).props(f"aria-label='{say('policy')}'")
             self.label = ui.label().classes("quiet").style("min-width: 9em")
-            action(said("best"), None, lambda: self.choose(BEST))
+            action(say("best"), None, lambda: self.choose(BEST))
         with ui.row().classes("items-center gap-2"):
-            self.pause = action(said("pause"), "pause", self.turn_pause)
-            action(said("one step"), "skip_next", self.step)
-            slow = ui.checkbox(said("slow motion")).props("dense")
-        self.player = LivePlayer(page.path, page.studio.given(page.name), self.screen.show)
+            self.pause = action(say("pause"), "pause", self.turn_pause)
+            action(say("one step"), "skip_next", self.step)
+            slow = ui.checkbox(say("slow motion")).props("dense")
+        self.player = LivePlayer(page.path, page.studio.given(page.name), self.screen.show, is_seen=False)
         slow.on_value_change(lambda event: setattr(self.player, "speed", SLOW if event.value else 1.0))
         self.screen.on_leave = self.player.close
+        self.choose(page.choice["policy"], int(page.choice["seed"]) if page.choice["seed"] else None)
         ui.add_body_html(SEEN)
+        ui.timer(
+            0.0, lambda: ui.run_javascript("emitEvent('seen', !document.hidden)"), once=True
+        )  # once it is connected
         ui.on("seen", lambda event: setattr(self.player, "is_seen", bool(event.args)))
         ui.timer(EVERY, self.look)
 
@@ -354,49 +435,54 @@ class LiveView:
     def look(self) -> None:
         """Offers policies that are new, and shows what the critic expected."""
         models = [path.stem for path in requests.models(RunFolder(self.page.path).models)]
-        steps = [*models, CURRENT]
+        steps = [*models, CURRENT, BEST]
         if steps != self.steps:
-            current = self.steps[self.slider.value]
-            self.steps, value = steps, steps.index(current) if current in steps else len(models)
-            self.slider.props(f"max={len(models)}")
-            self.slider.value = value
+            self.steps = steps
+            self.slider.props(f"max={len(steps) - 1}")
         self.name()
-        self.status.text = self.player.problem
+        self.status.text = say(self.player.problem)
         self.page.show_maps()
         if self.page.values is not None:
             self.page.values.show(self.player.complete or self.player.episode, self.player.gamma)
 
     def name(self) -> None:
-        """Says which policy the slider is at."""
+        """Says which policy acts, and moves the slider there."""
         model, is_paused = self.player.model, self.player.is_paused
-        self.pause.text = said("continue") if is_paused else said("pause")
+        self.pause.text = say("continue") if is_paused else say("pause")
         self.pause.props(f"icon={'play_arrow' if is_paused else 'pause'}")
-        names = {CURRENT: said("current policy"), BEST: said("best policy")}
-        self.label.text = names.get(model) or said("after {} steps", f"{int(model.removeprefix('step_')):,}")
+        if model in self.steps:
+            self.slider.value = self.steps.index(model)
+        names = {CURRENT: say("current policy"), BEST: say("best policy")}
+        self.label.text = names.get(model) or say("after {} steps", f"{int(model.removeprefix('step_')):,}")
 
     def chosen(self) -> None:
         """Lets the policy at the slider act."""
-        self.choose(self.steps[min(int(self.slider.value), len(self.steps) - 1)])
-        self.name()
+        model = self.steps[min(int(self.slider.value), len(self.steps) - 1)]
+        if model != self.player.model:
+            self.choose(model)
 
     def choose(self, model: str, seed: int | None = None, goal: Sequence[float] | None = None) -> None:
         """Lets a policy act, from a seed or to a goal if one is given."""
         if goal is not None or (model, seed) != (self.player.model, self.player.seed):
             self.player.choose(model, seed, goal)
+            self.page.choice.change(policy=model, seed="" if seed is None else str(seed))
+            self.name()
 
 
 class Values:
     """Values that the critic gave to the steps of an episode, and the returns to go. Mutable."""
 
     def __init__(self) -> None:
-        with ui.card().classes("card w-full").props("flat bordered"):
+        with ui.card().classes("card w-full").props("flat bordered") as self.card:
             self.title = ui.label().classes("text-weight-medium text")
-            self.figure = Figure()
+            self.figure = Figure(say("Value of each step"))
+        self.card.set_visibility(False)
 
     def show(self, episode: LiveEpisode | None, gamma: float) -> None:
         """Draws an episode, as far as it is."""
         if episode is not None and episode.rewards:
-            self.title.text = said("Value of each step, seed {}", episode.seed)
+            self.card.set_visibility(True)
+            self.title.text = say("Value of each step, seed {}", episode.seed)
             to_go = episode.to_go(gamma) if episode.is_over else np.zeros(0)
             expected = episode.expected if episode.is_cut else None
             self.figure.show(charts.value_chart(np.array(episode.values), to_go, expected))
@@ -408,21 +494,26 @@ class Episodes:
     def __init__(self, page: RunPage) -> None:
         self.page = page
         self.histogram: Chart | None = None
-        with ui.expansion(said("Episodes"), value=True).classes("w-full"):
+        with ui.expansion(say("Episodes"), value=True).classes("w-full"):
             self.title = ui.label().classes("text")
-            self.figure = Figure(height="200px", choose=self.choose)
-            self.play = action(said("Play {} episodes", REPLAYS), "replay", lambda event: self.replay(event.sender))
+            self.figure = Figure(say("Returns of the trained agent"), height="200px", choose=self.choose)
+            self.play = action(say("Play {} episodes", REPLAYS), "replay", lambda event: self.replay(event.sender))
             self.play.set_visibility(False)
-            self.table = ui.table(rows=[], columns=EPISODES, row_key="seed", pagination=10).props("flat dense")
+            self.table = ui.table(
+                rows=[],
+                columns=[column | {"label": say(str(column["label"]))} for column in EPISODES],
+                row_key="seed",
+                pagination=10,
+            ).props("flat dense")
             self.table.on("rowClick", lambda event: self.watch(event.args[1]))
             self.table.set_visibility(False)
-            self.training_title = ui.label(said("Returns of the training episodes")).classes("text")
-            self.training = Figure(height="200px")
+            self.training_title = ui.label(say("Returns of the training episodes")).classes("text")
+            self.training = Figure(say("Returns of the training episodes"), height="200px")
 
     def show(self, replays: JsonObject | None, training: Chart | None, has_model: bool) -> None:
         """Draws the histograms."""
         self.histogram = replays
-        self.title.text = said(TITLE) if replays else ""
+        self.title.text = say(TITLE) if replays else ""
         self.figure.set_visibility(replays is not None)
         self.play.set_visibility(has_model)
         self.training_title.set_visibility(training is not None)
@@ -445,9 +536,9 @@ class Episodes:
         """Shows an episode again: the best policy acts from its seed."""
         if self.page.live is not None and isinstance(seed := episode.get("seed"), int):
             self.page.live.choose(BEST, seed)
-            ui.notify(said("The best policy acts from the seed {}.", seed))
+            ui.notify(say("The best policy acts from the seed {}.", seed))
 
     def replay(self, button: Any) -> None:
         """Lets the best policy play episodes from known seeds, in a process of its own."""
-        text = said("The best policy plays {} episodes; they are listed here when it has finished.", REPLAYS)
+        text = say("The best policy plays {} episodes; they are listed here when it has finished.", REPLAYS)
         command(button, "report", self.page, text, "--replay", str(REPLAYS))

@@ -17,6 +17,7 @@ from nicegui import app, ui
 from rejeu.lab.studio import classroom, compare, figures, new, play, run, runs
 from rejeu.lab.studio.guard import HOST, Guard
 from rejeu.lab.studio.layout import frame
+from rejeu.lab.studio.saving import add_downloads
 from rejeu.lab.studio.state import Studio
 
 PORTS = 100
@@ -71,6 +72,7 @@ def serve(
         links = [(entry.path, entry.title) for entry in PAGES if entry.is_listed]
         figures.serve_scripts()
         add_files(studio)
+        add_downloads(studio)
         for entry in PAGES:
             add(entry, studio, links)
         ui.run_with(server, title="rejeu studio", dark=None, show_welcome_message=False, reconnect_timeout=RECONNECT)
@@ -85,7 +87,7 @@ def add(page: Page, studio: Studio, links: list[tuple[str, str]]) -> None:
     """Adds a page to NiceGUI's application."""
 
     def show(request: Request) -> None:
-        with frame(page.title, page.path, links):
+        with frame(request, page.title, page.path, links):
             page.build(studio, request)
 
     ui.page(page.path, title=f"{page.title} · rejeu studio")(show)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path, PurePath
@@ -16,6 +17,8 @@ from rejeu.lab.runs.read import RunSummary, is_file
 
 EVERY = 1.0
 """Seconds between two looks at the folder, and longest look, after which rows are shown though some runs are not read yet."""
+REST = 3.0
+"""Rest between two looks at many runs, as a multiple of the time that the last one took."""
 
 Guests = Mapping[str, tuple[Path, Environment]]
 NOTHING = RunConfig(env="")
@@ -40,6 +43,8 @@ class Studio:
         """The runs without their tables, by the names of their rows."""
         self.version = 0
         """Rises when the rows change."""
+        self.deleted: list[Path] = []
+        """Folders in the bin, which come back in the reverse order."""
         self._reader = RowReader(folder)
         self._trusted = [typed]
         self._ended = threading.Event()
@@ -67,7 +72,7 @@ class Studio:
 
     def row(self, run: str) -> Row | None:
         """Returns the row of a run by its path below the folder, as pages have it in their address; None if there is none."""
-        return next((row for row in self.rows if row["run"] == run), None)
+        return next((row for row in self.rows if row.run == run), None)
 
     def given(self, run: str) -> RunOptions:
         """Returns how the environment of a run is made, as far as people have typed what no file may name.
@@ -103,21 +108,29 @@ class Studio:
 
     def holds(self, run: str) -> bool:
         """Returns whether a run has begun, by its path below the folder."""
-        return any(f"{row['run']}/".startswith(f"{run}/") for row in self.rows if row["state"] != "gone")
+        return any(f"{row.run}/".startswith(f"{run}/") for row in self.rows if row.state != "gone")
 
     def file(self, run: str, name: str) -> Path | None:
         """Returns a regular file in the folder of a run; None if there is none, or it is a symbolic link."""
         row = self.row(run)
-        path = None if row is None else Path(row["path"]) / name
+        path = None if row is None else Path(row.path) / name
         return path if path is not None and is_file(path) else None
+
+    def forget(self, path: Path) -> None:
+        """Leaves out the row of a run that was moved away."""
+        self._reader.moved.add(path)
+        self.rows = [row for row in self.rows if row.path != path]
+        self.version += 1
 
     def _follow(self) -> None:
         while not self._ended.is_set():
+            began = time.monotonic()
             rows = self._reader.read(EVERY)
             if rows != self.rows or not self.version:  # an empty folder was read too
                 self.rows, self.summaries = rows, self._reader.summaries()
                 self.version += 1
-            self._ended.wait(EVERY)
+            is_complete = all(row.state != "unread" for row in rows)
+            self._ended.wait(max(EVERY, REST * (time.monotonic() - began)) if is_complete else 0.0)
 
 
 def allowed(typed: RunConfig, run: RunConfig) -> RunOptions | None:

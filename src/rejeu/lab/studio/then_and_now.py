@@ -26,6 +26,7 @@ from rejeu.lab.studio.games import HostedGame, caption
 from rejeu.lab.studio.layout import EVERY, action
 from rejeu.lab.studio.player import step_of
 from rejeu.lab.studio.screen import Screen
+from rejeu.lab.studio.speech import say
 from rejeu.logs.video import VideoFile, playback_fps
 from rejeu.teaching.play import Opened, opened
 from rejeu.teaching.play.game import Event, Game
@@ -125,16 +126,16 @@ class ThenAndNow:
     def __init__(self, folder: RunFolder, options: RunOptions) -> None:
         self.folder, self.options, self.seed = folder, options, 0
         self.playing: HostedGame | None = None
-        with ui.expansion(said("Then and now")).classes("w-full"):
-            ui.label(said("An early, a middle, the best and the current policy, from the same start")).classes(
+        with ui.expansion(say("Then and now")).classes("w-full"):
+            ui.label(say("An early, a middle, the best and the current policy, from the same start")).classes(
                 "text quiet"
             )
             with ui.row().classes("gap-2"):
-                action(said("Play"), "play_arrow", self.play)
-                action(said("another start"), "casino", lambda: self.play(self.seed + 1))
+                action(say("Play"), "play_arrow", self.play)
+                action(say("another start"), "casino", lambda: self.play(self.seed + 1))
                 for name, suffix in FORMATS.items():
                     action(
-                        said("save as {}", name),
+                        say("save as {}", name),
                         "download",
                         lambda event, suffix=suffix: self.save(event.sender, suffix),
                     )
@@ -156,9 +157,9 @@ class ThenAndNow:
         playing = self.playing
         if playing is not None:
             is_loading = playing.opened is None and not playing.ended
-            loading = said("agents are loaded and compiled ...")
+            loading = say("agents are loaded and compiled ...")
             self.status.text = (
-                loading if is_loading else said("start {}", self.seed) if not playing.said else playing.said
+                loading if is_loading else say("start {}", self.seed) if not playing.said else playing.said
             )
 
     async def save(self, button: ui.button, suffix: str) -> None:

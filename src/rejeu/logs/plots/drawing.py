@@ -73,6 +73,8 @@ def draw(panel: Axes, chart: Chart, along: str = "x", unit: float = 1.0) -> None
         if series["kind"] == "dots":
             size, opacity = dot_size(len(x)), float(np.clip(600 / len(x), 0.3, 0.6))
             panel.plot(x, y, "o", markersize=size, color=color, alpha=opacity, markeredgewidth=0, label=label)
+        elif series["kind"] == "thin":
+            panel.plot(x, y, color=color, linewidth=0.7, alpha=0.35)
         elif series["kind"] == "marks":
             panel.plot(x, y, "^", markersize=4.5, color=color, label=label, zorder=3)
         elif series["kind"] == "band":

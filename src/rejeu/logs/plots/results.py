@@ -138,7 +138,9 @@ def comparison(comparison: Any, path: str | Path | None = None) -> Picture:
     """
     envs = list(dict.fromkeys(group.env_id for group in comparison.groups))[:MAX_PANELS]
     drawn = [charts.group_chart("curve", comparison, env) for env in envs]
-    names = [[series["name"] for series in chart["series"] if series["name"]] for chart in drawn]
+    names = [
+        [series["name"] for series in chart["series"] if series["name"] and series["kind"] == "line"] for chart in drawn
+    ]
     heights = [3.7 + 0.2 * math.ceil(len(labels) / drawing.legend_columns(labels)) for labels in names]
     figure = drawing.make_figure("drawing a comparison", height=0.6 + sum(heights))
     panels = figure.subplots(len(envs), squeeze=False, height_ratios=heights)[:, 0]

@@ -55,10 +55,21 @@ def test_page_of_a_run(tmp_path):
 
 def test_the_last_evaluation_of_a_running_run_is_not_called_final(tmp_path):
     run = dataclasses.replace(runs.read_run(write(tmp_path / "run")), state="running")
-    assert [one.title for one in sections.tiles(run)][:2] == [
-        "Best evaluation, step 2,000",
-        "Newest evaluation, step 3,000",
+    assert [(tile.title, tile.step) for tile in sections.tiles(run)][:2] == [
+        ("Best evaluation", "2,000"),
+        ("Newest evaluation", "3,000"),
     ]
+
+
+def test_the_return_comes_first_until_an_evaluation_has_a_success(tmp_path):
+    run = runs.read_run(write(tmp_path / "run"))
+    best, final, *_ = sections.tiles(run)
+    assert (best.value, best.note[:7], best.more) == ("50.0 %", "success", "return 160.00 (155.68 to 164.32)")
+    table = run.evaluations
+    never = dataclasses.replace(run, evaluations=Table({**table.columns, "success_rate": np.zeros(3)}))
+    best, final, *_ = sections.tiles(never)
+    assert (best.value, best.note, best.more) == ("160.00", "return, 95 % interval 155.68 to 164.32", "success 0.0 %")
+    assert final.value == "150.00"
 
 
 def test_several_runs_share_a_page(tmp_path, monkeypatch):

@@ -53,8 +53,17 @@ def write_report(
         read = [read_run(path) for path in paths]
         usual = RunFolder(read[0].path).report if len(read) == 1 else Path("report.html")
         out = usual if out is None else Path(out)
-    parts = sections.build(read, out.absolute().parent)
-    return atomic.write(out, page.render("report.html", parts.data, title=sections.title_of(read), runs=parts.runs))
+    return atomic.write(out, render(read, out.absolute().parent))
+
+
+def render(runs: Sequence[RunSummary], folder: Path | None = None) -> str:
+    """Returns the report of runs as one HTML page; ``folder`` is that of its file, from which it refers to large videos.
+
+    Raises:
+        MissingExtra: if plotly or jinja2 is not installed.
+    """
+    parts = sections.build(runs, folder)
+    return page.render("report.html", parts.data, title=sections.title_of(runs), runs=parts.runs)
 
 
 def record(agent: Agent, path: Path, evaluations: Sequence[tuple[int, Evaluation]]) -> RunSummary:

@@ -44,7 +44,7 @@ def render(template: str, data: object, **context: object) -> str:
 
     nonce = secrets.token_urlsafe(18)
     policy = (
-        f"default-src 'none'; script-src 'nonce-{nonce}'; style-src 'unsafe-inline'; img-src data:; media-src data:; "
+        f"default-src 'none'; script-src 'nonce-{nonce}'; style-src 'unsafe-inline'; img-src data: blob:; media-src data:; "
         "connect-src 'none'; base-uri 'none'; form-action 'none'"
     )
     files = ("charts.css", "page.css", "charts.js", "page.js")

@@ -20,7 +20,7 @@ from rejeu.lab.runs.config import RunConfig
 from rejeu.lab.runs.read import MAX_WORD, RunSummary, best_row
 from rejeu.logs import charts as chart_data
 from rejeu.logs.charts import Chart
-from rejeu.logs.formatting import counted, quoted
+from rejeu.logs.formatting import counted, duration, quoted
 from rejeu.logs.tables import flat
 
 LAST = 100
@@ -42,6 +42,8 @@ class Tile(NamedTuple):
     value: str
     note: str = ""
     more: str = ""
+    step: str = ""
+    """Of the training, if it is of one; the title says it too."""
 
 
 class ChartGroup(NamedTuple):
@@ -213,21 +215,6 @@ def between(low: float, high: float, as_text: Callable[[float], str] = number) -
     return f"{as_text(low)} to {as_text(high)}" if math.isfinite(low) and math.isfinite(high) else ""
 
 
-def duration(seconds: float) -> str:
-    """Returns a time in words, a dash if it is unknown.
-
-    >>> duration(75), duration(4000), duration(7.25)
-    ('1 min 15 s', '1 h 6 min', '7.2 s')
-    """
-    if not math.isfinite(seconds) or seconds < 0:
-        return "\N{EN DASH}"
-    if seconds < 60:
-        return f"{seconds:.1f} s"
-    minutes, seconds = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours:,} h {minutes} min" if hours else f"{minutes} min {seconds} s"
-
-
 def tiles(run: RunSummary) -> list[Tile]:
     """Returns the figures of the headline."""
     mean, headline = run.evaluations.column("mean_return"), []
@@ -248,19 +235,19 @@ def tiles(run: RunSummary) -> list[Tile]:
 
 
 def evaluation_tiles(run: RunSummary, title: str, row: int) -> list[Tile]:
-    """Returns the figures of one evaluation: the success rate, if it is known, with the return below, else the return."""
+    """Returns the figures of one evaluation: the success rate with the return below; until there is a success the return."""
     table = run.evaluations
     mean, rate = table.column("mean_return")[row], table.column("success_rate")[row]
-    at = f"step {number(table.column('step')[row], 0)}"
+    step = number(table.column("step")[row], 0)
     low, high = (end[row] for end in chart_data.interval(table, "return"))
     interval = between(low, high)
-    if math.isfinite(rate):
+    if (table.column("success_rate") > 0).any() and math.isfinite(rate):
         low, high = (end[row] for end in chart_data.interval(table, "success"))
         note = f"success, 95 % interval {between(low, high, percent)}" if math.isfinite(low) else "success"
         more = f"return {number(mean)}" + (f" ({interval})" if interval else "")
-        return [Tile(f"{title}, {at}", percent(rate), note, more)]
+        return [Tile(title, percent(rate), note, more, step)]
     note = f"return, 95 % interval {interval}" if interval else "return"
-    return [Tile(f"{title}, {at}", number(mean), note)]
+    return [Tile(title, number(mean), note, f"success {percent(rate)}" if math.isfinite(rate) else "", step)]
 
 
 def training_tiles(run: RunSummary) -> list[Tile]:

@@ -11,6 +11,7 @@ const RejeuCharts = (() => {
   // Plotly shows a few HTML tags in its labels; here all text is plain.
   const plain = (text) => String(text).replace(/&/g, "&amp;").replace(/</g, "&lt;");
   const switchedOff = new WeakMap(); // the numbers of the series that the reader switched off, by plot
+  const drawn = new WeakMap(); // the chart that was drawn last, by plot
 
   function layout(chart, more = {}) {
     const phone = matchMedia("(pointer: coarse)").matches;
@@ -38,7 +39,7 @@ const RejeuCharts = (() => {
       const x = series[axis];
       const value = chart.percent ? "%{y:.1%}" : "%{y:,.5~g}";
       const common = {
-        x, name: plain(series.name), visible: !hidden.has(number), type: "scatter",
+        x, name: plain(series.name), visible: !hidden.has(number), type: "scatter", showlegend: Boolean(series.name) && series.kind !== "thin",
         hovertemplate: `${value}${series.name ? ` ${plain(series.name)}` : ""}<br>${chart.x ? `${plain(chart.x)} %{x:,.4~g}` : axis === "x" ? "step %{x:,d}" : "%{x:,.4~g} min"}<extra></extra>`,
       };
       const own = color(series.color);
@@ -48,6 +49,8 @@ const RejeuCharts = (() => {
         found.push({ ...common, y: series.y, mode: "markers", marker: { color: own, size, opacity } });
       } else if (series.kind === "line") {
         found.push({ ...common, y: series.y, mode: "lines", line: { color: own, width: 2 } });
+      } else if (series.kind === "thin") {
+        found.push({ ...common, y: series.y, mode: "lines", line: { color: faded(series.color, 0.4), width: 1 } });
       } else if (series.kind === "points") {
         const reach = (end, sign) => series.y.map((y, i) => (end?.[i] == null ? 0 : sign * (end[i] - y)));
         const bars = { type: "data", symmetric: false, array: reach(series.high, 1), arrayminus: reach(series.low, -1) };
@@ -64,7 +67,7 @@ const RejeuCharts = (() => {
       } else if (series.kind === "band") {
         const keep = x.map((_, i) => i).filter((i) => series.low[i] != null && series.high[i] != null);
         const edge = { ...common, x: keep.map((i) => x[i]), mode: "lines", line: { width: 0 }, hoverinfo: "skip", hovertemplate: undefined };
-        found.push({ ...edge, y: keep.map((i) => series.low[i]) });
+        found.push({ ...edge, y: keep.map((i) => series.low[i]), showlegend: false });
         found.push({ ...edge, y: keep.map((i) => series.high[i]), fill: "tonexty", fillcolor: faded(series.color, 0.2) });
       } else if (series.kind === "area") {
         found.push({ ...common, y: series.y, mode: "lines", line: { width: 0.5, color: own }, fillcolor: own, stackgroup: "all" });
@@ -98,11 +101,16 @@ const RejeuCharts = (() => {
     if (box) legend(element, chart, axis, box, hidden, choose);
   }
 
+  // The legend is made again only when it changes: with each new element the browser styles the whole page again.
   function legend(element, chart, axis, box, hidden, choose) {
+    const state = JSON.stringify([chart.series.map(({ name, kind, color }) => [name, kind, color]), [...hidden], color("ink")]);
+    const isNew = !drawn.has(element) || drawn.get(element).state !== state;
+    drawn.set(element, { chart, axis, state });
+    if (!isNew) return;
     const focused = [...box.children].indexOf(document.activeElement);
     box.replaceChildren();
     chart.series.forEach((series, number) => {
-      if (!series.name) return;
+      if (!series.name || series.kind === "thin") return;
       const button = document.createElement("button");
       const sign = document.createElement("i");
       button.type = "button";
@@ -113,12 +121,48 @@ const RejeuCharts = (() => {
       button.append(sign, series.name);
       button.addEventListener("click", () => {
         if (!hidden.delete(number)) hidden.add(number);
-        draw(element, chart, axis, box, choose);
+        draw(element, drawn.get(element).chart, drawn.get(element).axis, box, choose);
       });
       box.append(button);
     });
+    box.append(saving(element, () => csvOf(drawn.get(element).chart)));
     box.children[focused]?.focus(); // of the keyboard, which was on the button before
   }
+
+  // Buttons that save a chart: two kinds of picture, which Plotly makes, and its numbers.
+  function saving(element, rows) {
+    const title = element.getAttribute("aria-label") || "chart";
+    const filename = title.replace(/[^\p{L}\p{N} ._-]+/gu, "-").slice(0, 80);
+    const layout = () => ({ ...element.layout, paper_bgcolor: color("card"), title: { text: plain(title), font: { size: 14 } }, margin: { l: 8, r: 14, t: 40, b: 8 } });
+    const picture = (format) => Plotly.downloadImage({ data: element.data, layout: { ...layout(), showlegend: true } }, { format, filename, width: 900, height: 500, scale: 2 });
+    const numbers = () => {
+      const link = document.createElement("a");
+      link.href = URL.createObjectURL(new Blob([rows().map((row) => row.map(cell).join(",")).join("\n") + "\n"], { type: "text/csv" }));
+      link.download = `${filename}.csv`;
+      link.click();
+      setTimeout(() => URL.revokeObjectURL(link.href), 1000);
+    };
+    const box = document.createElement("span");
+    box.className = "save";
+    for (const [name, save] of [["PNG", () => picture("png")], ["SVG", () => picture("svg")], ["CSV", numbers]]) {
+      const button = document.createElement("button");
+      button.type = "button";
+      button.append(name);
+      button.setAttribute("aria-label", `${name}: ${title}`);
+      button.addEventListener("click", save);
+      box.append(button);
+    }
+    return box;
+  }
+
+  // A cell of a table with commas; a text that a spreadsheet would take for a formula gets an apostrophe.
+  const cell = (value) => (value == null ? "" : typeof value === "number" ? value : `"${String(value).replace(/^[=+@-]/, "'$&").replace(/"/g, '""')}"`);
+  const csvOf = (chart) => [
+    ["series", chart.x ?? "step", ...(chart.x ? [] : ["minutes"]), "value", "low", "high"],
+    ...chart.series.flatMap((series) => series.x.map((x, i) => [
+      series.name, x, ...(chart.x ? [] : [series.t[i]]), series.y?.[i], series.low?.[i], series.high?.[i],
+    ])),
+  ];
 
   const digits = (value) => (Number.isInteger(value) ? {} : { maximumSignificantDigits: 6 });
   const short = (value) => (value == null ? "–" : value.toLocaleString("en-US", digits(value)).replace("-", "−"));
@@ -126,7 +170,7 @@ const RejeuCharts = (() => {
 
 
   // Draws a histogram; the bar that is chosen has another color, and a click calls choose with the number of its bar.
-  function histogram(element, h, chosen, choose) {
+  function histogram(element, h, chosen, choose, box) {
     const middles = h.counts.map((_, i) => (h.edges[i] + h.edges[i + 1]) / 2);
     const colors = h.counts.map((_, i) => (i === chosen ? color("accent") : color("dots")));
     const text = h.counts.map((n, i) => `${n.toLocaleString("en-US")} episodes<br>${rangeOf(h, i)}`);
@@ -138,6 +182,9 @@ const RejeuCharts = (() => {
     Object.assign(axes.yaxis, { rangemode: "tozero", exponentformat: "none" });
     const isNew = !element.classList.contains("js-plotly-plot");
     Plotly.react(element, [bars], axes, bare);
+    drawn.set(element, h);
+    const rows = ({ counts, edges }) => [["from", "to", "episodes"], ...counts.map((n, i) => [edges[i], edges[i + 1], n])];
+    if (!box?.children.length) box?.append(saving(element, () => rows(drawn.get(element))));
     if (isNew) element.on("plotly_click", (event) => choose(event.points[0].pointNumber));
   }
 
