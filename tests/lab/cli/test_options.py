@@ -160,7 +160,7 @@ def test_class(spy, tmp_path):
     assert main([*argv, "--success-threshold", "3", "--out", str(tmp_path / "board.md")]) == 0
     assert includes(listed, folder=Path("pupils"))
     assert includes(vectors, n_envs=7, seed=5)
-    assert includes(evaluated, path=Path("a"), env_id=TYPED, episodes=7, seconds=120.0, seed=5, success_threshold=3.0)
+    assert includes(evaluated, name="a", env_id=TYPED, episodes=7, seconds=120.0, seed=5, success_threshold=3.0)
     assert includes(board, env_id=TYPED, episodes=7, language="fr")
     assert (tmp_path / "board.md").is_file()
 
