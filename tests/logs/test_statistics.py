@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy import special
 
 from rejeu.logs import statistics
 
@@ -69,3 +70,9 @@ def test_equal_to_rliable_on_the_same_draws():
     found = [statistics.iqm([scores]), *statistics.interval(statistics.iqm(statistics.resampled([scores], [draws])))]
     recorded = next(row["rliable"] for row in RECORDED["rows"] if row["statistic"] == "iqm, 5 runs, 1 environment")
     np.testing.assert_allclose(found, np.ravel(recorded), rtol=0, atol=1e-6)
+
+
+def test_students_quantile_equals_scipys():
+    degrees = np.array([1, 2, 3, 4, 7, 19, 99, 1e3, 1e5, np.nan])
+    np.testing.assert_allclose(statistics.student_quantile(degrees), special.stdtrit(degrees, 0.975), rtol=1e-8)
+    assert statistics.student_quantile(np.zeros(0)).shape == (0,)

@@ -13,7 +13,7 @@ __all__ = [*CATALOG]
 def agent_of(entry: Entry) -> type[Agent]:
     """Returns the class of agents of an algorithm."""
     base = OnPolicyAgent if entry.kind == "rollout" else OffPolicyAgent
-    return type(entry.name, (base,), {"__doc__": entry.summary, "__module__": __name__, "algorithm": entry.load()})
+    return type(entry.name, (base,), {"__doc__": entry.summary, "__module__": __name__, "algorithm": entry})
 
 
 BUILT_IN = {name: agent_of(entry) for name, entry in CATALOG.items()}

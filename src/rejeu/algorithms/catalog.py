@@ -42,9 +42,11 @@ class Entry(NamedTuple):
     zoo: str = ""
     """In folders of RL Zoo, if that is not the name in lowercase."""
 
-    def load(self) -> ModuleType:
-        """Imports the file of the algorithm."""
+    def load(self, agent: object = None, agent_class: type | None = None) -> ModuleType:
+        """Imports the file of the algorithm. An entry that is an attribute of a class is read as this file."""
         return importlib.import_module(f"rejeu.algorithms.{self.module}")
+
+    __get__ = load  # type: ignore[misc]
 
 
 CATALOG = {

@@ -178,9 +178,5 @@ class Display:
 
 
 def quoted(word: object) -> str:
-    """Returns a word of a command line as it is typed: in quotes where the shell needs them.
-
-    >>> quoted("runs/first")
-    'runs/first'
-    """
+    """Returns a word of a command line as it is typed: in quotes where the shell needs them."""
     return subprocess.list2cmdline([str(word)]) if os.name == "nt" else shlex.quote(str(word))

@@ -33,7 +33,7 @@ HOLD_SECONDS = 0.5
 EVEN = "pad=ceil(iw/2)*2:ceil(ih/2)*2"
 """Filter that gives the frames even heights and widths, which most formats need."""
 FORMATS = {
-    ".mp4": ("-vf", EVEN, "-c:v", "libx264", "-pix_fmt", "yuv420p", "-movflags", "+faststart"),
+    ".mp4": ("-vf", EVEN, "-c:v", "libx264", "-preset", "veryfast", "-pix_fmt", "yuv420p", "-movflags", "+faststart"),
     ".webm": ("-vf", EVEN, "-c:v", "libvpx-vp9", "-pix_fmt", "yuv420p", "-crf", "32", "-b:v", "0"),
     ".gif": (
         "-vf",

@@ -24,10 +24,11 @@ import rejeu
 from rejeu.core import errors, hardware, interrupt
 from rejeu.core.records import utf8
 from rejeu.core.types import JsonObject
-from rejeu.lab.cli.commands import COMMANDS, MODULES, TASKS
+from rejeu.lab.cli.commands import COMMANDS, MODULES, TASKS, TRAINING
 from rejeu.lab.runs import parsing
 from rejeu.lab.runs.arguments import check_options, of_task
 from rejeu.lab.runs.config import read_task
+from rejeu.logs.formatting import quoted
 
 DESCRIPTION = """Trains agents on Gymnasium environments.
 
@@ -73,8 +74,10 @@ def run_command(argv: Sequence[str]) -> int:
         check_options(arguments)
         for name in getattr(arguments, "imports", ()):
             importlib.import_module("rejeu.lab.runs.environment").import_source(name)
-        module = importlib.import_module(f"rejeu.lab.cli.{MODULES.get(command, command)}")
         with messages(getattr(arguments, "json", False)) as emit:
+            if command in TRAINING:
+                print(f"command       rejeu {' '.join(map(quoted, argv))}", flush=True)
+            module = importlib.import_module(f"rejeu.lab.cli.{MODULES.get(command, command)}")
             status, result = getattr(module, f"run_{command}")(arguments)
             emit(result)
         return status

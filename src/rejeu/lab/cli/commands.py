@@ -482,6 +482,8 @@ TASKS: dict[str, tuple[Callable[..., Any], ...]] = {
 """The arguments of each command, by what people want to do, in the order of the help."""
 COMMANDS = {command.__name__.lower(): command for commands in TASKS.values() for command in commands}
 """The arguments of each command, by its name."""
+TRAINING = ("train", "resume", "branch", "clone")
+"""Commands that are printed before JAX is imported, so that the wait begins with a line."""
 MODULES = {
     "branch": "resume",
     "class": "courses",

@@ -6,7 +6,6 @@ from contextlib import ExitStack
 
 from rejeu.core.interrupt import Interrupt
 from rejeu.core.types import JsonObject
-from rejeu.lab.cli import sweep
 from rejeu.lab.reporting.report import write_report
 from rejeu.lab.runs.arguments import Train
 from rejeu.lab.runs.begin import begin, with_dataset
@@ -18,6 +17,8 @@ def run_train(arguments: Train) -> tuple[int, JsonObject]:
     if arguments.offline is not None:
         arguments = with_dataset(arguments)
     if arguments.seeds is not None:
+        from rejeu.lab.cli import sweep
+
         return sweep.train_together(arguments) if sweep.fit_together(arguments) else sweep.train_all(arguments)
     stopwatch = Stopwatch()
     with ExitStack() as stack:

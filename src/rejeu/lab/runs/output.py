@@ -47,17 +47,14 @@ class Stopwatch:
 
 def header(config: DecidedRun, environment: Environment, backend: str, folder: RunFolder) -> str:
     """Returns the first lines of a run; ``backend`` describes the backend."""
-    preset = "preset" if config.preset else "no preset"
     length = f"{config.minutes:g} minutes" if config.steps is None else f"{config.steps:,} steps"
     every = f"evaluated on {counted(config.evaluate_episodes, 'episode')} every {config.evaluate_every:,} steps"
-    return "\n".join(
-        [
-            f"environment   {environment}, {config.n_envs} at once",
-            f"backend       {backend}",
-            f"algorithm     {config.algorithm}, {preset}, seed {config.seed}",
-            f"training      {length}, {every}",
-            f"run folder    {folder.path}",
-        ]
+    return (
+        f"environment   {environment}, {config.n_envs} at once\n"
+        f"backend       {backend}\n"
+        f"algorithm     {config.algorithm}, {'preset' if config.preset else 'no preset'}, seed {config.seed}\n"
+        f"training      {length}, {every}\n"
+        f"run folder    {folder.path}"
     )
 
 
