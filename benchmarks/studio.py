@@ -204,9 +204,10 @@ def busy(n_runs: int, n_tabs: int, priority: int) -> None:
             time.sleep(0.5)
         with opened(address, "/", priority) as page:
             base, seconds = page.url, {}  # type: str, dict[str, list[float]]
-            tabs = [page.context.new_page() for _ in range(n_tabs)]
-            for i, tab in enumerate(tabs):
-                tab.goto(f"{base}run?run=run_{i % n_runs}", wait_until="commit")
+            assert page.context.browser is not None
+            others = page.context.browser.new_context()
+            for i in range(n_tabs):
+                others.new_page().goto(address.replace("/?", f"/run?run=run_{i % n_runs}&", 1), wait_until="commit")
             for path, selector in (
                 ("", "text=run_0"),
                 ("run?run=run_0", "text=Environment steps"),
