@@ -74,9 +74,10 @@ def test_best_first_goes_by_the_mean_that_is_shown_within_each_environment():
     steady = group("steady", [row("steady/0", best=400.0), row("steady/1", best=420.0)])
     lander = Block(row("lander", "LunarLander-v3", best=600.0))
     new, mixed = Block(row("new")), group("mixed", [*lucky.members, lander.total])
-    blocks = [new, mixed, lander, lucky, steady]
-    assert names(ordered(blocks, "best", descending=True)) == ["steady", "lucky", "lander", "new", "mixed"]
-    assert names(ordered(blocks, "best", descending=False)) == ["lucky", "steady", "lander", "new", "mixed"]
+    damaged = Block(row("damaged", "", best=900.0))
+    blocks = [new, mixed, damaged, lander, lucky, steady]
+    assert names(ordered(blocks, "best", descending=True)) == ["steady", "lucky", "lander", "damaged", "new", "mixed"]
+    assert names(ordered(blocks, "best", descending=False)) == ["lucky", "steady", "lander", "damaged", "new", "mixed"]
 
 
 def test_the_share_of_a_group_is_that_of_the_steps_of_all_its_runs():

@@ -320,7 +320,7 @@ def ordered(blocks: Iterable[Block], sort: str, descending: bool) -> list[Block]
     finite = sorted((pair for pair in values if pair[0] == pair[0]), key=lambda pair: pair[0], reverse=descending)
     ranked = [block for _, block in finite]
     if sort == "best":
-        ranked.sort(key=lambda block: block.total.env)
+        ranked.sort(key=lambda block: (not block.total.env, block.total.env))
     return [*ranked, *(block for value, block in values if value != value)]
 
 
