@@ -203,7 +203,7 @@ def busy(n_runs: int, n_tabs: int, priority: int) -> None:
         while not all(last_row(Path(folder) / f"run_{i}")[1] > LOADING for i in range(n_runs)):
             time.sleep(0.5)
         with opened(address, "/", priority) as page:
-            base, seconds = page.url, {}  # type: str, dict[str, list[float]]
+            base = page.url
             assert page.context.browser is not None
             others = page.context.browser.new_context()
             for i in range(n_tabs):
@@ -214,16 +214,17 @@ def busy(n_runs: int, n_tabs: int, priority: int) -> None:
                 ("new", "text=Start"),
                 ("compare", ".plot.js-plotly-plot"),
             ):
-                for _ in range(5):
+                seconds = []
+                for _ in range(3):
                     began = time.monotonic()
                     page.goto(base + path)
                     page.wait_for_selector(selector)
-                    seconds.setdefault(path or "runs", []).append(time.monotonic() - began)
+                    seconds.append(time.monotonic() - began)
+                spread = f"{min(seconds):.2f} to {max(seconds):.2f} s"
+                print(f"{path or 'runs'}: median {statistics.median(seconds):.2f} s, {spread}", flush=True)
         for run in runs:
             run.terminate()
             run.wait()
-    for path, values in seconds.items():
-        print(f"{path}: median {statistics.median(values):.2f} s, {min(values):.2f} to {max(values):.2f} s", flush=True)
 
 
 def keys(env: str, n_agents: int, priority: int) -> None:

@@ -118,8 +118,6 @@ def build(studio: Studio, request: Request) -> None:
     table = ui.table(rows=[], columns=columns(), row_key="key", pagination=pagination(choice, 0), selection="multiple")
     table.classes("w-full").props("flat bordered dense wrap-cells binary-state-sort column-sort-order=da")
     table.props.update({"rows-per-page-options": sorted(PER_PAGE)})
-    for button in (compare, delete):
-        button.bind_enabled_from(table, "selected", bool)
     for name, template in SLOTS.items():
         table.add_slot(f"body-cell-{name}", template)
     for part, label in (("header", f"'{say('choose all')}'"), ("body", "props.row.name")):
@@ -164,8 +162,15 @@ def build(studio: Studio, request: Request) -> None:
         except (OSError, ValueError) as error:
             ui.notify(brief(error), type="negative")
         table.selected = []
+        enable()
         show()
 
+    def enable() -> None:
+        for button in (compare, delete):
+            button.set_enabled(bool(table.selected))
+
+    enable()
+    table.on_select(enable)
     delete.on_click(lambda: move(moving.delete, picked()))
     undo.on_click(lambda: move(moving.restore))
     compare.on_click(lambda: ui.navigate.to(address("/compare", run=picked())))
