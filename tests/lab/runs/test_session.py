@@ -85,18 +85,20 @@ def test_status_is_the_mean_of_the_last_hundred_episodes_and_the_time_that_is_le
     (run / "agent.safetensors").unlink()
     config = json.loads((run / "config.json").read_text())
     seconds = run_list.read(run).seconds
-    assert rows.describe(found)["mean_return"] == pytest.approx(returns[-100:].mean())
+    assert rows.describe(found).mean_return == pytest.approx(returns[-100:].mean())
     for asked, left in (({"steps": 40 * n}, 3 * (seconds - 2)), ({"steps": None, "minutes": 2}, 120 - seconds + 2)):
         (run / "config.json").write_text(json.dumps({**config, **asked}))
         (run / "checkpoints").mkdir(exist_ok=True)
         facts = rows.describe(replace(run_list.read(run), state="running"))
-        assert facts["steps_per_second"] == pytest.approx(10 * n / (seconds - 2))
-        assert facts["seconds_left"] == pytest.approx(left)
-        assert rows.rate_text(facts) == f"{10 * n / (seconds - 2):,.0f}/s, {left:,.0f} s left"
+        assert facts.steps_per_second == pytest.approx(10 * n / (seconds - 2))
+        assert facts.seconds_left == pytest.approx(left)
+        minutes, rest = divmod(round(left), 60)
+        words = f"{minutes} min {rest} s" if minutes else f"{rest} s"
+        assert rows.rate_text(facts) == f"{10 * n / (seconds - 2):,.0f}/s, {words} left"
     facts = rows.describe(replace(run_list.read(run), state="interrupted"))
-    assert (facts["episodes"], facts["seconds_left"], facts["seconds"]) == (n, None, seconds)
-    best = facts["best"]
-    assert (best["step"], best["mean_return"], best["success_rate"]) == (
+    assert (facts.episodes, facts.seconds_left, facts.seconds) == (n, None, seconds)
+    best = facts.best
+    assert (best.step, best.mean_return, best.success_rate) == (
         10 * n,
         101.0,
         pytest.approx(math.nan, nan_ok=True),

@@ -24,7 +24,7 @@ def test_an_agent_is_stepped_and_a_place_of_the_map_shows_its_episode(browser, c
         page.get_by_role("button", name="one step").click()
         page.locator("figcaption", has_text="step 1").wait_for()
         page.get_by_text("Then and now").click()
-        page.get_by_role("button", name="Play", exact=True).last.click()
+        page.locator(".q-expansion-item", has_text="Then and now").get_by_role("button", name="Play").click()
         page.locator(".one-row canvas").first.wait_for()
         assert "after 512 steps" in page.locator(".one-row").inner_text()
         check_widths(page)

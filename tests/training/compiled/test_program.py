@@ -16,7 +16,7 @@ N_ENVS, LENGTH, GAMMA = 3, 3, 0.5
 
 def test_steps_and_episodes_are_counted_and_logged() -> None:
     env = Reach(max_episode_steps=LENGTH)
-    program: Any = SimpleNamespace(n_envs=N_ENVS, config=SimpleNamespace(gamma=GAMMA))
+    program: Any = SimpleNamespace(n_envs=N_ENVS, config=SimpleNamespace(gamma=GAMMA, action_share=1.0))
     vstate, zeros = reset_all(env, jax.random.key(0), N_ENVS), jnp.zeros(N_ENVS)
     state = EpisodeState(vstate, vstate.obs, zeros == 0, zeros, jnp.zeros(N_ENVS, int), zeros, jnp.uint32(0))
     step = jax.jit(lambda loop, turn: step_envs(program, env, loop, jnp.ones((N_ENVS, 1)), turn))

@@ -306,7 +306,9 @@ def best_text(row: Row) -> str:
 def rate_text(row: Row) -> str:
     """Returns the steps a second, and the time that is left."""
     rate, seconds = row.steps_per_second, row.seconds_left
-    remaining = f", {duration(seconds)} left" if seconds is not None and math.isfinite(seconds) else ""
+    remaining = ""
+    if seconds is not None and math.isfinite(seconds):
+        remaining = f", {duration(seconds) if seconds >= 60 else f'{seconds:.0f} s'} left"
     return f"{rate:,.0f}/s{remaining}" if math.isfinite(rate) else "-"
 
 
