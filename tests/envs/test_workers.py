@@ -11,6 +11,7 @@ import sys
 import textwrap
 import threading
 import time
+from multiprocessing import forkserver
 
 import gymnasium as gym
 import numpy as np
@@ -284,14 +285,17 @@ def test_spaces_that_differ_are_noticed(tmp_path):
     assert not children()
 
 
+@pytest.mark.skipif(os.name == "nt", reason="os.kill ends a process on Windows, whatever the signal")
 @pytest.mark.parametrize("number", [*interrupt.NAMES], ids=[*interrupt.NAMES.values()])
 def test_a_request_to_stop_leaves_the_workers_at_work(number):
     """Terminals, timeout and SLURM send it to every process; the main one may want to finish the step that it is in."""
     vector = make("nothing")
     vector.reset()
-    for worker in vector.workers.workers:
-        os.kill(worker.process.pid, number)
+    servers = [forkserver._forkserver._forkserver_pid] if pool.START_METHOD == "forkserver" else []
+    for pid in (*servers, *(worker.process.pid for worker in vector.workers.workers)):
+        os.kill(pid, number)
     np.testing.assert_array_equal(vector.step(np.zeros((2, 1), np.float32)).obs[:, 1], 1)
+    assert all(worker.alive for worker in vector.workers.workers)  # which only a fork server that lives can say
     vector.close()
 
 
