@@ -8,7 +8,6 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import inspect
-import os
 import tempfile
 import warnings
 import zipfile
@@ -32,7 +31,6 @@ from rejeu.algorithms import config as configs
 from rejeu.algorithms.actor_critic.network import ActorCritic
 from rejeu.algorithms.actor_critic.steps import samples
 from rejeu.algorithms.catalog import CATALOG
-from rejeu.algorithms.config import REPLAY_BUFFERS
 from rejeu.callbacks.base import Callback, TrainingCallback
 from rejeu.checkpoints import model_files
 from rejeu.checkpoints.agent_state import AGENT_ARGUMENTS
@@ -49,9 +47,8 @@ from rejeu.sb3 import arguments, policy as policies
 from rejeu.sb3.common import base_callback, buffers, logger as loggers, utils
 from rejeu.sb3.common.env_util import is_wrapped, make_vec_env
 from rejeu.sb3.common.monitor import Monitor
-from rejeu.sb3.common.noise import VectorizedActionNoise
 from rejeu.sb3.common.preprocessing import is_image_space, is_image_space_channels_first, maybe_transpose
-from rejeu.sb3.common.torch_layers import encoder_of, register_again
+from rejeu.sb3.common.torch_layers import register_again
 from rejeu.sb3.common.vec_env.vec_normalize import VecNormalize
 from rejeu.sb3.common.vec_env.vec_transpose import VecTransposeImage
 from rejeu.sb3.policy import BasePolicy

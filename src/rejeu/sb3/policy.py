@@ -27,24 +27,6 @@ from rejeu.core.types import Action, AnyArray, Observation, PyTree
 from rejeu.sb3.common.preprocessing import maybe_transpose
 from rejeu.sb3.common.utils import Tensor, is_vectorized_observation
 
-__all__ = [
-    "Actor",
-    "ActorCriticCnnPolicy",
-    "ActorCriticPolicy",
-    "BaseModel",
-    "BasePolicy",
-    "CnnPolicy",
-    "ContinuousCritic",
-    "DQNPolicy",
-    "Distribution",
-    "MlpPolicy",
-    "MultiInputActorCriticPolicy",
-    "MultiInputPolicy",
-    "QNetwork",
-    "SACPolicy",
-    "TD3Policy",
-]
-
 NETWORKS = {
     "actor": ("actor",),
     "critic": ("critics", "critic"),

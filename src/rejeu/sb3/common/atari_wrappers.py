@@ -11,17 +11,6 @@ from gymnasium import spaces
 from rejeu.core.errors import requires
 from rejeu.core.types import Action, Info, Observation
 
-__all__ = [
-    "AtariWrapper",
-    "ClipRewardEnv",
-    "EpisodicLifeEnv",
-    "FireResetEnv",
-    "MaxAndSkipEnv",
-    "NoopResetEnv",
-    "StickyActionEnv",
-    "WarpFrame",
-]
-
 
 class StickyActionEnv(gym.Wrapper):
     """Repeats the previous action with a probability; the first action of an episode is never replaced."""

@@ -10,8 +10,6 @@ from rejeu.agents import (
 from rejeu.envs.registry import make_env
 from rejeu.sb3.modules import define, passes_on
 
-__all__ = ["BaseAlgorithm", "OffPolicyAlgorithm", "OnPolicyAlgorithm", "maybe_make_env"]
-
 
 def maybe_make_env(env: Any, verbose: int = 0) -> Any:
     """Returns an environment as it is, and one of an id."""

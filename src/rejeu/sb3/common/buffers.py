@@ -27,18 +27,6 @@ from rejeu.sb3.common.type_aliases import (
 from rejeu.sb3.common.utils import Tensor
 from rejeu.sb3.common.vec_env.base_vec_env import TIME_LIMIT_TRUNCATED
 
-__all__ = [
-    "KEY_TO_GOAL_STRATEGY",
-    "BaseBuffer",
-    "DictReplayBuffer",
-    "DictRolloutBuffer",
-    "GoalSelectionStrategy",
-    "HerReplayBuffer",
-    "NStepReplayBuffer",
-    "ReplayBuffer",
-    "RolloutBuffer",
-]
-
 KEY_TO_GOAL_STRATEGY = {strategy.value: strategy for strategy in GoalSelectionStrategy}
 """Where the goals of hindsight come from, by name."""
 

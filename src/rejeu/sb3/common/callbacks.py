@@ -19,7 +19,7 @@ from rejeu.agents import Agent
 from rejeu.agents.off_policy import OffPolicyAgent
 from rejeu.callbacks.progress_bar import ProgressBar
 from rejeu.core import atomic
-from rejeu.core.types import Settings, Variables
+from rejeu.core.types import Variables
 from rejeu.core.validation import whole
 from rejeu.envs.masks import make_masked
 from rejeu.sb3.common.base_callback import (
@@ -34,21 +34,6 @@ from rejeu.sb3.common.vec_env.adapters import dummy_vec_env, identities
 from rejeu.sb3.common.vec_env.base_vec_env import VecEnv
 from rejeu.sb3.common.vec_env.vec_normalize import sync_envs_normalization
 from rejeu.sb3.modules import passes_on
-
-__all__ = [
-    "BaseCallback",
-    "CallbackList",
-    "CheckpointCallback",
-    "ConvertCallback",
-    "EvalCallback",
-    "EventCallback",
-    "EveryNTimesteps",
-    "LogEveryNTimesteps",
-    "ProgressBarCallback",
-    "StopTrainingOnMaxEpisodes",
-    "StopTrainingOnNoModelImprovement",
-    "StopTrainingOnRewardThreshold",
-]
 
 
 class CheckpointCallback(BaseCallback):

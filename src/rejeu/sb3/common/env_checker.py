@@ -10,8 +10,6 @@ from gymnasium import spaces
 
 from rejeu.envs import checker, validation
 
-__all__ = ["check_env"]
-
 
 def check_env(env: gym.Env, warn: bool = True, skip_render_check: bool = True) -> None:
     """Checks the spaces of an environment, resets and some random steps, for about a second.

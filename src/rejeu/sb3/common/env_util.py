@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -16,8 +16,6 @@ from rejeu.sb3.common.monitor import Monitor
 from rejeu.sb3.common.vec_env.base_vec_env import VecEnv, is_wrapped, unwrap_wrapper
 from rejeu.sb3.common.vec_env.dummy_vec_env import DummyVecEnv
 from rejeu.sb3.modules import passes_on
-
-__all__ = ["is_wrapped", "make_atari_env", "make_vec_env", "unwrap_wrapper"]
 
 
 def make_vec_env(

@@ -11,16 +11,6 @@ from gymnasium import spaces
 from rejeu.core.types import Action, Info, Observation
 from rejeu.sb3.modules import alias
 
-__all__ = [
-    "BitFlippingEnv",
-    "FakeImageEnv",
-    "IdentityEnv",
-    "IdentityEnvBox",
-    "IdentityEnvMultiBinary",
-    "IdentityEnvMultiDiscrete",
-    "SimpleMultiObsEnv",
-]
-
 
 class IdentityEnv(gym.Env):
     """The action must equal the observation, for a reward of 1; observations are random.

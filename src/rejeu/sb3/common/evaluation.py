@@ -19,8 +19,6 @@ from rejeu.envs.masks import make_masked
 from rejeu.logs.evaluation import MOST_STEPS, cut_off
 from rejeu.sb3.modules import passes_on
 
-__all__ = ["evaluate_policy"]
-
 
 def evaluate_policy(
     model: Any,

@@ -15,44 +15,19 @@ import tempfile
 import time
 import warnings
 from abc import ABC, abstractmethod
-from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from functools import partialmethod
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 
 from rejeu.core import atomic
-from rejeu.core.types import JsonObject, Settings
+from rejeu.core.types import JsonObject
 from rejeu.logs import logging
 from rejeu.logs.formatting import LOGS
 from rejeu.logs.logging import CsvFile, JsonLines, TensorBoard, add_text, open_log
 from rejeu.logs.tables import lines_of
-
-__all__ = [
-    "DEBUG",
-    "DISABLED",
-    "ERROR",
-    "INFO",
-    "WARN",
-    "CSVOutputFormat",
-    "Figure",
-    "FormatUnsupportedError",
-    "HParam",
-    "HumanOutputFormat",
-    "Image",
-    "JSONOutputFormat",
-    "KVWriter",
-    "Logger",
-    "TensorBoardOutputFormat",
-    "Video",
-    "configure",
-    "filter_excluded_keys",
-    "make_output_format",
-    "read_csv",
-    "read_json",
-]
 
 DEBUG, INFO, WARN, ERROR, DISABLED = 10, 20, 30, 40, 50
 

@@ -16,11 +16,9 @@ import numpy as np
 
 from rejeu.core import atomic
 from rejeu.core.failed_writes import FailedWrites
-from rejeu.core.types import Action, Info, JsonObject, Observation, Settings
+from rejeu.core.types import Action, Info, JsonObject, Observation
 from rejeu.envs.snapshot import check_types
 from rejeu.logs.tables import MAX_LINE, lines_of
-
-__all__ = ["LoadMonitorResultsError", "Monitor", "ResultsWriter", "get_monitor_files", "load_results"]
 
 SUFFIX = "monitor.csv"
 STATE = {"needs_reset": bool, "total_steps": int, "rewards": list[float], "episode_returns": list[float]}

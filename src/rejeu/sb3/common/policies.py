@@ -2,6 +2,5 @@
 
 from rejeu.sb3.modules import passes_on
 from rejeu.sb3.policy import *  # noqa: F403
-from rejeu.sb3.policy import __all__ as __all__
 
 passes_on(__name__)

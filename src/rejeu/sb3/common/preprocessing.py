@@ -12,17 +12,6 @@ from gymnasium import spaces
 
 from rejeu.core.types import Observation
 
-__all__ = [
-    "check_for_nested_spaces",
-    "get_action_dim",
-    "get_flattened_obs_dim",
-    "get_obs_shape",
-    "is_image_space",
-    "is_image_space_channels_first",
-    "maybe_transpose",
-    "preprocess_obs",
-]
-
 
 def is_image_space_channels_first(observation_space: spaces.Box) -> bool:
     """Returns whether the first axis of an image is the shortest; warns if the second is."""

@@ -11,20 +11,6 @@ import numpy as np
 from rejeu.core.errors import requires
 from rejeu.sb3.common.monitor import load_results
 
-__all__ = [
-    "EPISODES_WINDOW",
-    "POSSIBLE_X_AXES",
-    "X_EPISODES",
-    "X_TIMESTEPS",
-    "X_WALLTIME",
-    "load_results",
-    "plot_curves",
-    "plot_results",
-    "rolling_window",
-    "ts2xy",
-    "window_func",
-]
-
 X_TIMESTEPS = "timesteps"
 X_EPISODES = "episodes"
 X_WALLTIME = "walltime_hrs"

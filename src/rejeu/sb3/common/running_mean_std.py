@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-__all__ = ["RunningMeanStd"]
-
 
 class RunningMeanStd:
     """Running mean and variance of each component, ``float64``.

@@ -43,15 +43,6 @@ from rejeu.networks import ENCODERS, register_encoder
 from rejeu.networks.layers import own_module
 from rejeu.sb3.common.preprocessing import is_image_space, is_image_space_channels_first, preprocess_obs
 
-__all__ = [
-    "BaseFeaturesExtractor",
-    "CombinedExtractor",
-    "FlattenExtractor",
-    "NatureCNN",
-    "create_mlp",
-    "get_actor_critic_arch",
-]
-
 PREFIX = "sb3:"
 """How the names of encoders that are extractors begin."""
 

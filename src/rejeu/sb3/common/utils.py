@@ -8,7 +8,7 @@ import platform
 import random
 import re
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -23,31 +23,6 @@ from rejeu.core import schedules
 from rejeu.core.schedules import Exponential, Linear, TableSchedule
 from rejeu.core.types import Observation, Settings
 from rejeu.sb3.modules import passes_on
-
-__all__ = [
-    "ConstantSchedule",
-    "Device",
-    "FloatSchedule",
-    "LinearSchedule",
-    "Tensor",
-    "check_for_correct_spaces",
-    "configure_logger",
-    "constant_fn",
-    "explained_variance",
-    "get_device",
-    "get_latest_run_id",
-    "get_linear_fn",
-    "get_parameters_by_name",
-    "get_schedule_fn",
-    "get_system_info",
-    "is_vectorized_observation",
-    "obs_as_tensor",
-    "polyak_update",
-    "safe_mean",
-    "set_random_seed",
-    "should_collect_more_steps",
-    "update_learning_rate",
-]
 
 TABLE_INTERVALS = 1_000
 """Intervals of the table by which a file contains a function given as a schedule."""

@@ -16,25 +16,5 @@ from rejeu.sb3.common.vec_env.vec_transpose import VecTransposeImage
 from rejeu.sb3.common.vec_env.vec_video_recorder import VecVideoRecorder
 from rejeu.sb3.modules import passes_on
 
-__all__ = [
-    "DummyVecEnv",
-    "StackedObservations",
-    "SubprocVecEnv",
-    "VecCheckNan",
-    "VecEnv",
-    "VecEnvWrapper",
-    "VecExtractDictObs",
-    "VecFrameStack",
-    "VecMonitor",
-    "VecNormalize",
-    "VecTransposeImage",
-    "VecVideoRecorder",
-    "adapters",
-    "is_vecenv_wrapped",
-    "sync_envs_normalization",
-    "unwrap_vec_normalize",
-    "unwrap_vec_wrapper",
-]
-
-for path in [path for path in sys.modules if path.startswith(f"{__name__}.")]:
-    passes_on(path)
+for _path in [path for path in sys.modules if path.startswith(f"{__name__}.")]:
+    passes_on(_path)

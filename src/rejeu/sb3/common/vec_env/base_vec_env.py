@@ -21,23 +21,10 @@ import numpy as np
 from gymnasium.vector.utils import concatenate, create_empty_array
 
 from rejeu.core.errors import requires
-from rejeu.core.types import Action, Info, Observation, Settings
+from rejeu.core.types import Action, Info, Observation
 from rejeu.envs.rendering import check_renders, rgb_frame
 from rejeu.envs.workers.process import call_method
 from rejeu.logs.formatting import counted
-
-__all__ = [
-    "VecEnv",
-    "VecEnvIndices",
-    "VecEnvObs",
-    "VecEnvStepReturn",
-    "VecEnvWrapper",
-    "is_vecenv_wrapped",
-    "is_wrapped",
-    "tile_images",
-    "unwrap_vec_wrapper",
-    "unwrap_wrapper",
-]
 
 TERMINAL_OBSERVATION = "terminal_observation"
 """Key of the info that holds the last observation of an episode."""

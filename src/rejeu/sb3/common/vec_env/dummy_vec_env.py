@@ -13,8 +13,6 @@ from rejeu.envs.validation import environment_fault, id_of, reset_env, with_loca
 from rejeu.envs.workers.process import as_declared, step_and_reset
 from rejeu.sb3.common.vec_env.base_vec_env import SingleEnvs, VecEnvIndices, VecEnvStepReturn, stacked
 
-__all__ = ["DummyVecEnv"]
-
 
 class DummyVecEnv(SingleEnvs):
     """Environments stepped one after the other in this process, each reset within the step that ends its episode.

@@ -7,10 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 from gymnasium import spaces
 
-from rejeu.core.types import Info, Observation, Settings
+from rejeu.core.types import Info, Observation
 from rejeu.sb3.common.vec_env.base_vec_env import TERMINAL_OBSERVATION, by_key, is_image
-
-__all__ = ["StackedObservations"]
 
 
 class StackedObservations:

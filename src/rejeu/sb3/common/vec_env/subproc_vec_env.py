@@ -14,8 +14,6 @@ from rejeu.envs.workers.pool import RESTARTED, TIMEOUT, Processes, ProcessWorker
 from rejeu.envs.workers.process import WorkerFailure
 from rejeu.sb3.common.vec_env.base_vec_env import SingleEnvs, VecEnvIndices, VecEnvStepReturn, stacked
 
-__all__ = ["SubprocVecEnv"]
-
 
 class SubprocVecEnv(SingleEnvs):
     """Environments stepped in parallel, one process each, and reset within the step that ends an episode.

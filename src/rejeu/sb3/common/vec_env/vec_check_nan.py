@@ -10,8 +10,6 @@ from rejeu.core.errors import BadEnvironmentError
 from rejeu.core.types import Action, Observation
 from rejeu.sb3.common.vec_env.base_vec_env import VecEnv, VecEnvStepReturn, VecEnvWrapper, by_key
 
-__all__ = ["VecCheckNan"]
-
 
 class NotFiniteError(BadEnvironmentError, ValueError):
     """Actions, observations or rewards contain NaN or infinity."""

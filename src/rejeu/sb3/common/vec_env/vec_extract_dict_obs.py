@@ -7,8 +7,6 @@ from gymnasium import spaces
 
 from rejeu.sb3.common.vec_env.base_vec_env import ObservationWrapper, VecEnv
 
-__all__ = ["VecExtractDictObs"]
-
 
 class VecExtractDictObs(ObservationWrapper):
     """Replaces Dict observations by one of their entries.

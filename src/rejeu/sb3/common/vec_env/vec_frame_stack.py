@@ -8,8 +8,6 @@ from rejeu.core.types import Observation
 from rejeu.sb3.common.vec_env.base_vec_env import VecEnv, VecEnvStepReturn, VecEnvWrapper
 from rejeu.sb3.common.vec_env.stacked_observations import StackedObservations
 
-__all__ = ["VecFrameStack"]
-
 
 class VecFrameStack(VecEnvWrapper):
     """Replaces observations by :class:`StackedObservations`.

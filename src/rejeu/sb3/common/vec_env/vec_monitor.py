@@ -12,8 +12,6 @@ from rejeu.core.types import Info, JsonObject, Observation
 from rejeu.sb3.common.monitor import Monitor, ResultsWriter, keywords_of
 from rejeu.sb3.common.vec_env.base_vec_env import VecEnv, VecEnvStepReturn, VecEnvWrapper
 
-__all__ = ["VecMonitor"]
-
 
 class VecMonitor(VecEnvWrapper):
     """Adds ``info["episode"] = {"r": return, "l": length, "t": seconds since construction}`` to an episode's last step.

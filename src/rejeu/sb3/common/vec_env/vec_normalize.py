@@ -34,8 +34,6 @@ from rejeu.sb3.common.vec_env.base_vec_env import (
 )
 from rejeu.sb3.common.vec_env.vec_transpose import VecTransposeImage
 
-__all__ = ["VecNormalize", "sync_envs_normalization", "unwrap_vec_normalize"]
-
 KIND = "vec_normalize"
 """Kind of its files."""
 PICKLES = (b"\x80\x02c", b"\x80\x03c", b"\x80\x04\x95", b"\x80\x05\x95")

@@ -8,8 +8,6 @@ from gymnasium import spaces
 from rejeu.core.types import Observation
 from rejeu.sb3.common.vec_env.base_vec_env import ObservationWrapper, VecEnv, by_key, is_image
 
-__all__ = ["VecTransposeImage"]
-
 
 class VecTransposeImage(ObservationWrapper):
     """Moves the channels of images to the front: ``(height, width, channels)`` becomes ``(channels, height, width)``.

@@ -10,8 +10,6 @@ from rejeu.envs.rendering import check_renders
 from rejeu.logs.video import VideoFile
 from rejeu.sb3.common.vec_env.base_vec_env import VecEnv, VecEnvStepReturn, VecEnvWrapper, tile_images
 
-__all__ = ["VecVideoRecorder"]
-
 
 class VecVideoRecorder(VecEnvWrapper):
     """Records videos of a vector environment while it is stepped.
