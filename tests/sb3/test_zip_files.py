@@ -238,7 +238,7 @@ CLOUDPICKLED = b"\x80\x02ccloudpickle.cloudpickle\n_make_skeleton_class\n."
     (pickle.dumps(({}, [np.zeros(2)])), "it is a pickle, .*VecNormalize.* models of Stable Baselines 2 .* train again with"),
     (changed(PPO, {"policy_kwargs": serialized(CLOUDPICKLED)}), "policy_kwargs: it holds a class .*your own, .*with equinox"),
     (changed(PPO, {"policy_class": serialized(b"\x80\x02cmine\nPolicy\n.")}), "it names mine.Policy, .*with equinox"),
-])  # fmt: skip
+], ids=["Stable Baselines 2", "VecNormalize", "own class", "own policy"])  # fmt: skip
 def test_what_is_not_read_is_named_with_what_to_do(content, message, tmp_path):
     with pytest.raises(CheckpointError, match=message):
         load_zip(write(tmp_path, content))
