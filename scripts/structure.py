@@ -91,22 +91,10 @@ def parse(src: Path, package: str = PACKAGE) -> dict[str, tuple[Path, ast.Module
     return modules
 
 
-def is_type_checking(node: ast.AST) -> bool:
-    """Returns whether a statement is ``if TYPE_CHECKING``."""
-    return isinstance(node, ast.If) and ast.unparse(node.test) in ("TYPE_CHECKING", "typing.TYPE_CHECKING")
-
-
-def nodes(module: str, tree: ast.Module) -> Iterator[ast.AST]:
-    """Yields every node of a module, but in the package's own ``__init__`` not the types of its lazy public names."""
-    for statement in tree.body:
-        if not (module == PACKAGE and is_type_checking(statement)):
-            yield from ast.walk(statement)
-
-
 def imports(module: str, path: Path, tree: ast.Module, known: set[str]) -> Iterator[tuple[str, ast.stmt]]:
     """Yields each module of the package that a module imports, anywhere in it, and the statement that does so."""
     package = module if path.name == "__init__.py" else module.rpartition(".")[0]
-    for node in nodes(module, tree):
+    for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):

@@ -74,7 +74,7 @@ def test_a_script_type_checks_and_its_mistakes_are_found(tmp_path):
     assert len(errors) == 2, done.stdout
     assert 'Module has no attribute "SACC"' in errors[0]
     assert '"SAC" has no attribute "lern"' in errors[1]
-    assert 'Revealed type is "rejeu.agents.off_policy.SAC"' in done.stdout
+    assert 'Revealed type is "rejeu.agents.named.SAC"' in done.stdout
 
 
 def test_the_stub_of_the_named_agents_is_the_catalog():
