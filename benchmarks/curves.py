@@ -22,7 +22,7 @@ import rejeu
 from rejeu.agents import presets
 from rejeu.algorithms import config as configs
 from rejeu.core import validation
-from rejeu.envs import make_vector
+from rejeu.envs.make import make_vector
 from rejeu.logs.plots import drawing as style
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))

@@ -46,9 +46,8 @@ from rejeu.algorithms import config as configs
 from rejeu.callbacks.evaluate import Evaluate, Evaluated
 from rejeu.core import validation
 from rejeu.core.records import convert
-from rejeu.envs import make_vector
 from rejeu.envs.base import Step
-from rejeu.envs.make import VectorEnv
+from rejeu.envs.make import VectorEnv, make_vector
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from trials.provenance import machine, provenance

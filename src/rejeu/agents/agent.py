@@ -443,8 +443,8 @@ class Agent(AnyAgent):
         env = self.run.env
         return None if env is None else env.vec_normalize
 
-    def check_spaces(self, vector: VectorEnv, source: str) -> None:
-        """Raises ``ValueError`` if environments, called ``source`` in the message, have other spaces than the agent."""
+    def check_spaces(self, vector: Any, source: str) -> None:
+        """Raises ``ValueError`` if environments or a dataset, called ``source``, have other spaces than the agent."""
         for name in ("observation", "action"):
             ours, theirs = getattr(self, f"{name}_space"), getattr(vector, f"{name}_space")
             if not spaces.same(ours, theirs, bounds=name == "action"):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import gymnasium as gym
 import msgspec
@@ -61,18 +61,10 @@ class AgentHeader(msgspec.Struct, kw_only=True):
     best_window: Positive
 
 
-class Saved(NamedTuple):
-    """The interpreted header of a model file."""
-
-    header: AgentHeader
-    config: Any
-    """The algorithm's configuration."""
-    observation_space: gym.Space
-    action_space: gym.Space
-
-
-def interpret(header: Mapping[str, object], room: int, config_class: Any, changes: Mapping[str, object]) -> Saved:
-    """Returns a header with its values checked and converted.
+def interpret(
+    header: Mapping[str, object], room: int, config_class: Any, changes: Mapping[str, object]
+) -> tuple[AgentHeader, Any, gym.Space, gym.Space]:
+    """Returns a header with its values checked, and of these the configuration and the two spaces.
 
     Args:
         header: JSON values of schema ``checkpoint.SCHEMA``.
@@ -101,7 +93,7 @@ def interpret(header: Mapping[str, object], room: int, config_class: Any, change
             raise ValueError(
                 f"action_share={config.action_share} cannot replace {before.action_share}; train a new agent"
             )
-    return Saved(saved, config, observation_space, action_space)
+    return saved, config, observation_space, action_space
 
 
 def check_space(description: object, ours: gym.Space, name: str) -> None:
@@ -192,18 +184,16 @@ def load(
     changes = cls.converted(changes)
     arguments = {key: changes.pop(key) for key in [*changes] if key in AGENT_ARGUMENTS}
     try:
-        saved = interpret(header, file.room, cls.algorithm.Config, changes)
+        saved, config, observation_space, action_space = interpret(header, file.room, cls.algorithm.Config, changes)
     except CheckpointError as error:
         raise CheckpointError(f"{path}: {error}") from None
     agent = cls.__new__(cls)
     outputs = {key: arguments.pop(key) for key in OUTPUTS if key in arguments}
-    agent.configure(saved.config, Identity.of(**{key: getattr(saved.header, key) for key in ARGUMENTS} | arguments))
+    agent.configure(config, Identity.of(**{key: getattr(saved, key) for key in ARGUMENTS} | arguments))
     agent.set_outputs(**outputs)
-    spaces.check_policy(
-        agent.identity.policy_name, saved.observation_space, agent.config.policy_kwargs.normalize_images
-    )
+    spaces.check_policy(agent.identity.policy_name, observation_space, config.policy_kwargs.normalize_images)
     try:
-        agent.build(saved.observation_space, saved.action_space)
+        agent.build(observation_space, action_space)
     except WRONG as error:
         raise CheckpointError(f"{path}: {brief(error)}") from None
     checkpoint.match(agent.learner.shapes, checkpoint.within(file.specs, prefix), path)
@@ -219,7 +209,7 @@ def load(
     devices.find(agent.identity.device)  # an error of its own
     try:
         agent.start_run(vector, agent.learner.pack(state))
-        _restore_counters(agent, saved.header)
+        _restore_counters(agent, saved)
     except (ArithmeticError, MemoryError, ValueError) as error:
         if changes.keys() & {"buffer_size", "n_steps", "n_episodes"}:
             raise

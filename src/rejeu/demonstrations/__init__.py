@@ -15,7 +15,8 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -167,24 +168,24 @@ def record(
     """
     from rejeu.demonstrations.recording import Recording
 
-    game = one_of(env)
-    recording = None if path is None else Recording(path, game, None, "expert")
-    try:
+    with one_of(env) as game, ExitStack() as stack:
+        recording = None if path is None else stack.enter_context(closing(Recording(path, game, None, "expert")))
         seeds = [None if seed is None else seed + i for i in range(whole("episodes", episodes, least=1))]
         played = [play(game, agent, lambda obs, action: action, start, recording)[0][0] for start in seeds]
-    finally:
-        if recording is not None:
-            recording.close()
-        if game is not env:
-            game.close()
     return Demonstrations(tuple(played), game.observation_space, game.action_space)
 
 
-def one_of(env: Any) -> gym.Env:
-    """Returns the environment of an id, or the environment that was given; raises ``TypeError`` for anything else."""
+@contextmanager
+def one_of(env: Any) -> Iterator[gym.Env]:
+    """Yields the environment of an id, which is closed at the end, or the environment that was given.
+
+    Raises:
+        TypeError: for anything else.
+    """
     if not isinstance(env, str | gym.Env):
         raise TypeError(f"env must be an id or one Gymnasium environment, got {type(env).__name__}")
-    return make_env(env) if isinstance(env, str) else env
+    with closing(make_env(env)) if isinstance(env, str) else nullcontext(env) as game:
+        yield game
 
 
 def play(
@@ -360,8 +361,8 @@ def dagger(
         ValueError: if the spaces differ, or the agent has a memory.
     """
     steps = whole("steps", steps, least=1)
-    game, say = one_of(env), after_round or (lambda i, demonstrations: None)
-    try:
+    say = after_round or (lambda i, demonstrations: None)
+    with one_of(env) as game:
         if demonstrations is not None:
             clone(agent, demonstrations, updates, learning_rate=learning_rate, seed=seed)
             say(0, demonstrations)
@@ -379,9 +380,6 @@ def dagger(
                 continue  # nobody took over
             clone(agent, demonstrations, updates, learning_rate=learning_rate, seed=seed + i + 1, counted=counted)
             say(i + 1, demonstrations)
-    finally:
-        if game is not env:
-            game.close()
     assert demonstrations is not None
     return demonstrations
 
@@ -460,14 +458,7 @@ def check(agent: AnyAgent, demonstrations: Demonstrations) -> None:
     """Raises ``ValueError`` unless an agent can learn from demonstrations: these spaces, the bounds of observations aside."""
     if not isinstance(demonstrations, Demonstrations):
         raise TypeError(f"demonstrations={demonstrations!r} must be what read(FOLDER) or record(...) returns")
-    for name, ours, theirs in (
-        ("observation", agent.observation_space, demonstrations.observation_space),
-        ("action", agent.action_space, demonstrations.action_space),
-    ):
-        if not spaces.same(ours, theirs, bounds=name == "action"):
-            raise ValueError(
-                f"the demonstrations have the {name} space {theirs}, and the agent {ours}; record them in its environment"
-            )
+    agent.check_spaces(demonstrations, "the set of demonstrations")
     if isinstance(space := agent.action_space, gym.spaces.Dict | gym.spaces.Tuple):
         raise ValueError(f"demonstrations of the action space {space} cannot be learned from; flatten it in a wrapper")
     if agent.learner.algorithm.recall is not None:

@@ -16,8 +16,18 @@ from gymnasium.vector.async_vector_env import AsyncState
 from rejeu.core.errors import BadEnvironmentError, WorkerError
 from rejeu.core.spaces import leaves, plain
 from rejeu.core.types import Info, Observation
-from rejeu.envs import base, goals as goals_module, validation
-from rejeu.envs.base import Seed, Step, VectorEnv, checked_seed, describe_spec, each_info, each_seed, step_whole
+from rejeu.envs import goals as goals_module, validation
+from rejeu.envs.base import (
+    Seed,
+    Step,
+    VectorEnv,
+    checked_seed,
+    describe_spec,
+    each_info,
+    each_seed,
+    step_whole,
+    success_of,
+)
 from rejeu.envs.goals import GoalFunctions
 
 DISABLED = "make the vector with autoreset_mode=gymnasium.vector.AutoresetMode.DISABLED"
@@ -183,9 +193,7 @@ class GymnasiumVector(VectorEnv):
         return [*self._called(self.env.call, name)]  # type: ignore[attr-defined]
 
     def success(self, step: Step, env: int) -> float:
-        info = step.info.get("final_info", step.info) if self._same_step else step.info
-        keys = [key for key in base.SUCCESS_KEYS if key in info and info.get(f"_{key}", np.ones(self.n_envs))[env]]
-        return base.success_of({key: info[key][env] for key in keys})
+        return success_of(each_info(step.info, self.n_envs)[env])
 
     def goals(self) -> GoalFunctions | None:
         unwrapped = self.env.unwrapped

@@ -9,7 +9,7 @@ import re
 import sys
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any, NamedTuple
@@ -18,7 +18,6 @@ import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
 
 from rejeu.core.errors import MissingExtra, requires
-from rejeu.core.types import Settings
 from rejeu.core.validation import nearest
 
 PLAIN_ID = re.compile(r"(?=.{1,200}$)([\w-]+/)?[\w.-]*(?<!\.py)(?<!\.)", re.IGNORECASE)
@@ -175,19 +174,13 @@ def make_env(env_id: str, **kwargs: Any) -> gym.Env:
 
 def maker(env_id: str, **kwargs: Any) -> Callable[[], gym.Env]:
     """Returns a function that makes the environment. It can be pickled, and includes the registration."""
-    return _Maker(env_id, kwargs, gym.registry.get(env_id))
+    return partial(_make_of_spec, env_id, gym.registry.get(env_id), **kwargs)
 
 
-@dataclass(frozen=True)
-class _Maker:
-    env_id: str
-    kwargs: Settings
-    spec: EnvSpec | None
-
-    def __call__(self) -> gym.Env:
-        if self.spec is not None and not register(self.env_id):
-            gym.registry[self.env_id] = self.spec
-        return make_env(self.env_id, **self.kwargs)
+def _make_of_spec(env_id: str, spec: EnvSpec | None, /, **kwargs: Any) -> gym.Env:
+    if spec is not None and not register(env_id):
+        gym.registry[env_id] = spec
+    return make_env(env_id, **kwargs)
 
 
 def unknown_environment(env_id: str) -> str:

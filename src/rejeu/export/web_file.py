@@ -29,16 +29,8 @@ ENVIRONMENTS = {
     for name in ("CartPole-v1", "Pendulum-v1", "MountainCar-v0", "MountainCarContinuous-v0", "rejeu/Ball-v0")
 } | {"parking-v0": "jax/Parking-v0"}
 """Environments that a page can contain, with the ids of their equals in JAX, which it contains too."""
-TYPES = {
-    "float32": "Float32Array",
-    "int8": "Int8Array",
-    "int16": "Int16Array",
-    "int32": "Int32Array",
-    "uint8": "Uint8Array",
-    "uint16": "Uint16Array",
-    "uint32": "Uint32Array",
-    "bool": "Uint8Array",
-}
+NUMBERS = ("float32", "int8", "int16", "int32", "uint8", "uint16", "uint32")
+TYPES = {name: f"{name.capitalize()}Array" for name in NUMBERS} | {"bool": "Uint8Array"}
 JAVASCRIPT = Language("JavaScript", TYPES)
 KEY = ShapeDtypeStruct((2,), np.uint32)
 

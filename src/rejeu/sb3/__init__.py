@@ -22,12 +22,12 @@ if TYPE_CHECKING:
     from rejeu.sb3.common.buffers import HerReplayBuffer
     from rejeu.sb3.common.utils import get_system_info
 
-__all__ = [
-    *(name for name, entry in CATALOG.items() if entry.original),
-    "HerReplayBuffer",
-    "get_system_info",
-    "load_zip",
-]
+ELSEWHERE = {
+    "HerReplayBuffer": "rejeu.sb3.common.buffers",
+    "get_system_info": "rejeu.sb3.common.utils",
+    "load_zip": "rejeu.agents.zip_files",
+}
+__all__ = [*(name for name, entry in CATALOG.items() if entry.original), *ELSEWHERE]
 
 
 class HER:
@@ -45,12 +45,7 @@ def __getattr__(name: str) -> Any:
     """Imports an algorithm when it is first used, so that worker processes need not."""
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}; {nearest(name, __all__)}")
-    elsewhere = {
-        "HerReplayBuffer": "rejeu.sb3.common.buffers",
-        "get_system_info": "rejeu.sb3.common.utils",
-        "load_zip": "rejeu.agents.zip_files",
-    }
-    return getattr(importlib.import_module(elsewhere.get(name, "rejeu.sb3.algorithms")), name)
+    return getattr(importlib.import_module(ELSEWHERE.get(name, "rejeu.sb3.algorithms")), name)
 
 
 def __dir__() -> list[str]:

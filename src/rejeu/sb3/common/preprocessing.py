@@ -88,8 +88,6 @@ def get_obs_shape(observation_space: spaces.Space) -> Any:
 
 def get_flattened_obs_dim(observation_space: spaces.Space) -> int:
     """Returns the length of an observation that is flattened, with choices one-hot."""
-    if isinstance(observation_space, spaces.MultiDiscrete):
-        return int(np.sum(observation_space.nvec))
     return int(spaces.utils.flatdim(observation_space))
 
 
