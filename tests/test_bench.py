@@ -87,15 +87,6 @@ def results():
     }
 
 
-def row_of(text, *cells):
-    """The cells of the first row of a table that begins with ``cells``."""
-    for line in text.splitlines():
-        found = [cell.strip() for cell in line.strip("|").split("|")]
-        if line.startswith("|") and found[: len(cells)] == list(cells):
-            return found
-    raise AssertionError(f"no row {cells} in\n{text}")
-
-
 def test_later_rounds_measure_the_variant_that_was_the_fastest_in_the_first(results):
     of = {(s["round"], s["variant"]) for s in results["samples"] if s["key"] == "steps/TD3/sb3"}
     assert of == {(0, plan.ONE), (0, plan.ALL), (1, plan.ONE), (2, plan.ONE)}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import gymnasium as gym
 import msgspec
@@ -16,10 +16,8 @@ from rejeu.core import checkpoint, devices, spaces, xla
 from rejeu.core.errors import CheckpointError, MissingObjectError
 from rejeu.core.records import WRONG, Positive, Seed, brief, convert
 from rejeu.core.types import JsonObject, Settings
+from rejeu.envs.make import VectorEnv
 from rejeu.envs.registry import are_plain, is_plain_id
-
-if TYPE_CHECKING:
-    from rejeu.envs.make import VectorEnv
 
 ARGUMENTS = ("policy", "seed", "stats_window_size", "success_threshold", "best_window")
 """Arguments of an agent that its model file holds."""
