@@ -10,7 +10,7 @@ import pytest
 from rejeu.demonstrations import read
 from rejeu.lab.cli import main, studio as command
 from rejeu.lab.runs.config import RunConfig
-from rejeu.lab.studio.games import HostedGame, Wanted
+from rejeu.lab.studio.games import HostedGame, asked_game
 from rejeu.lab.studio.state import Studio
 from rejeu.teaching.play import opened as game_opened
 from tests.helpers import error_of
@@ -99,23 +99,23 @@ def test_an_error_is_one_line_on_the_page(browser, common):
 @pytest.mark.parametrize(
     ("wanted", "message"),
     [
-        (Wanted("evil:Env-v0", (), True, None, False), "names the environment 'evil:Env-v0', and no file may name"),
-        (Wanted("evil.py", (), True, None, False), "names the environment 'evil.py', and no file may name"),
-        (Wanted("", ("../anna.safetensors",), True, None, False), "is not in the folder of the studio"),
-        (Wanted("", ("/etc/passwd",), True, None, False), "is not in the folder of the studio"),
-        (Wanted("Pendulum-v1", ("anna.safetensors",), True, None, False), "plays CartPole-v1, not Pendulum-v1"),
-        (Wanted("Pendulum-v1", (), False, None, False), "nobody plays"),
+        (("evil:Env-v0", (), True, None, False), "names the environment 'evil:Env-v0', and no file may name"),
+        (("evil.py", (), True, None, False), "names the environment 'evil.py', and no file may name"),
+        (("", ("../anna.safetensors",), True, None, False), "is not in the folder of the studio"),
+        (("", ("/etc/passwd",), True, None, False), "is not in the folder of the studio"),
+        (("Pendulum-v1", ("anna.safetensors",), True, None, False), "plays CartPole-v1, not Pendulum-v1"),
+        (("Pendulum-v1", (), False, None, False), "nobody plays"),
     ],
 )
 def test_an_address_names_no_code_and_no_file_elsewhere(common, wanted, message):
     with pytest.raises(ValueError, match=re.escape(message)):
-        wanted.open(Studio(common.folder))
+        asked_game(Studio(common.folder), *wanted)
 
 
 def test_an_environment_that_the_command_line_names_is_played(tmp_path):
     studio = Studio(tmp_path)
     studio.trust(RunConfig(env=f"tests.playing:{LEVER}"))
-    with Wanted(f"tests.playing:{LEVER}", (), True, 3, False).open(studio) as made:
+    with asked_game(studio, f"tests.playing:{LEVER}", (), True, 3, False) as made:
         assert (made.env_id, made.game.seed) == (LEVER, 3)
 
 
@@ -187,8 +187,7 @@ def test_watch_of_two_opens_the_studio_with_both(common, monkeypatch, capsys):
         ("anna.safetensors", "CartPole-v1"),
         (f"{HOSTILE}.safetensors", "CartPole-v1"),
     ]
-    wanted = Wanted("", tuple(names), by_hand=False, seed=5, record=False)
-    with wanted.open(Studio(folder, call["guests"])) as made:
+    with asked_game(Studio(folder, call["guests"]), "", names, False, 5, False) as made:
         assert [player.name for player in made.game.players] == names
     assert "one or two different agents" in error_of(capsys, "watch", *names, names[0])
     assert "one or two different agents" in error_of(capsys, "watch", names[0], names[0])

@@ -33,7 +33,7 @@ from rejeu.lab.reporting.run_list import read_all
 from rejeu.lab.runs.read import RunSummary
 from rejeu.logs import statistics
 from rejeu.logs.charts import GROUP_COLORS, Chart, group_chart
-from rejeu.logs.formatting import cell, counted, csv_text, markdown_table, number
+from rejeu.logs.formatting import cell, counted, csv_text, html_table, markdown_table, number
 
 if TYPE_CHECKING:
     from rejeu.logs.plots.picture import Picture
@@ -286,7 +286,7 @@ class Comparison:
 
     def _repr_html_(self) -> str:
         lines = [self.definition, *(f"note: {note}" for note in self.notes)]
-        return table_html(self) + "".join(f"<p>{html.escape(line)}</p>" for line in lines)
+        return html_table(self.text_table()) + "".join(f"<p>{html.escape(line)}</p>" for line in lines)
 
 
 def compare(
@@ -530,7 +530,7 @@ def page_of(comparison: Comparison) -> str:
         colors=GROUP_COLORS,
         facts=[counted(n_runs, "run"), *(envs if len(envs) <= 3 else [counted(len(envs), "environment")])],
         notes=comparison.notes,
-        table=table_html(comparison),
+        scores=comparison.text_table(),
         definition=f"{comparison.definition.capitalize()}. Intervals are 95 % stratified bootstrap intervals.",
         curves=entries["curve"],
         profiles=entries["profile"],
@@ -548,14 +548,3 @@ def run_rows(comparison: Comparison) -> list[list[str]]:
             seed = "" if run.config.seed is None else str(run.config.seed)
             rows.append([run.name, group.label, run.config.env, seed, run.state, f"{run.steps:,}", number(score)])
     return rows
-
-
-def table_html(comparison: Comparison) -> str:
-    """Returns the table of the groups as HTML, everything escaped; needs no other package."""
-    head, *rows = comparison.text_table()
-    lines = [
-        "".join(f"<{tag}{' class=text' * (i < 2)}>{html.escape(text)}</{tag}>" for i, text in enumerate(cells))
-        for tag, cells in [("th", head), *(("td", row) for row in rows)]
-    ]
-    body = "".join(f"<tr>{line}</tr>" for line in lines[1:])
-    return f'<div class="scroll"><table class="numbers"><thead><tr>{lines[0]}</tr></thead><tbody>{body}</tbody></table></div>'

@@ -117,6 +117,8 @@ def written(setting: object) -> str:
 R = TypeVar("R", bound="RunConfig")
 MAX_BYTES = 2**20
 """Upper limit on the size of a ``config.json``, and of the file of a task."""
+MAX_WORD = 10_000
+"""Upper limit on the length of a word of a command that is shown, in characters."""
 MAX_EPISODES = 10_000
 """Upper limit on the episodes of an evaluation while training."""
 
@@ -298,7 +300,7 @@ class RunConfig(EnvironmentOptions):
         options = self.again()
         return CheckpointError(
             f"{where} names an environment that is imported or made with more than numbers, which no file may ask for; "
-            f"if you trust it, name it again:{options if len(options) < 500 and options.isprintable() else ' --env ENV'}"
+            f"if you trust it, name it again:{options if len(options) < 500 else ' --env ENV'}"
         )
 
     def environment_words(self, option: bool = False) -> list[str]:
@@ -311,7 +313,7 @@ class RunConfig(EnvironmentOptions):
         ['--env', 'my_env.py', '--env-kwargs', 'g=9.8']
         """
         words = ["--env", self.typed] if option else [self.typed]
-        return self.as_words(*(words if self.names_code or not option else ()))
+        return self.as_words(*(words if not option or (self.env and self.names_code) else ()))
 
     def again(self) -> str:
         """Returns the options with which ``rejeu evaluate RUN`` and the like make the environment, a space before each.
@@ -319,7 +321,7 @@ class RunConfig(EnvironmentOptions):
         >>> RunConfig(env="CartPole-v1", imports=("my_algorithm.py",)).again()
         ' --import my_algorithm.py'
         """
-        return "".join(f" {quoted(word)}" for word in self.environment_words(option=True))
+        return "".join(f" {quoted(shown(word, MAX_WORD))}" for word in self.environment_words(option=True))
 
     def words(self) -> list[str]:
         """Returns the words of the command line that begins this run: ``rejeu`` is followed by them.

@@ -15,6 +15,8 @@ from filelock import FileLock, Timeout
 from rejeu.core import atomic, hardware, interrupt
 
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+TAIL = 2**16
+"""Most bytes of a log that are read."""
 LOST = -1
 """Exit status of a process that vanished."""
 
@@ -89,13 +91,17 @@ def start_apart(words: Sequence[str], log: Path) -> subprocess.Popen[bytes]:
 def last_line(log: Path) -> str:
     """Returns the last line of a log that is not empty."""
     try:
-        with log.open("rb") as file:
-            file.seek(max(log.stat().st_size - 4096, 0))
-            lines = file.read().decode("utf-8", "replace").split("\n")
+        text = end_of(log).strip().rpartition("\n")[2].strip()
     except OSError:
         return "there is no log"
-    text = next((line.strip() for line in reversed(lines) if line.strip()), "it printed nothing")
-    return text.removeprefix("rejeu: error: ")
+    return text.removeprefix("rejeu: error: ") or "it printed nothing"
+
+
+def end_of(log: Path) -> str:
+    """Returns the last :data:`TAIL` bytes of a log as text."""
+    with log.open("rb") as file:
+        file.seek(max(log.stat().st_size - TAIL, 0))
+        return file.read(TAIL).decode("utf-8", "replace")
 
 
 def default_workers() -> int:
@@ -108,18 +114,14 @@ def threads_of(workers: int) -> int:
     return max(hardware.cores() // workers, 1)
 
 
-def environment(threads: int) -> dict[str, str]:
-    """Returns the environment variables of a process that uses so many threads."""
-    return {**dict.fromkeys(THREADS, str(threads)), **os.environ, hardware.CORES: str(threads)}
-
-
 class LocalLauncher:
     """Starts runs on this machine."""
 
     def __init__(self, workers: int, threads: int | None = None) -> None:
         """Starts nothing; each of the ``workers`` runs at once has so many threads, by default its share of the cores."""
         self.capacity = workers
-        self._environ = environment(threads or threads_of(workers))
+        n_threads = str(threads or threads_of(workers))
+        self._environ = {**dict.fromkeys(THREADS, n_threads), **os.environ, hardware.CORES: n_threads}
 
     def start(self, task: Path, log: Path) -> Process:
         """Starts a run."""

@@ -27,7 +27,7 @@ from rejeu.core import atomic
 from rejeu.core.errors import CheckpointError
 from rejeu.core.records import Malformed, convert, json_text, parse_json, shown
 from rejeu.core.types import Settings
-from rejeu.lab.runs.config import MAX_BYTES, RunConfig
+from rejeu.lab.runs.config import MAX_BYTES, MAX_WORD, RunConfig
 from rejeu.logs.formatting import quoted
 from rejeu.logs.tables import EMPTY, Table, flat, read_bytes, read_table
 
@@ -36,8 +36,6 @@ MAX_WARNINGS_BYTES = 2**16
 MAX_VIDEOS = 1000
 MAX_NAME = 200
 """Upper limit on the length of a name or an id, in characters."""
-MAX_WORD = 10_000
-"""Upper limit on the length of a word of the command that repeats a run, in characters."""
 MAX_STEP = 2**53
 """Upper limit on environment steps; larger numbers are damage."""
 ERROR = re.compile(r"[A-Z]\w*(Error|Exception): ")
@@ -119,10 +117,6 @@ class RunSummary:
             return {}
         default, value = dict(flat(defaults)), dict(flat(self.config.hyperparameters))
         return {name: (value[name], default.get(name)) for name in value if value[name] != default.get(name)}
-
-    def environment_words(self) -> list[str]:
-        """Returns the options with which commands about the run make its environment again; empty if its id is enough."""
-        return self.config.environment_words(option=True) if self.config.env else []
 
     @cached_property
     def command(self) -> str:

@@ -11,42 +11,18 @@ from rejeu.core.language import Language, said
 from rejeu.core.types import JsonObject
 from rejeu.lab.reporting.rows import Row
 from rejeu.lab.studio.judging import Judging
-from rejeu.lab.studio.layout import EVERY, address
+from rejeu.lab.studio.layout import EVERY, HERE, add_cells, address
 from rejeu.lab.studio.speech import language_here, say
 from rejeu.lab.studio.state import Studio
 from rejeu.teaching.courses import leaderboard
 from rejeu.teaching.courses.leaderboard import Leaderboard
 
-CSS = """
-.class td.name { font-weight: 600; white-space: normal; overflow-wrap: anywhere; }
-.class a { text-decoration: none; }
-.class svg { width: 7rem; height: 1rem; display: block; }
-.projector .header { display: none; }
-.projector .page { max-width: none; padding: 1.5vh 2vw; gap: 1vh; }
-.projector .class td, .projector .class th { font-size: min(2.2rem, 3.2vw, 4vh); line-height: 1.35; padding: 0.3vh 8px; }
-.projector .class td, .projector .class th { height: auto; }
-.projector .class td .quiet { font-size: min(1.4rem, 2.2vw, 2.4vh); line-height: 1.2; }
-.projector .class svg { width: 16vw; height: 1.6rem; }
-.projector .title { font-size: min(3rem, 5vw, 5.5vh); line-height: 1.2; }
-.projector .small { display: none; }
-"""
 PLACES = "Models whose intervals overlap may be equally good: the place is the range that the intervals allow."
 NAMES = ("place", "name", "algorithm", "steps", "seed", "return", "interval", "success", "length")
 LEFT_OUT = dict.fromkeys(("algorithm", "steps", "seed", "length"), "gt-sm small") | dict.fromkeys(
     ("bar", "success"), "gt-xs"
 )
 """Classes of columns that a phone, or the projector, leaves out."""
-SLOTS = {
-    "name": """<q-td :props="props" class="name">
-        <a v-if="props.row.link" class="run" :href="props.row.link" :title="props.row.watch"><q-icon
-        name="play_arrow" />{{ props.row.name }}</a>
-        <span v-else>{{ props.row.name }}</span>
-        <div class="text-caption quiet">{{ props.row.training }}</div></q-td>""",
-    "bar": """<q-td :props="props"><svg viewBox="-2 0 104 10" preserveAspectRatio="none" aria-hidden="true">
-        <rect :x="props.row.low" y="3" :width="props.row.width" height="4" fill="var(--dots)" />
-        <rect :x="props.row.middle" y="0" width="2" height="10" fill="var(--line)" /></svg></q-td>""",
-}
-"""Cells as Vue's templates, which escape what they are given."""
 
 
 @cache
@@ -57,7 +33,7 @@ def judging_of(studio: Studio) -> Judging:
 
 def build(studio: Studio, request: Request) -> None:
     """Makes the page; its address may name a ``language``, and ``projector`` for large letters."""
-    ui.add_css(CSS)
+    ui.add_css(HERE / "classroom.css")
     judging, language = judging_of(studio), language_here()
     is_large = "projector" in request.query_params
     ui.query("body").classes("projector" if is_large else "")
@@ -69,8 +45,7 @@ def build(studio: Studio, request: Request) -> None:
         ).classes("run")
     table = ui.table(rows=[], columns=columns(leaderboard.columns(language)), row_key="name", pagination=0)
     table.classes("w-full class").props("flat bordered dense hide-pagination")
-    for name, template in SLOTS.items():
-        table.add_slot(f"body-cell-{name}", template)
+    add_cells(table, "classroom.vue")
     notes = ui.label().classes("text quiet")
     previous: object = None
 

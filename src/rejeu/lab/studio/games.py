@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import NamedTuple
 
 from rejeu.agents import load
 from rejeu.checkpoints.run_folder import dated, find_model
@@ -28,37 +27,36 @@ SLOW = 20.0
 """Steps a second below which a key that is pressed acts at once, rather than at the next step."""
 
 
-class Wanted(NamedTuple):
-    """A game that somebody asks for."""
+def asked_game(
+    studio: Studio, env: str, names: Sequence[str], by_hand: bool, seed: int | None, is_recorded: bool
+) -> AbstractContextManager[Opened]:
+    """Returns the context of a game that somebody asks for.
 
-    env: str
-    """Id of the environment; empty for that of the first agent."""
-    agents: Sequence[str]
-    """Names of models: paths below the folder of the studio, or those that the command line named."""
-    by_hand: bool
-    seed: int | None
-    record: bool
+    Args:
+        studio: that has the agents.
+        env: id of the environment; empty for that of the first agent.
+        names: of models: paths below the folder of the studio, or those that the command line named.
+        by_hand: whether a person plays.
+        seed: of the first round; None draws one.
+        is_recorded: whether the episodes of the person are written below the folder of the studio.
 
-    def open(self, studio: Studio) -> AbstractContextManager[Opened]:
-        """Returns the context of the game.
-
-        Raises:
-            ValueError: if the environment or an agent cannot be used, or nobody plays.
-            OSError: if there is no such model.
-        """
-        if not self.agents and not self.by_hand:
-            raise ValueError("nobody plays; choose an agent, or play yourself")
-        players = {name: find_agent(studio, name) for name in self.agents}
-        environment = next((env for _, env in players.values()), None)
-        if environment is None:
-            environment = from_run(RunConfig(env=full_name(self.env)), "the address", studio.typed(self.env))
-        env_id = self.env or environment.env_id
-        for name, (_, env) in players.items():
-            if env.env_id != env_id:
-                raise ValueError(f"{name} plays {env.env_id}, not {env_id}")
-        agents = {name: load(model, device="cpu") for name, (model, _) in players.items()}
-        folder = studio.below(f"played/{dated(environment.env_id).name}") if self.record and self.by_hand else None
-        return opened(environment.make, agents, self.by_hand, seed=self.seed, record=folder, has_video=False)
+    Raises:
+        ValueError: if the environment or an agent cannot be used, or nobody plays.
+        OSError: if there is no such model.
+    """
+    if not names and not by_hand:
+        raise ValueError("nobody plays; choose an agent, or play yourself")
+    players = {name: find_agent(studio, name) for name in names}
+    environment = next((played for _, played in players.values()), None)
+    if environment is None:
+        environment = from_run(RunConfig(env=full_name(env)), "the address", studio.typed(env))
+    env_id = env or environment.env_id
+    for name, (_, played) in players.items():
+        if played.env_id != env_id:
+            raise ValueError(f"{name} plays {played.env_id}, not {env_id}")
+    agents = {name: load(model, device="cpu") for name, (model, _) in players.items()}
+    folder = studio.below(f"played/{dated(environment.env_id).name}") if is_recorded and by_hand else None
+    return opened(environment.make, agents, by_hand, seed=seed, record=folder, has_video=False)
 
 
 def find_agent(studio: Studio, name: str) -> tuple[Path, Environment]:

@@ -6,9 +6,11 @@ into ``ui.html``, ``ui.markdown``, ``ui.code``, the slots of a table as HTML, or
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import copy
+from pathlib import Path
 from types import MappingProxyType
 from urllib.parse import urlencode
 
@@ -16,34 +18,14 @@ from fastapi import Request
 from nicegui import ui
 
 from rejeu.core.language import LANGUAGES, Language, chosen
+from rejeu.core.records import brief
 from rejeu.lab.studio import figures
 from rejeu.lab.studio.speech import QUASAR, say
 from rejeu.lab.studio.state import Studio
 
+HERE = Path(__file__).parent
 EVERY = 1.0
 """Seconds between two looks whether what a page shows has changed."""
-STYLE = """
-body { font-family: system-ui, sans-serif; }
-.nicegui-content { padding: 0; }
-.page { width: 100%; max-width: 1400px; margin: 0 auto; padding: 16px; gap: 12px; }
-.header { background: var(--bar, #1d4f91); min-height: 48px; padding: 4px 12px; }
-.q-table td, .q-table th { padding: 4px 8px; }
-.q-table td { max-width: 22rem; overflow: hidden; text-overflow: ellipsis; }
-.quiet { color: var(--muted); }
-.picture { width: 84px; height: 48px; object-fit: cover; border-radius: 4px; display: block; }
-.notes { max-width: 16rem; white-space: normal; }
-a.run { color: var(--line); overflow-wrap: anywhere; }
-.card { background: var(--card); border-color: var(--rule); padding: 10px 12px; gap: 4px; min-width: 0; box-shadow: none; }
-.tile { flex: 1 1 200px; gap: 0; }
-.charts { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 420px), 1fr)); gap: 12px; }
-.mono { font-family: ui-monospace, monospace; font-size: 12px; }
-.warning { background: var(--mark); color: var(--mark-ink); border-radius: 8px; padding: 4px 10px; width: 100%; }
-.unseen { position: absolute; width: 1px; height: 1px; overflow: hidden; clip-path: inset(50%); }
-.body--dark .text-primary { --q-primary: var(--line); }
-.text { white-space: pre-wrap; overflow-wrap: anywhere; }
-.body--dark { --bar: #16263d; }
-@media (max-width: 600px) { .page { padding: 8px; } }
-"""
 MODES = {None: "brightness_auto", False: "light_mode", True: "dark_mode"}
 """Symbols of the colors of a page: those of the system, light and dark."""
 
@@ -70,7 +52,7 @@ def frame(request: Request, title: str, path: str, links: Sequence[tuple[str, st
         filter(None, [request.query_params.get("run") if path == "/run" else "", say(title), "rejeu"])
     )
     figures.add_scripts()
-    ui.add_css(STYLE)
+    ui.add_css(HERE / "layout.css")
     ui.colors(primary="#2f6db5", positive="#1b7a43")
     dark = ui.dark_mode(None)
     with ui.header().classes("header items-center gap-1 no-wrap"):
@@ -118,12 +100,28 @@ def action(text: str, icon: str | None, on_click: Callable[..., object]) -> ui.b
     return ui.button(text, icon=icon, on_click=on_click).props("outline dense no-caps padding='2px 10px'")
 
 
+def add_cells(table: ui.table, file: str) -> None:
+    """Gives a table the cells in a file next to this one: Vue's templates, which escape what they are given."""
+    text = (HERE / file).read_text(encoding="utf-8")
+    for name, template in re.findall(r'<template #([\w-]+)="props">\n(.*?)</template>', text, re.DOTALL):
+        table.add_slot(name, template)
+
+
 def form_buttons(form: ui.dialog, text: str, on_click: Callable[..., object], icon: str | None = None) -> ui.button:
     """Makes the buttons below a form over a page, which removes it when it is cancelled; returns the first."""
     with ui.row():
         button = ui.button(text, icon=icon, on_click=on_click).props("no-caps")
         ui.button(say("Cancel"), on_click=form.delete).props("flat no-caps")
     return button
+
+
+@contextmanager
+def failures_shown() -> Iterator[None]:
+    """Context whose failure, of a file or for an invalid value, is shown for a few seconds."""
+    try:
+        yield
+    except (OSError, ValueError) as error:
+        ui.notify(brief(error), type="negative")
 
 
 def follow(studio: Studio, show: Callable[[], object], every: float = EVERY) -> None:

@@ -282,8 +282,7 @@ async def lead_to(studio: Studio, words: Sequence[str], path: Path, show: Callab
         while not studio.holds(name):
             if process.poll() is not None and not (path.is_dir() and find(path)):
                 return processes.read_log(path) or f"rejeu {words[0]} ended with exit status {process.returncode}"
-            printed = processes.read_log(path).strip().rpartition("\n")[2]
-            show(printed or say("JAX is loaded, and environments are made ..."))
+            show(processes.last_line(path) or say("JAX is loaded, and environments are made ..."))
             await asyncio.sleep(LOOK)
     ui.navigate.to(address("/run", run=name))
     return ""

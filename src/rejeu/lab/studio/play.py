@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
 from functools import partial
 
 from fastapi import Request
 from nicegui import ui
 
 from rejeu.agents import presets
-from rejeu.lab.studio.games import HostedGame, Wanted
+from rejeu.lab.studio.games import HostedGame, asked_game
 from rejeu.lab.studio.layout import address, follow
 from rejeu.lab.studio.screen import CSS, Screen
 from rejeu.lab.studio.speech import say
 from rejeu.lab.studio.state import Studio
+from rejeu.teaching.play import Opened
 from rejeu.teaching.play.game import Event
 from rejeu.teaching.play.keys import KNOWN, KeyMap
 from rejeu.teaching.play.window import HELP, legend
@@ -69,11 +71,12 @@ def build(studio: Studio, request: Request) -> None:
 
     def begin() -> None:
         from_seed = None if number.value is None else int(number.value)
-        wanted = Wanted(env.value or "", tuple(agents.value), bool(by_hand.value), from_seed, bool(record.value))
+        players = tuple(agents.value), bool(by_hand.value)
+        start = partial(asked_game, studio, env.value or "", *players, from_seed, bool(record.value))
         form.value = False
         stage.clear()  # the screen of an earlier game ends it
         with stage:
-            show(studio, wanted, offer, begin)
+            show(start, offer, begin)
 
     def offer(env_id: str | None = None) -> None:
         env_id = env.value or env_id
@@ -103,12 +106,13 @@ def offered(studio: Studio, env_id: str | None, selected: list[str]) -> list[str
     return [*dict.fromkeys([*selected, *studio.guests, *runs])]
 
 
-def show(studio: Studio, wanted: Wanted, begun: Callable[[str], object], again: Callable[[], object]) -> None:
+def show(
+    start: Callable[[], AbstractContextManager[Opened]], begun: Callable[[str], object], again: Callable[[], object]
+) -> None:
     """Begins a game, and shows it.
 
     Args:
-        studio: that has the agents.
-        wanted: who plays.
+        start: returns the context of the game.
         begun: called with the id of its environment.
         again: called to begin it anew, when it has ended.
     """
@@ -123,7 +127,7 @@ def show(studio: Studio, wanted: Wanted, begun: Callable[[str], object], again: 
     status = ui.label(say("The environment is made, and agents are compiled ...")).classes("text")
     screen = Screen(lambda event: playing.handle(event), label)
     buttons = ui.row().classes("keys gap-1 items-center w-full")
-    playing = HostedGame(lambda: wanted.open(studio), screen.show)
+    playing = HostedGame(start, screen.show)
     screen.on_leave = lambda: playing.handle(Event("close"))
 
     def look() -> None:

@@ -9,15 +9,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from rejeu.core import atomic
-from rejeu.lab.runs.process import start_apart
+from rejeu.lab.runs.process import end_of, start_apart
 from rejeu.lab.runs.read import is_file
 
 HIDDEN = ".studio"
 """Folder of the logs, beside the run folders."""
 STARTED: dict[tuple[str, str], subprocess.Popen[bytes]] = {}
 """The processes by command and run: what is under way is not started twice. That a run begins is one command."""
-TAIL = 2**16
-"""Most bytes of a log that are shown."""
 
 
 def start(words: Sequence[str], run: Path) -> subprocess.Popen[bytes]:
@@ -46,10 +44,13 @@ def read_log(run: Path) -> str:
     """Returns the end of what a run has printed, of one that a sweep or the studio started; else nothing."""
     for path in (log_of(run), run.parent / f"{run.name}.log"):
         if is_file(path):
-            with path.open("rb") as file:
-                file.seek(max(path.stat().st_size - TAIL, 0))
-                return plain(file.read(TAIL).decode("utf-8", "replace"))
+            return plain(end_of(path))
     return ""
+
+
+def last_line(run: Path) -> str:
+    """Returns the last line that a run has printed; see :func:`read_log`."""
+    return read_log(run).strip().rpartition("\n")[2]
 
 
 def plain(text: str) -> str:

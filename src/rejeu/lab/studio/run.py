@@ -18,7 +18,6 @@ from nicegui import ui
 from rejeu.checkpoints.run_folder import RunFolder
 from rejeu.core import atomic
 from rejeu.core.errors import one_line
-from rejeu.core.records import brief
 from rejeu.core.types import JsonObject
 from rejeu.lab.experiments.work import HIDDEN
 from rejeu.lab.reporting import run_list
@@ -29,7 +28,7 @@ from rejeu.lab.runs.read import Remarks, is_file
 from rejeu.lab.studio import moving, processes
 from rejeu.lab.studio.branch import open_form
 from rejeu.lab.studio.figures import Figure
-from rejeu.lab.studio.layout import EVERY, Choice, action, address, form_buttons, is_number
+from rejeu.lab.studio.layout import EVERY, Choice, action, address, failures_shown, form_buttons, is_number
 from rejeu.lab.studio.player import BEST, CURRENT, LiveEpisode, LivePlayer, lower_priority
 from rejeu.lab.studio.runs import COLORS
 from rejeu.lab.studio.screen import CSS, Screen
@@ -243,11 +242,8 @@ def edit_remarks(page: RunPage, row: Row) -> None:
     """Opens a form for the note and the tags of a run."""
 
     def save() -> None:
-        try:
+        with failures_shown():
             Remarks(note.value or "", (*(tags.value or "").split(),)).write(RunFolder(page.path))
-        except OSError as error:
-            ui.notify(brief(error), type="negative")
-        else:
             form.delete()
 
     with ui.dialog(value=True) as form, ui.card().classes("w-full").style("max-width: 30rem"):
@@ -260,36 +256,26 @@ def rename_run(page: RunPage) -> None:
     """Opens a form for another name of a run, and leads to its page."""
 
     def save() -> None:
-        try:
+        with failures_shown():
             moving.rename(page.studio, page.name, name.value or "")
-        except (OSError, ValueError) as error:
-            message.text = brief(error)
-        else:
             ui.navigate.to(address("/run", run=name.value))
 
     with ui.dialog(value=True) as form, ui.card().classes("w-full").style("max-width: 30rem"):
         name = ui.input(say("folder"), value=page.name).classes("w-full")
-        message = ui.label().classes("text mono")
         form_buttons(form, say("Rename"), save)
 
 
 def delete_run(page: RunPage) -> None:
     """Moves a run into the bin, and leads to the page of all runs, where that can be undone."""
-    try:
+    with failures_shown():
         moving.delete(page.studio, [page.name])
-    except (OSError, ValueError) as error:
-        ui.notify(brief(error), type="negative")
-    else:
         ui.navigate.to("/")
 
 
 def stop(button: Any, folder: RunFolder) -> None:
     """Asks the run to stop with a checkpoint, as Ctrl-C does."""
-    try:
+    with failures_shown():
         atomic.touch(folder.stop)
-    except OSError as error:
-        ui.notify(brief(error), type="negative")
-    else:
         ui.notify(say("The run stops after this step, and saves everything."))
         disable_while(button, lambda: is_file(folder.stop))
 
@@ -299,14 +285,11 @@ def command(button: Any, name: str, page: RunPage, text: str, *words: str) -> No
 
     def is_under_way() -> bool:
         if process.poll():
-            ui.notify(processes.read_log(page.path).strip().rpartition("\n")[2], type="negative")
+            ui.notify(processes.last_line(page.path), type="negative")
         return process.returncode is None
 
-    try:
+    with failures_shown():
         process = processes.start([name, str(page.path), *words, *page.studio.words(page.name)], page.path)
-    except (OSError, ValueError) as error:
-        ui.notify(brief(error), type="negative")
-    else:
         ui.notify(text)
         disable_while(button, is_under_way)
 
@@ -344,8 +327,8 @@ def show_settings(section: sections.RunSection) -> None:
             ui.label(say(title)).classes("text-weight-medium")
             cells = [dict(zip(names, row, strict=True)) for row in rows]
             ui.table(rows=cells, columns=columns).props("flat dense hide-header wrap-cells").classes("w-full text")
-    if section.command:
-        ui.label(section.command).classes("text mono quiet")
+    if section.run.command:
+        ui.label(section.run.command).classes("text mono quiet")
 
 
 class Head:
@@ -380,7 +363,7 @@ class Head:
                 show_actions(self.page, row)
         for element in (self.progress, self.status):
             element.set_visibility(row.state == "running")
-        problems = (*row.warnings, *row.notes) if section is None else (*section.warnings, *section.notes)
+        problems = (*row.warnings, *row.notes) if section is None else (*section.run.warnings, *section.notes)
         if problems != self.problems:
             self.problems = problems
             self.notes.clear()
@@ -392,8 +375,9 @@ class Head:
         """Shows how far training is: a bar, and what it has printed last; of one without a log what its files say."""
         self.progress.value = row.share or 0.0
         self.progress.props["indeterminate"] = row.share is None
-        printed = processes.read_log(self.page.path).strip().rpartition("\n")[2]
-        self.status.text = printed or say(row.reason) or f"{steps_text(row)} · {rate_text(row)}"
+        self.status.text = (
+            processes.last_line(self.page.path) or say(row.reason) or f"{steps_text(row)} · {rate_text(row)}"
+        )
 
 
 class LiveView:

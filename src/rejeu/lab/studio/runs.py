@@ -16,12 +16,11 @@ from fastapi import Request
 from nicegui import ui
 from nicegui.events import ClickEventArguments, GenericEventArguments
 
-from rejeu.core.records import brief
 from rejeu.core.types import JsonObject
 from rejeu.lab.reporting.grouping import group_labels
 from rejeu.lab.reporting.rows import POINTS, BestEvaluation, Row, cells, nothing
 from rejeu.lab.studio import moving
-from rejeu.lab.studio.layout import Choice, action, address, follow, is_number
+from rejeu.lab.studio.layout import Choice, action, add_cells, address, failures_shown, follow, is_number
 from rejeu.lab.studio.new import start
 from rejeu.lab.studio.speech import say, translated
 from rejeu.lab.studio.state import Studio
@@ -46,26 +45,6 @@ COLUMNS = {
 """Titles of the columns."""
 NUMBERS, PHONE = ("steps", "best", "rate"), ("run", "state", "best")
 """Columns whose cells are to the right, and those that a phone shows."""
-SLOTS = {
-    "run": """<q-td :props="props" :style="{paddingLeft: props.row.is_inner ? '28px' : '8px'}">
-        <q-btn v-if="props.row.is_group" flat dense no-caps align="left"
-          :icon="props.row.is_open ? 'expand_more' : 'chevron_right'" :aria-expanded="props.row.is_open"
-          :label="props.row.name" @click="$parent.$emit('fold', props.row.key)" />
-        <a v-else class="run" :href="props.row.link">{{ props.row.name }}</a>
-        <div class="text-caption quiet">{{ props.row.about }}</div>
-        <div class="text-caption notes">{{ props.row.remarks }}</div></q-td>""",
-    "state": """<q-td :props="props"><q-badge :color="props.row.color" :label="props.row.state" />
-        <div class="text-caption quiet notes">{{ props.row.reason }}</div></q-td>""",
-    "steps": """<q-td :props="props">{{ props.row.steps }}
-        <q-linear-progress v-if="props.row.share != null" :value="props.row.share" aria-hidden="true" /></q-td>""",
-    "best": """<q-td :props="props">{{ props.row.best }}<div class="text-caption quiet">{{ props.row.more }}</div></q-td>""",
-    "curve": """<q-td :props="props"><svg width="110" height="28" role="img" aria-label=say("curve")><polyline
-        :points="props.row.curve" fill="none" stroke="var(--line)" stroke-width="1.5" /></svg></q-td>""",
-    "picture": """<q-td :props="props"><video v-if="props.row.video" :src="props.row.video" muted loop preload="metadata"
-        class="picture" onmouseenter="this.play()" onmouseleave="this.pause()"></video>
-        <img v-else-if="props.row.picture" :src="props.row.picture" class="picture" loading="lazy" alt=""></q-td>""",
-}
-"""Cells as Vue's templates, which escape what they are given."""
 
 
 class Block(NamedTuple):
@@ -118,8 +97,7 @@ def build(studio: Studio, request: Request) -> None:
     table = ui.table(rows=[], columns=columns(), row_key="key", pagination=pagination(choice, 0), selection="multiple")
     table.classes("w-full").props("flat bordered dense wrap-cells binary-state-sort column-sort-order=da")
     table.props.update({"rows-per-page-options": sorted(PER_PAGE)})
-    for name, template in SLOTS.items():
-        table.add_slot(f"body-cell-{name}", template)
+    add_cells(table, "runs.vue")
     for part, label in (("header", f"'{say('choose all')}'"), ("body", "props.row.name")):
         table.add_slot(f"{part}-selection", f'<q-checkbox v-model="props.selected" dense :aria-label="{label}" />')
 
@@ -157,10 +135,8 @@ def build(studio: Studio, request: Request) -> None:
         return marked(blocks, {line["key"] for line in table.selected})
 
     def move(do: Callable[..., None], *arguments: object) -> None:
-        try:
+        with failures_shown():
             do(studio, *arguments)
-        except (OSError, ValueError) as error:
-            ui.notify(brief(error), type="negative")
         table.selected = []
         enable()
         show()

@@ -63,7 +63,7 @@ def render(runs: Sequence[RunSummary], folder: Path | None = None) -> str:
         MissingExtra: if plotly or jinja2 is not installed.
     """
     parts = sections.build(runs, folder)
-    return page.render("report.html", parts.data, title=sections.title_of(runs), runs=parts.runs)
+    return page.render("report.html", parts.data, title=sections.title_of(runs), sections=parts.runs)
 
 
 def record(agent: Agent, path: Path, evaluations: Sequence[tuple[int, Evaluation]]) -> RunSummary:

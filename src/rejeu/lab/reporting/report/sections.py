@@ -17,7 +17,7 @@ from rejeu.core.types import JsonObject
 from rejeu.lab.reporting.report.page import ChartEntry
 from rejeu.lab.reporting.report.videos import BUDGET, Video, collect
 from rejeu.lab.runs.config import RunConfig
-from rejeu.lab.runs.read import MAX_WORD, RunSummary, best_row
+from rejeu.lab.runs.read import RunSummary, best_row
 from rejeu.logs import charts as chart_data
 from rejeu.logs.charts import Chart
 from rejeu.logs.formatting import counted, duration, quoted
@@ -66,30 +66,23 @@ class RunSection(NamedTuple):
     """The content of a page on one run, as the template shows it."""
 
     id: str
-    name: str
+    run: RunSummary
     env: str
     algorithm: str
-    state: str
-    state_text: str
     tiles: list[Tile]
     facts: list[str]
     groups: list[ChartGroup]
     videos: list[Video]
-    other_videos: int
-    """Number of further videos in the run folder."""
+    """Those that are shown."""
     histograms: set[str]
     """Those that exist: ``"episodes"`` of training, ``"replays"`` of the trained agent."""
     evaluations: list[JsonObject]
     has_success: bool
-    evaluations_note: str
     settings: list[tuple[str, str]]
     changed: list[Hyperparameter]
     """Hyperparameters that differ from the defaults."""
     unchanged: list[Hyperparameter]
-    versions: list[tuple[str, str]]
-    warnings: Sequence[str]
     notes: Sequence[str]
-    command: str
     replay_command: str
     """Command that plays episodes of the trained agent; empty without a model."""
 
@@ -119,10 +112,10 @@ def build(runs: Sequence[RunSummary], folder: Path | None) -> Parts:
         own_charts, groups = charts_of(run, f"run{i}")
         charts |= own_charts
         bars = {"episodes": histogram_of(run), "replays": replays_of(run)}
-        histograms |= {f"run{i}-{name}": histogram for name, histogram in bars.items() if histogram is not None}
+        keys = {name for name, histogram in bars.items() if histogram is not None}
+        histograms |= {f"run{i}-{name}": bars[name] for name in keys}
         clips, notes, spent = collect(run, folder, budget)
         budget -= spent
-        keys = {name for name, histogram in bars.items() if histogram is not None}
         sections.append(describe(run, f"run{i}", groups, clips, notes, keys))
     return Parts(sections, {"charts": charts, "histograms": histograms})
 
@@ -166,28 +159,21 @@ def describe(
     changed, unchanged = hyperparameters(run)
     return RunSection(
         id=key,
-        name=run.name,
+        run=run,
         env=run.config.env or "unknown environment",
         algorithm=run.config.algorithm or "unknown algorithm",
-        state=run.state,
-        state_text="state unknown" if run.state == "unknown" else run.state,
         tiles=tiles(run),
         facts=facts(run),
         groups=groups,
         videos=videos,
-        other_videos=max(len(run.videos) - len(videos), 0),
         histograms=histograms,
         evaluations=evaluation_rows(run),
         has_success=bool(np.isfinite(run.evaluations.column("success_rate")).any()),
-        evaluations_note=evaluations_note(run),
         settings=settings(run),
         changed=changed,
         unchanged=unchanged,
-        versions=[(shown(name), shown(value)) for name, value in run.versions.items()],
-        warnings=run.warnings,
         notes=[*run.notes, *notes],
-        command=run.command,
-        replay_command=f"rejeu report {path_word(run.path)} --replay 100{env_options(run)}"
+        replay_command=f"rejeu report {path_word(run.path)} --replay 100{run.config.again()}"
         if run.format == "rejeu" and run.models
         else "",
     )
@@ -293,12 +279,6 @@ def evaluation_rows(run: RunSummary) -> list[JsonObject]:
     ]
 
 
-def evaluations_note(run: RunSummary) -> str:
-    """Returns which evaluations are listed; empty if all are."""
-    n = len(run.evaluations)
-    return f"{MAX_EVALUATIONS} of {n:,} evaluations, evenly spaced" if n > MAX_EVALUATIONS else ""
-
-
 def value_text(value: object) -> str:
     """Returns a value of a configuration as text; a schedule in words.
 
@@ -339,12 +319,7 @@ def replay_command(run: RunSummary) -> str:
     if run.format != "rejeu" or not run.models:
         return ""
     option = "" if RunFolder(run.path).best in run.models else " --which last"
-    return f"rejeu watch {path_word(run.path)}{option} --seed N --episodes 1{env_options(run)}"
-
-
-def env_options(run: RunSummary) -> str:
-    """Returns the options with which commands about the run make its environment again; empty if its id is enough."""
-    return "".join(f" {quoted(shown(word, MAX_WORD))}" for word in run.environment_words())
+    return f"rejeu watch {path_word(run.path)}{option} --seed N --episodes 1{run.config.again()}"
 
 
 def path_word(path: Path) -> str:
