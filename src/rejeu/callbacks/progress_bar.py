@@ -182,7 +182,7 @@ def status(
     """Returns one line on a run: steps, steps per second, return, success rate, time left; NaN is left out.
 
     >>> status(1500, 20_000, 812.3, -1204.5, math.nan, 22.8)
-    '1,500/20,000 steps · 812/s · return -1,204.50 · 0:23 left'
+    '1,500/20,000 steps · 812/s · return -1,204.50 · 23 s left'
     """
     parts = [f"{step:,}" + ("" if n_steps is None else f"/{n_steps:,}") + " steps", f"{rate:,.0f}/s"]
     if not math.isnan(mean_return):
@@ -190,7 +190,7 @@ def status(
     if not math.isnan(success_rate):
         parts.append(f"success {success_rate:.0%}")
     if not math.isnan(seconds_left):
-        parts.append(f"{duration(seconds_left)} left")
+        parts.append(f"{formatting.duration(round(seconds_left))} left")
     return " · ".join(parts)
 
 
@@ -208,17 +208,6 @@ def time_spent(before: Mapping[str, float], after: Mapping[str, float]) -> str:
         return ""
     shares = time_shares(passed).items()
     return " · ".join(f"{NAMES.get(activity, activity)} {max(share, 0.0):.0%}" for activity, share in shares)
-
-
-def duration(seconds: float) -> str:
-    """Returns a time as ``m:ss`` or ``h:mm:ss``.
-
-    >>> duration(59.6), duration(3725)
-    ('1:00', '1:02:05')
-    """
-    minutes, full_seconds = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02}:{full_seconds:02}" if hours else f"{minutes}:{full_seconds:02}"
 
 
 def _mean(values: Iterable[float]) -> float:

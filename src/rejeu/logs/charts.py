@@ -66,11 +66,6 @@ def usable(values: np.ndarray) -> np.ndarray:
     return np.abs(values) < HUGE
 
 
-def steps(values: Iterable[float] | np.ndarray) -> list[int]:
-    """Returns steps for JSON."""
-    return np.asarray(values, np.float64).astype(np.int64).tolist()
-
-
 def window_of(n: int) -> int:
     """Returns the number of episodes that a point of a smoothed curve averages.
 
@@ -113,7 +108,7 @@ def series(form: str, name: str, color: str, step: Any, minutes: Any, y: Any = (
         "kind": form,
         "name": name,
         "color": color,
-        "x": steps(step),
+        "x": np.asarray(step, np.float64).astype(np.int64).tolist(),
         "t": plain(minutes),
         "y": plain(y),
         **columns,

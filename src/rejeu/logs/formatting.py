@@ -81,13 +81,13 @@ def number(value: float) -> str:
 def duration(seconds: float) -> str:
     """Returns a time in words, a dash if it is unknown.
 
-    >>> duration(75), duration(4000), duration(7.25)
-    ('1 min 15 s', '1 h 6 min', '7.2 s')
+    >>> duration(75), duration(4000), duration(7.25), duration(7)
+    ('1 min 15 s', '1 h 6 min', '7.25 s', '7 s')
     """
     if not math.isfinite(seconds) or seconds < 0:
         return "\N{EN DASH}"
     if seconds < 60:
-        return f"{seconds:.1f} s"
+        return f"{seconds:.3g} s"
     minutes, seconds = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours:,} h {minutes} min" if hours else f"{minutes} min {seconds} s"

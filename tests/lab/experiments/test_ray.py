@@ -122,29 +122,28 @@ def test_ctrl_c_stops_the_runs_with_a_checkpoint(nodes, undisturbed, tmp_path):
     assert_equal(undisturbed, models(out))
 
 
-def make_spec(tmp_path, code, **changes):
-    marker = launcher.write_marker(tmp_path)
+def train(tmp_path, code, **changes):
     (tmp_path / "task").write_text(code, encoding="utf-8")
-    paths = (str(tmp_path / name) for name in ("task", "log", "stop"))
-    spec = launcher.Spec(*paths, marker, str(tmp_path), {}, cluster.versions(launcher.PACKAGES))
-    return spec._replace(**changes)
+    settings = {name: tmp_path / name for name in ("task", "log", "stop")} | {"folder": tmp_path, "environ": {}}
+    settings |= {"marker": launcher.write_marker(tmp_path), "versions": cluster.versions(launcher.PACKAGES)}
+    return launcher.train(**{**settings, **changes})
 
 
 def test_a_node_trains_in_the_folder_until_it_is_asked_to_stop(tmp_path, monkeypatch):
     monkeypatch.setattr(process, "program", lambda task: [sys.executable, str(task)])
     monkeypatch.setattr(launcher, "POLL", 0.01)
-    assert launcher.train(make_spec(tmp_path, "print('trained')")) == 0
+    assert train(tmp_path, "print('trained')") == 0
     assert (tmp_path / "log").read_text(encoding="utf-8") == "trained\n"
     waits = "import sys; sys.stdin.read(); sys.exit(143)"
     (tmp_path / "stop").touch()
-    assert launcher.train(make_spec(tmp_path, waits)) == 143
+    assert train(tmp_path, waits) == 143
 
 
 def test_a_node_that_has_other_versions_or_another_folder_is_refused(tmp_path):
     with pytest.raises(ClusterError, match=r"the node .* has jax .* and not 0\.0\.1"):
-        launcher.train(make_spec(tmp_path, "", versions={**cluster.versions(launcher.PACKAGES), "jax": "0.0.1"}))
+        train(tmp_path, "", versions={**cluster.versions(launcher.PACKAGES), "jax": "0.0.1"})
     with pytest.raises(ClusterError, match="does not see"):
-        launcher.train(make_spec(tmp_path, "", marker=str(tmp_path / "a" / "none")))
+        train(tmp_path, "", marker=str(tmp_path / "a" / "none"))
 
 
 def test_a_node_does_not_import_jax():

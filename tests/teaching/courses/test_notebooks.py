@@ -10,6 +10,7 @@ import pytest
 from rejeu.lab.cli import main
 from rejeu.teaching import courses
 from rejeu.teaching.courses import notebooks
+from tests.teaching.courses.solutions import text_of
 
 SOURCE = """\
 <!-- #region lang="en" -->
@@ -104,7 +105,7 @@ def shape(code):
 @pytest.mark.parametrize("source", courses.sources(), ids=lambda source: source.name)
 def test_the_code_of_a_solution_has_no_unknown_or_unused_names(source, tmp_path):
     for language in courses.LANGUAGES:
-        made = courses.text(source.read_text(encoding="utf-8"), language, "solution")
+        made = text_of(source, language)
         (tmp_path / f"{language}.py").write_text(made, encoding="utf-8")
     command = [sys.executable, "-m", "ruff", "check", "--isolated", "--select", "F,E9,B", "--ignore", "F401,F811,B018"]
     done = subprocess.run([*command, tmp_path], capture_output=True, text=True, check=False)

@@ -9,6 +9,7 @@ import pytest
 from rejeu.lab.cli import main
 from rejeu.teaching import courses
 from rejeu.teaching.courses import grading, notebooks
+from tests.teaching.courses.solutions import text_of
 from tests.tiers import only
 
 SOURCES = courses.sources()
@@ -29,7 +30,7 @@ def without_display():
 @pytest.mark.exhaustive
 @EACH
 def test_a_solution_runs_in_full_and_passes_all_its_checks(source, tmp_path):
-    (tmp_path / "notebook.py").write_text(courses.text(source.read_text("utf-8"), "en", "solution"), encoding="utf-8")
+    (tmp_path / "notebook.py").write_text(text_of(source, "en"), encoding="utf-8")
     environ = without_display() | {"MPLBACKEND": "agg", "PYTHONIOENCODING": "utf-8"}
     command = [sys.executable, "notebook.py"]
     done = subprocess.run(command, cwd=tmp_path, env=environ, capture_output=True, encoding="utf-8", timeout=1800)

@@ -27,6 +27,9 @@ from rejeu.lab.runs.output import Stopwatch, echo
 from rejeu.lab.runs.session import Session
 from rejeu.logs.formatting import counted
 
+OF_TRAIN = ("hyperparameters", "evaluate_episodes", "device", "seed", "out", "no_report", "no_video")
+"""Options that are those of ``rejeu train``."""
+
 
 def run_clone(arguments: Clone) -> tuple[int, JsonObject]:
     """Clones and evaluates; the exit status is that of ``rejeu train``."""
@@ -39,13 +42,7 @@ def run_clone(arguments: Clone) -> tuple[int, JsonObject]:
         wrappers=environment.run.wrappers,
         imports=environment.run.imports,
         algorithm=arguments.algo,
-        hyperparameters=arguments.hyperparameters,
-        evaluate_episodes=arguments.evaluate_episodes,
-        device=arguments.device,
-        seed=arguments.seed,
-        out=arguments.out,
-        no_report=arguments.no_report,
-        no_video=arguments.no_video,
+        **{name: getattr(arguments, name) for name in OF_TRAIN},
     )
     with ExitStack() as stack:
         session, stop = begin(task, stack, write_report), stack.enter_context(Interrupt())

@@ -21,7 +21,7 @@ from rejeu.agents import AGENTS, find_agent, find_preset
 from rejeu.checkpoints.agent_state import Identity
 from rejeu.core import devices, spaces
 from rejeu.core.errors import one_line
-from rejeu.core.records import MAX_DEPTH, Seed, convert, is_deep, shown
+from rejeu.core.records import MAX_DEPTH, Seed, convert, is_deep, read_bytes, shown
 from rejeu.core.validation import as_path, check_names, choice, field_names
 from rejeu.envs.make import BACKENDS, make_vector
 from rejeu.envs.registry import are_plain, is_plain_id, maker, register
@@ -119,10 +119,8 @@ def read_plan(plan: str | Path | Mapping[str, Any]) -> tuple[Plan, str | None]:
     if not path.is_file():
         raise FileNotFoundError(f"there is no plan {path}")
     with at(path):
-        if path.stat().st_size > MAX_BYTES:
-            raise ValueError(f"it has more than {MAX_BYTES:,} bytes, the most of a plan")
         try:
-            text = path.read_bytes().decode("utf-8-sig").replace("\r\n", "\n")
+            text = read_bytes(path, MAX_BYTES).decode("utf-8-sig").replace("\r\n", "\n")
             if any(line.count(".") > MAX_DOTS for line in text.split("\n")):
                 raise ValueError(f"it has a line of more than {MAX_DOTS:,} dots")
             content = tomllib.loads(text)

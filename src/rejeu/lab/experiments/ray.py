@@ -15,7 +15,7 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 from rejeu.core import atomic, hardware
 from rejeu.core.errors import ClusterError
@@ -44,42 +44,33 @@ PACKAGES = ("jax", "jaxlib", "optax")
 """Further packages whose versions results depend on."""
 
 
-class Spec(NamedTuple):
-    """A run as a node trains it. Paths are strings, which are the same on all machines."""
-
-    task: str
-    """File with what the process is asked to do."""
-    log: str
-    stop: str
-    """File that asks the run to stop."""
-    marker: str
-    """File that a node sees if it shares the folder of the sweep; no other file has its name."""
-    folder: str
-    """Current folder."""
-    environ: dict[str, str]
-    """Further environment variables."""
-    versions: dict[str, str]
-    """Versions that the node must have."""
-
-
 def look(marker: str) -> tuple[dict[str, str], bool]:
     """Returns the versions of this node, and whether it sees the folder of the sweep."""
     return cluster.versions(PACKAGES), Path(marker).is_file()
 
 
-def train(spec: Spec) -> int:
+def train(
+    task: Path, log: Path, stop: Path, marker: str, folder: Path, environ: dict[str, str], versions: dict[str, str]
+) -> int:
     """Trains on this node until the process ends, and returns its exit status. A Ray task.
 
     The process stops with a checkpoint when it is asked to, and when this function is left by an error.
+
+    Args:
+        task: file with what the process is asked to do. Paths are the same on all machines.
+        log: what the process prints.
+        stop: file that asks the run to stop.
+        marker: file that a node sees if it shares the folder of the sweep; no other file has its name.
+        folder: current folder.
+        environ: further environment variables.
+        versions: versions that the node must have.
 
     Raises:
         ClusterError: if this node has other versions, or does not see the folder of the sweep.
     """
     where = f"the node {platform.node()}"
-    check_node(*look(spec.marker), where, spec.versions, spec.marker)
-    folder, stop = Path(spec.folder), Path(spec.stop)
-    environ = {**os.environ, **spec.environ}
-    process = Process(Path(spec.task), Path(spec.log), environ, folder if folder.is_dir() else None)
+    check_node(*look(marker), where, versions, marker)
+    process = Process(task, log, {**os.environ, **environ}, folder if folder.is_dir() else None)
     kill_at = math.inf
     try:
         while (status := process.poll()) is None:
@@ -195,16 +186,9 @@ class RayLauncher:
         write_task(task, replace(description, folder=str(Path(description.folder).resolve())))
         stop = task.with_suffix(".stop")
         stop.unlink(missing_ok=True)
-        spec = Spec(
-            task=str(task.resolve()),
-            log=str(log.resolve()),
-            stop=str(stop.resolve()),
-            marker=self._marker,
-            folder=os.getcwd(),
-            environ=self._environ,
-            versions=self._versions,
-        )
-        self._handles.append(RayRun(self._ray, self._task.remote(spec), log, stop))
+        files = task.resolve(), log.resolve(), stop.resolve(), self._marker, Path.cwd()
+        result = self._task.remote(*files, self._environ, self._versions)
+        self._handles.append(RayRun(self._ray, result, log, stop))
         return self._handles[-1]
 
     def close(self) -> None:

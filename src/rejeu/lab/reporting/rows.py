@@ -306,9 +306,7 @@ def best_text(row: Row) -> str:
 def rate_text(row: Row) -> str:
     """Returns the steps a second, and the time that is left."""
     rate, seconds = row.steps_per_second, row.seconds_left
-    remaining = ""
-    if seconds is not None and math.isfinite(seconds):
-        remaining = f", {duration(seconds) if seconds >= 60 else f'{seconds:.0f} s'} left"
+    remaining = "" if seconds is None or not math.isfinite(seconds) else f", {duration(round(seconds))} left"
     return f"{rate:,.0f}/s{remaining}" if math.isfinite(rate) else "-"
 
 

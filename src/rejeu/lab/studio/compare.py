@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple
 
 from fastapi import Request
 from nicegui import ui
@@ -157,17 +156,9 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> ui.table:
     return shown.classes("w-full").props("flat bordered dense")
 
 
-class Cell(NamedTuple):
-    """The probability that one group is better than another."""
-
-    text: str
-    color: str = ""
-    more: str = ""
-
-
-def matrix(labels: Sequence[str], pairs: Iterable[Improvement]) -> list[list[Cell]]:
-    """Returns for each group in the order of the labels its cells against each of them."""
-    cells: dict[tuple[str, str], Cell] = {}
+def matrix(labels: Sequence[str], pairs: Iterable[Improvement]) -> list[list[dict[str, str]]]:
+    """Returns for each group in the order of the labels its cells against each of them: ``text``, ``color`` and ``more``."""
+    cells: dict[tuple[str, str], dict[str, str]] = {}
     for pair in pairs:
         for first, second, share in (
             (pair.label, pair.other, pair.probability),
@@ -177,14 +168,14 @@ def matrix(labels: Sequence[str], pairs: Iterable[Improvement]) -> list[list[Cel
                 f"color-mix(in srgb, var(--{'good' if share >= 0.5 else 'bad'}) {abs(share - 0.5):.0%}, transparent)"
             )
             better, worse, _, text = pair.cells
-            cells[first, second] = Cell(f"{share:.0%}", color, f"{better} > {worse}: {text}")
-    return [[cells.get((first, second), Cell("")) for second in labels] for first in labels]
+            cells[first, second] = {"text": f"{share:.0%}", "color": color, "more": f"{better} > {worse}: {text}"}
+    return [[cells.get((first, second), {}) for second in labels] for first in labels]
 
 
-def show_matrix(labels: Sequence[str], rows: Sequence[Sequence[Cell]]) -> None:
+def show_matrix(labels: Sequence[str], rows: Sequence[Sequence[dict[str, str]]]) -> None:
     """Shows the pairs of groups."""
     shown = table(["group", *labels], [[label] for label in labels])
     for cells, row in zip(shown.rows, rows, strict=True):
-        cells |= {str(i + 1): cell._asdict() for i, cell in enumerate(row)}
+        cells |= {str(i + 1): cell for i, cell in enumerate(row)}
     for i in range(len(labels)):
         shown.add_slot(f"body-cell-{i + 1}", MATRIX)

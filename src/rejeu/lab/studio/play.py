@@ -11,7 +11,7 @@ from nicegui import ui
 
 from rejeu.agents import presets
 from rejeu.lab.studio.games import HostedGame, asked_game
-from rejeu.lab.studio.layout import address, follow
+from rejeu.lab.studio.layout import address, follow, is_number
 from rejeu.lab.studio.screen import CSS, Screen
 from rejeu.lab.studio.speech import say
 from rejeu.lab.studio.state import Studio
@@ -57,9 +57,9 @@ def build(studio: Studio, request: Request) -> None:
         agents.props(f"use-chips max-values={MOST_AGENTS}")
         by_hand = ui.switch(say("I play"), value="watch" not in asked)
         record = ui.switch(say("record")).bind_enabled_from(by_hand, "value")
-        number = ui.number(
-            say("seed"), value=int(seed) if seed.isdecimal() and len(seed) < 16 else None, min=0, precision=0
-        ).classes("w-20")
+        number = ui.number(say("seed"), value=int(seed) if is_number(seed) else None, min=0, precision=0).classes(
+            "w-20"
+        )
         start = ui.button(say("Start"), icon="play_arrow").props("no-caps")
     stage = ui.column().classes("stage w-full")
 

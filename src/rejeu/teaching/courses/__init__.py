@@ -16,11 +16,10 @@ from rejeu.teaching.courses.notebooks import (
     notebook,
     sources,
     steps,
-    text,
     write,
 )
 
-__all__ = ["LANGUAGES", "Language", "Version", "by_hand", "minutes", "notebook", "sources", "steps", "text", "write"]
+__all__ = ["LANGUAGES", "Language", "Version", "by_hand", "minutes", "notebook", "sources", "steps", "write"]
 
 
 def by_hand(

@@ -119,15 +119,6 @@ def jupytext() -> ModuleType:
     return jupytext
 
 
-def text(source: str, language: Language, version: Version) -> str:
-    """Returns a version of a source in one language, as a text notebook (.py) in jupytext's percent format.
-
-    Raises:
-        ValueError: if the source has an invalid mark; the message has the line.
-    """
-    return jupytext().writes(notebook(source, language, version), "py:percent")
-
-
 def notebook(source: str, language: Language, version: Version) -> JsonObject:
     r"""Returns a version of a source in one language, as a notebook of ``nbformat``.
 

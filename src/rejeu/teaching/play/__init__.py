@@ -139,7 +139,7 @@ def opened(
         if by_hand:
             hand_env = make()
             bound = keys_for(id_of(hand_env), hand_env.action_space, keys)
-            players.append(Player("you", hand_env, _hand(bound)))
+            players.append(Player("you", hand_env, lambda obs, held, step: bound.action(held, step)))
         players += [Player(name, make(agent), _policy(agent)) for name, agent in agents.items()]
         first = players[0]
         fps = natural_fps(first.env) if fps is None else fps
@@ -195,10 +195,6 @@ def _check(seed: int | None, fps: float | None, episodes: int | None) -> tuple[i
     if seed is None:
         return int(np.random.default_rng().integers(10_000)), episodes
     return whole("seed", seed, least=0), episodes
-
-
-def _hand(keys: KeyMap) -> Act:
-    return lambda obs, held, step: keys.action(held, step)
 
 
 def _policy(agent: Any) -> Act:
