@@ -356,11 +356,6 @@ class Agent(AnyAgent):
         return self.call.interrupted_by is not None
 
     @property
-    def name(self) -> str:
-        """The algorithm's name."""
-        return self.algorithm.Config.name
-
-    @property
     def policy(self) -> Any:
         """The name of its policy."""
         return self.policy_name
@@ -371,32 +366,11 @@ class Agent(AnyAgent):
         return self.run.env
 
     @property
-    def origin(self) -> tuple[str, Mapping[str, Any]] | None:
-        """Id and keyword arguments of its environments or those it was trained on; None if they were not made from an id."""
-        return self.trained_on if self.run.env is None else self.run.env.made_from
-
-    @property
     def _place(self) -> str:
         """The id of its environments; of a loaded agent, that of the environments it was trained on, if it is known."""
         if self.run.env is not None:
             return self.run.env.env_id
         return "no environment" if self.trained_on is None else f"no environment, trained on {self.trained_on[0]}"
-
-    @property
-    def n_envs(self) -> int:
-        """Number of environments."""
-        return self.run.env.n_envs if self.run.env is not None else 1
-
-    @property
-    def state(self) -> Any:
-        """A copy of the algorithm's state. Waits for pending updates."""
-        finite.settle(self)
-        return self.learner.state(self.run.state)
-
-    @property
-    def num_timesteps(self) -> int:
-        """Environment steps since the last ``learn`` with ``reset_num_timesteps=True`` started."""
-        return self.run.step - self.call.reset_step
 
     @property
     def n_updates(self) -> int:
@@ -407,11 +381,6 @@ class Agent(AnyAgent):
     def seconds(self) -> dict[str, float]:
         """Wall time spent training, in seconds: ``total``, and of it ``env``, ``replay`` and ``update``."""
         return dict(self.run.seconds)
-
-    @property
-    def takes_masks(self) -> bool:
-        """Whether its policy takes masks of the allowed actions."""
-        return self.config.action_masks
 
     def with_masks(self, obs: Observation, masks: AnyArray) -> Any:
         """Returns a batch of observations together with action masks, if the agent takes any; None allows all actions.
@@ -437,18 +406,6 @@ class Agent(AnyAgent):
             return self.obs_leaves, structure
         structure = jax.tree.structure(Masked(jax.tree.unflatten(structure, self.obs_leaves), 0))
         return (*self.obs_leaves, mask_leaf(env.action_space, env.env_id)), structure
-
-    def get_vec_normalize_env(self) -> Any:
-        """Returns the ``VecNormalize`` around the training environments, or None."""
-        env = self.run.env
-        return None if env is None else env.vec_normalize
-
-    def check_spaces(self, vector: Any, source: str) -> None:
-        """Raises ``ValueError`` if environments or a dataset, called ``source``, have other spaces than the agent."""
-        for name in ("observation", "action"):
-            ours, theirs = getattr(self, f"{name}_space"), getattr(vector, f"{name}_space")
-            if not spaces.same(ours, theirs, bounds=name == "action"):
-                raise ValueError(f"{source} has the {name} space {theirs}, and this agent was made for {ours}")
 
     def __repr__(self) -> str:
         return f"<rejeu.{self.name} on {self._place}, {self.run.step} steps, {self.run.n_updates} updates>"

@@ -19,13 +19,14 @@ import gymnasium as gym
 import numpy as np
 
 from rejeu.callbacks.base import Stateful
-from rejeu.core import devices
+from rejeu.core import devices, spaces
 from rejeu.core.failed_writes import FailedWrites
 from rejeu.core.spaces import Leaf
 from rejeu.core.validation import coerce, number, whole, whole_seed
 from rejeu.envs.make import Backend, VectorEnv
 from rejeu.logs.history import History
 from rejeu.logs.logging import Logger
+from rejeu.training import finite
 from rejeu.training.compiled import Stops
 from rejeu.training.learner import Learner, PackedState
 from rejeu.training.run import Episode, Progress, Run, TrainingCall
@@ -206,7 +207,7 @@ class Files:
 
 
 class AnyAgent(Protocol):
-    """An agent, whatever its algorithm: see :class:`rejeu.agents.agent.Agent`."""
+    """An agent, whatever its algorithm, and what follows from its values: see :class:`rejeu.agents.agent.Agent`."""
 
     algorithm: ClassVar[Any]
     config: Any
@@ -241,18 +242,6 @@ class AnyAgent(Protocol):
 
     @classmethod
     def converted(cls, settings: Mapping[str, Any]) -> dict[str, Any]: ...
-    @property
-    def name(self) -> str: ...
-    @property
-    def n_envs(self) -> int: ...
-    @property
-    def state(self) -> Any: ...
-    @property
-    def origin(self) -> tuple[str, Mapping[str, Any]] | None: ...
-    @property
-    def num_timesteps(self) -> int: ...
-    @property
-    def takes_masks(self) -> bool: ...
     def configure(self, config: Any, identity: Identity) -> None: ...
     def set_outputs(self, verbose: int = 0, log: str | Sequence[str] = (), tensorboard_log: Any = None) -> None: ...
     def build(self, observation_space: gym.Space, action_space: gym.Space) -> None: ...
@@ -262,8 +251,49 @@ class AnyAgent(Protocol):
     def abandon_episodes(self) -> None: ...
     def predict(self, observation: Any, *args: Any, **settings: Any) -> tuple[Any, Any]: ...
     def with_masks(self, obs: Any, masks: Any) -> Any: ...
-    def get_vec_normalize_env(self) -> Any: ...
-    def check_spaces(self, vector: Any, source: str) -> None: ...
+
+    @property
+    def name(self) -> str:
+        """The algorithm's name."""
+        return self.algorithm.Config.name
+
+    @property
+    def n_envs(self) -> int:
+        """Number of environments."""
+        return self.run.env.n_envs if self.run.env is not None else 1
+
+    @property
+    def state(self) -> Any:
+        """A copy of the algorithm's state. Waits for pending updates."""
+        finite.settle(self)
+        return self.learner.state(self.run.state)
+
+    @property
+    def origin(self) -> tuple[str, Mapping[str, Any]] | None:
+        """Id and keyword arguments of its environments or those it was trained on; None if they were not made from an id."""
+        return self.identity.trained_on if self.run.env is None else self.run.env.made_from
+
+    @property
+    def num_timesteps(self) -> int:
+        """Environment steps since the last ``learn`` with ``reset_num_timesteps=True`` started."""
+        return self.run.step - self.call.reset_step
+
+    @property
+    def takes_masks(self) -> bool:
+        """Whether its policy takes masks of the allowed actions."""
+        return self.config.action_masks
+
+    def get_vec_normalize_env(self) -> Any:
+        """Returns the ``VecNormalize`` around the training environments, or None."""
+        env = self.run.env
+        return None if env is None else env.vec_normalize
+
+    def check_spaces(self, vector: Any, source: str) -> None:
+        """Raises ``ValueError`` if environments or a dataset, called ``source``, have other spaces than the agent."""
+        for name in ("observation", "action"):
+            ours, theirs = getattr(self, f"{name}_space"), getattr(vector, f"{name}_space")
+            if not spaces.same(ours, theirs, bounds=name == "action"):
+                raise ValueError(f"{source} has the {name} space {theirs}, and this agent was made for {ours}")
 
     @abstractmethod
     def gradient_batch_size(self, n_envs: int) -> int:
