@@ -20,7 +20,7 @@ from rejeu.algorithms.config import OffPolicyConfig, to_json
 from rejeu.callbacks import Checkpoint
 from rejeu.core.algorithm import TD_ERROR, Transition
 from rejeu.core.errors import CheckpointError
-from rejeu.lab.experiments.folder import NOTHING, Plan, open_folder
+from rejeu.lab.experiments.folder import Plan, open_folder
 from rejeu.lab.experiments.plan import PlanError, read_plan
 from rejeu.lab.experiments.sweep import imports_of
 from rejeu.lab.experiments.work import Job
@@ -147,14 +147,14 @@ def test_plans_and_sweeps_import_no_installed_algorithm_that_they_name(site, tmp
     with pytest.raises(PlanError, match=refused):
         read_plan(plan)
     job = Job(name="a", run=RunConfig(env="Pendulum-v1", algorithm="AWAC", seed=0))
-    folder = open_folder(tmp_path / "sweep", Plan(jobs=(job,), threads=1), None, NOTHING)
+    folder = open_folder(tmp_path / "sweep", Plan(jobs=(job,), threads=1), None, RunConfig(env=""))
     with pytest.raises(ValueError, match=refused):
-        imports_of(folder, NOTHING)
+        imports_of(folder, RunConfig(env=""))
     assert "awac" not in sys.modules
     importlib.import_module("awac")  # as --import does
     del rejeu.AGENTS["AWAC"]  # a package that offers an entry point need not register it too
     assert [job.run.algorithm for job in read_plan(plan)[0].jobs] == ["AWAC"]
-    assert imports_of(folder, NOTHING) == ("awac",)
+    assert imports_of(folder, RunConfig(env="")) == ("awac",)
     del sys.modules["awac"]
 
 

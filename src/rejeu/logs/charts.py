@@ -125,15 +125,6 @@ def fit(values: np.ndarray, further: np.ndarray) -> list[float | None] | None:
     return plain(np.array([shown.min() - margin, shown.max() + margin]))
 
 
-def widened(shown: list[float | None] | None, value: float) -> list[float | None] | None:
-    """Returns the range of an axis, with room for a value."""
-    if shown is None or not math.isfinite(value):
-        return shown
-    low, high = (float(end) for end in shown if end is not None)
-    margin = 0.06 * (max(high, value) - low)
-    return [low, max(high, value + margin)]
-
-
 def episode_chart(episodes: Table, evaluations: Table, column: str, window: int | None = None) -> Chart | None:
     """Returns the chart of returns, successes or lengths over training; None without any number.
 

@@ -11,12 +11,15 @@ from rejeu.agents import AGENTS, SAC
 from rejeu.core.errors import CheckpointError
 from rejeu.core.interrupt import Interrupt
 from rejeu.lab.experiments import scheduler
-from rejeu.lab.experiments.folder import NOTHING, Plan, open_folder, read_folder
+from rejeu.lab.experiments.folder import Plan, open_folder, read_folder
 from rejeu.lab.experiments.scheduler import MAX_LOST, Scheduler
 from rejeu.lab.experiments.sweep import imports_of
 from rejeu.lab.experiments.work import Job, Work
 from rejeu.lab.runs.config import RunConfig
 from rejeu.lab.runs.process import hold
+
+NOTHING = RunConfig(env="")
+"""A command line that names nothing to import."""
 
 
 class Handle:
@@ -239,7 +242,7 @@ def test_a_full_disk_at_the_end_of_a_run_is_one_line(tmp_path, monkeypatch):
 def test_a_folder_is_joined_only_with_the_same_plan(tmp_path):
     folder = make_folder(tmp_path)
     assert make_folder(tmp_path).plan == folder.plan
-    joined = open_folder(folder.path, Plan(jobs=folder.jobs, threads=7), None, NOTHING)
+    joined = open_folder(folder.path, Plan(jobs=folder.plan.jobs, threads=7), None, NOTHING)
     assert joined.plan.threads == 1  # fixed when it began
     other = Plan(jobs=make_jobs(4, hyperparameters={"gamma": 0.9}), threads=1)
     with pytest.raises(ValueError, match="is the sweep of another plan: job-0 differs"):
@@ -274,7 +277,7 @@ def test_the_file_of_a_sweep_is_untrusted(tmp_path, key, value, problem):
     (job if key in job else job["run"]).update({key: value})
     path.write_text(json.dumps(content), encoding="utf-8")
     with pytest.raises(CheckpointError) as raised:
-        read_folder(folder.path)
+        read_folder(folder.path, NOTHING)
     assert problem in str(raised.value)
     assert "\n" not in str(raised.value)
 

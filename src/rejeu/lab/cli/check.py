@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from contextlib import closing
 
-import gymnasium as gym
-
 from rejeu.core.types import JsonObject
 from rejeu.lab.cli.commands import Check
 from rejeu.lab.runs import environment
@@ -19,7 +17,8 @@ def run_check(arguments: Check) -> tuple[int, JsonObject]:
 
     with closing(environment.from_arguments(arguments.env, arguments).make()) as env:
         findings = sorted(checker.findings(env))
-        package = None if arguments.all else installed_package(env)
+        module = type(env.unwrapped).__module__
+    package = module.partition(".")[0] if is_installed(module) and not arguments.all else None
     shown = findings if package is None else [finding for finding in findings if finding.level == "error"]
     n_errors, n_hidden = sum(finding.level == "error" for finding in findings), len(findings) - len(shown)
     n_warnings = len(shown) - n_errors
@@ -33,9 +32,3 @@ def run_check(arguments: Check) -> tuple[int, JsonObject]:
     counts = {"errors": n_errors, "warnings": n_warnings, "hidden_warnings": n_hidden}
     listed = [finding._asdict() for finding in shown]
     return int(n_errors > 0), {"env_id": arguments.env, **counts, "findings": listed}
-
-
-def installed_package(env: gym.Env) -> str | None:
-    """Returns the installed package that defines an environment's class, or None for the user's own code."""
-    module = type(env.unwrapped).__module__
-    return module.partition(".")[0] if is_installed(module) else None

@@ -54,7 +54,7 @@ def complete(
 ) -> tuple[int, JsonObject]:
     """Trains what is missing in a folder, compares the runs, and returns the exit status and the result."""
     launcher = make_launcher(folder, workers, ray)
-    echo(f"run folders   {folder.path}, {counted(len(folder.jobs), 'run')}, {launcher.capacity} at once")
+    echo(f"run folders   {folder.path}, {counted(len(folder.plan.jobs), 'run')}, {launcher.capacity} at once")
     typed = dataclasses.replace(typed, imports=imports_of(folder, typed))
     with Interrupt() as stop:
         scheduler = train(folder, launcher, stop, typed.imports, retry)
@@ -65,11 +65,11 @@ def finish(folder: SweepFolder, works: list[Work], typed: RunConfig, stop: Inter
     """Says what has become of the jobs and compares the runs; returns the exit status and the result."""
     result = SweepResult(folder.path, tuple(works))
     states = {outcome.state for outcome in result.outcomes}
-    resume = f"rejeu resume {quoted(folder.path)}{again(folder.jobs, typed)}"
+    resume = f"rejeu resume {quoted(folder.path)}{again(folder.plan.jobs, typed)}"
     echo(f"{counted(len(works), 'run')}: {states_text(result.outcomes)}")
     if "failed" in states:
         echo(f"{resume} tries failed runs again")
-    comparison = summarize(folder.path, "setting" if len({job.setting for job in folder.jobs}) > 1 else None)
+    comparison = summarize(folder.path, "setting" if len({job.setting for job in folder.plan.jobs}) > 1 else None)
     status = 2 if "failed" in states else 1 if states & {"waiting", "stopped"} else 0
     if stop.signal is not None:
         echo(f"stopped by {NAMES[stop.signal]}; {resume} continues")

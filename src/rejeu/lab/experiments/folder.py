@@ -35,8 +35,6 @@ PATIENCE = 60.0
 """Seconds to wait while another process creates the folder."""
 
 P = TypeVar("P")
-NOTHING = RunConfig(env="")
-"""A command line that names nothing to import."""
 
 MAX_JOBS = 10_000
 """Most runs of a sweep."""
@@ -97,14 +95,9 @@ class SweepFolder(NamedTuple):
     path: Path
     plan: Plan
 
-    @property
-    def jobs(self) -> tuple[Job, ...]:
-        """Its jobs, in the order of the plan."""
-        return self.plan.jobs
-
     def works(self, imports: tuple[str, ...] = (), retry: bool = False) -> list[Work]:
         """Returns its jobs as runs that a scheduler trains; ``retry`` tries those again that have failed."""
-        return [Work(self.path, job, imports, retry) for job in self.jobs]
+        return [Work(self.path, job, imports, retry) for job in self.plan.jobs]
 
 
 def is_sweep(path: Path) -> bool:
@@ -139,7 +132,7 @@ def difference(old_plan: Plan, plan: Plan) -> str:
     return f"the sweep of another plan: {differing} differs"
 
 
-def read_folder(path: Path, typed: RunConfig = NOTHING) -> SweepFolder:
+def read_folder(path: Path, typed: RunConfig) -> SweepFolder:
     """Returns the folder of an existing sweep. Its file is untrusted.
 
     Raises:

@@ -141,10 +141,7 @@ class RunningTrial:
 
 def evaluations(training: Work, column: str) -> list[tuple[int, float]]:
     """Returns step and value of each evaluation so far."""
-    try:
-        table = read_table(training.files.evaluations)
-    except OSError:
-        return []
+    table = read_table(training.files.evaluations)
     return list(zip(table.column("step").astype(int).tolist(), table.column(column).tolist(), strict=True))
 
 

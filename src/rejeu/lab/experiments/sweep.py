@@ -36,7 +36,7 @@ def imports_of(folder: SweepFolder, typed: RunConfig) -> tuple[str, ...]:
     Raises:
         ValueError: if the processes of the runs could not find an algorithm.
     """
-    algorithms = {job.run.algorithm: None for job in folder.jobs if job.run.algorithm is not None}
+    algorithms = {job.run.algorithm: None for job in folder.plan.jobs if job.run.algorithm is not None}
     modules = {name: None for algorithm in algorithms for name in modules_of(algorithm, typed.imports)}
     return tuple(modules) or typed.imports
 
@@ -129,7 +129,7 @@ def make_launcher(folder: SweepFolder, workers: int | None, ray: str | None) -> 
         from rejeu.lab.experiments.ray import RayLauncher  # Ray is an extra
 
         return RayLauncher(ray, folder.path / HIDDEN, folder.plan.resources, folder.plan.threads or 1, workers)
-    return LocalLauncher(min(workers or default_workers(), len(folder.jobs)), folder.plan.threads)
+    return LocalLauncher(min(workers or default_workers(), len(folder.plan.jobs)), folder.plan.threads)
 
 
 def sweep(

@@ -69,7 +69,8 @@ def learning_curve(
     if len(rows):
         records = history["step"][rows], history["seconds"][rows] / 60, history["return"][rows]
         shown_charts[0]["series"].insert(1, charts.series("marks", "records", "good", *records))
-        shown_charts[0]["range"] = charts.widened(shown_charts[0]["range"], history.best_return)
+        ends = np.array(shown_charts[0].get("range") or (), np.float64)
+        shown_charts[0]["range"] = charts.fit(ends, np.array([history.best_return]))
 
     figure = drawing.make_figure("drawing a learning curve", height=6.4 if len(shown_charts) > 1 else 4.2)
     panels = figure.subplots(len(shown_charts), sharex=True, squeeze=False, height_ratios=[3, 2][: len(shown_charts)])[

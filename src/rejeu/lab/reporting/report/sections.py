@@ -111,12 +111,12 @@ def build(runs: Sequence[RunSummary], folder: Path | None) -> Parts:
     for i, run in enumerate(runs):
         own_charts, groups = charts_of(run, f"run{i}")
         charts |= own_charts
-        bars = {"episodes": histogram_of(run), "replays": replays_of(run)}
-        keys = {name for name, histogram in bars.items() if histogram is not None}
-        histograms |= {f"run{i}-{name}": bars[name] for name in keys}
+        both = {"episodes": histogram_of(run), "replays": replays_of(run)}
+        bars = {name: histogram for name, histogram in both.items() if histogram is not None}
+        histograms |= {f"run{i}-{name}": histogram for name, histogram in bars.items()}
         clips, notes, spent = collect(run, folder, budget)
         budget -= spent
-        sections.append(describe(run, f"run{i}", groups, clips, notes, keys))
+        sections.append(describe(run, f"run{i}", groups, clips, notes, {*bars}))
     return Parts(sections, {"charts": charts, "histograms": histograms})
 
 
