@@ -47,7 +47,7 @@ NEVER = [("multi", "info", 3), *(pytest.param(kind, "method", 1, marks=exhaustiv
 def test_what_is_forbidden_is_never_done(kind, by, n_envs):
     env = vector(kind, by, n_envs)
     agent = small(env).learn(600)
-    assert sum(one.taken for one in env.envs) == 600
+    assert sum(one.taken for one in env.envs) == agent.num_timesteps >= 600  # whole rollouts
     assert len(agent.history) > 60
     other = vector(kind, by, n_envs)
     for deterministic in (True, False):
