@@ -225,6 +225,23 @@ def test_environment_variables_are_put_back(setting, monkeypatch):
     assert inside in ({"x11"} if setting == "x11" else {None, "dummy"})
 
 
+def test_the_display_is_open_before_a_drawing_imports_highway_env_with_its_first_picture(monkeypatch, tmp_path):
+    (tmp_path / "pygame").mkdir()
+    (tmp_path / "pygame" / "__init__.py").touch()
+    (tmp_path / "pygame" / "display.py").write_text(
+        "import os\ndrivers = []\nget_init = lambda: bool(drivers)\n"
+        "init = lambda: drivers.append(os.environ['SDL_VIDEODRIVER'])\n"
+    )
+    for name in ("pygame", "pygame.display"):  # as before anything has imported it
+        monkeypatch.setitem(sys.modules, name, None)
+        del sys.modules[name]
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    with rendering.display_for_pygame():
+        assert "SDL_VIDEODRIVER" not in os.environ  # else highway-env's viewer stays black
+        assert sys.modules["pygame.display"].drivers == ["dummy"]
+
+
 def test_driver_is_left_alone_where_there_is_a_display(monkeypatch):
     monkeypatch.setenv("DISPLAY", ":0")
     monkeypatch.delenv("SDL_VIDEODRIVER", raising=False)

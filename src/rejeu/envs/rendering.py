@@ -8,7 +8,7 @@ import sys
 import threading
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import MappingProxyType
 from typing import Any
 
@@ -100,17 +100,19 @@ def display_for_pygame() -> Iterator[None]:
     """Lets pygame render without a display, by SDL's ``dummy`` driver; restores the environment variable at the end.
 
     While ``SDL_VIDEODRIVER=dummy`` is set, highway-env renders black frames. Therefore the variable is set only while pygame's
-    display is opened.
+    display is opened, which is done here, since a drawing may import highway-env with its first picture.
     """
     hardware.quiet_sdl()
     name = "SDL_VIDEODRIVER"
     driver = os.environ.get(name, "dummy" if is_headless() else None)
     with environment_variable(name, driver):
-        if driver == "dummy" and "pygame" in sys.modules:
-            display = sys.modules["pygame"].display
-            if not display.get_init():
-                display.init()
-            del os.environ[name]
+        if driver == "dummy":
+            with suppress(ImportError):
+                from pygame import display
+
+                if not display.get_init():
+                    display.init()
+                del os.environ[name]
         yield
 
 
