@@ -153,7 +153,8 @@ class ProgressBar(TrainingCallback):
         shares, seconds_left = [], []
         if self.n_steps is not None:
             shares.append(done / self.n_steps)
-            seconds_left.append(max(self.n_steps - done, 0) / max(rate, 1e-9))
+            mean_rate = (done - self._taken) / max(now - self._began, 1e-9)  # of evaluations and their pauses too
+            seconds_left.append(max(self.n_steps - done, 0) / max(mean_rate, 1e-9))
         if self.seconds is not None:
             spent_seconds = self._spent + now - self._began
             shares.append(spent_seconds / self.seconds)
