@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import tomllib
 from contextvars import ContextVar
 from functools import cache
@@ -15,7 +16,8 @@ Language = Literal["en", "fr"]
 LANGUAGES: tuple[Language, ...] = get_args(Language)
 SETTING = "REJEU_LANGUAGE"
 """Environment variable with the language, English by default; ``speak`` in the notebooks of the courses sets it."""
-
+NUMBER = re.compile(r"(?<![\w.-])[\N{MINUS SIGN}-]?\d+(?:[.,]\d+)*%?(?!\w)|\N{EN DASH}")
+"""A number in a text, or the dash of one that is unknown; not those in names, such as ``CartPole-v1``."""
 
 spoken: ContextVar[Language | None] = ContextVar("spoken", default=None)
 """The language of a thread, where it is not that of all."""
@@ -39,8 +41,13 @@ def french() -> dict[str, str]:
 def said(text: str, *values: object, language: Language | None = None) -> str:
     """Returns a text in a language, by default the chosen one, with values in place of its braces.
 
-    >>> said("step {}", 3, language="fr"), said("a text without a translation", language="fr")
-    ('pas 3', 'a text without a translation')
+    A text without values may have its numbers in it.
+
+    >>> said("step {}", 3, language="fr"), said("step 3", language="fr"), said("without a translation", language="fr")
+    ('pas 3', 'pas 3', 'without a translation')
     """
-    text = french().get(text, text) if chosen(language) == "fr" else text
+    if chosen(language) == "fr":
+        pattern = text if values or text in french() or "{" in text else NUMBER.sub("{}", text)
+        if pattern in french():
+            text, values = french()[pattern], values if pattern == text else (*NUMBER.findall(text),)
     return text.format(*values) if values else text

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import rejeu
+from rejeu.core.language import said
 from rejeu.envs.registry import make_env
 from rejeu.lab.cli import main
 from rejeu.teaching.play import Game, play, watch
@@ -272,7 +273,12 @@ def test_a_lost_episode_is_called_failed_and_scores_are_summed_up_once_there_is_
     player.score, player.success = 2.5, 1.0
     assert message(Game([player], 0), player) == "réussi : 2.5"
     entries = legend(keys_for("LunarLander-v3", gym.spaces.Discrete(4), None))
-    assert [entry.label for entry in entries][:3] == ["gauche", "droite", "moteur principal"]
+    assert [entry.label for entry in entries][:3] == [
+        "left",
+        "right",
+        "main engine",
+    ]  # each page has a language of its own
+    assert [said(entry.label) for entry in entries][:3] == ["gauche", "droite", "moteur principal"]
 
 
 def test_a_rival_plays_the_same_starts_at_the_same_pace():

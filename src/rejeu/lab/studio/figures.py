@@ -13,6 +13,8 @@ from rejeu.lab.reporting.report.page import TEMPLATES
 from rejeu.lab.studio.speech import say
 from rejeu.logs.charts import Chart
 
+TEXTS = ("environment steps", "minutes of training", "return", "episodes", "to")
+"""Texts that the script writes itself."""
 SCRIPTS = ("/plotly.min.js", "/charts.js")
 
 
@@ -49,10 +51,15 @@ class Figure(Element, component="chart.js"):
 
 def in_language(chart: Chart | None) -> Chart | None:
     """Returns a chart with its texts in the language of the page, as far as that has them."""
-    if chart is None or "series" not in chart:
+    if chart is None:
         return chart
     axes: dict[str, str] = {name: say(chart[name]) for name in ("x", "y") if name in chart}
-    return {**chart, **axes, "series": [{**series, "name": say(series["name"])} for series in chart["series"]]}
+    names = {text: say(text) for text in TEXTS}
+    series = [
+        {**entry, "name": say(entry["name"])} | ({"text": [*map(say, entry["text"])]} if "text" in entry else {})
+        for entry in chart.get("series", ())
+    ]
+    return {**chart, **axes, "names": names, **({"series": series} if series else {})}
 
 
 def serve_scripts() -> None:

@@ -204,7 +204,7 @@ def command(texts: Texts, studio: Studio) -> tuple[list[str], Train]:
         ValueError: for a mistake, as the command line says it, or a folder elsewhere.
     """
     if not texts.get("env"):
-        raise ValueError("choose an environment")
+        raise ValueError(say("choose an environment"))
     folder = str(texts.get("out") or dated(texts["env"], texts.get("algorithm")).name[-150:].lstrip("-. "))
     values = {**texts, "out": str(new_folder(studio, folder))}
     words = [word for option in options(Train) for word in words_of(option, values.get(option.field))]

@@ -160,7 +160,7 @@ def show_keys(playing: HostedGame, keys: KeyMap | None) -> dict[ui.button, str]:
                     event_type = "press" if name == "pointerdown" else "release"
                     button.on(name, partial(playing.handle_all, event_type, text.split("+")))
                 keycaps[button] = text
-            ui.label(entry.label).classes("text-caption")
+            ui.label(say(entry.label)).classes("text-caption")
     for key, label in HELP:
         with ui.row().classes(together):
             button = ui.button(key, on_click=partial(playing.handle_all, "press", [key])).props(CHIP).classes("key")

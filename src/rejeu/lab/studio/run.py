@@ -167,7 +167,7 @@ class RunPage:
                         self.map_notes |= {entry.id: ui.label().classes("text-caption quiet")} if is_map else {}
                 if is_map:
                     self.maps[entry.id] = data[entry.id]
-                    self.map_notes[entry.id].text = entry.note
+                    self.map_notes[entry.id].text = say(entry.note)
                 else:
                     self.figures[entry.id].show(data[entry.id], axis=self.axis.value)
         self.show_maps()
@@ -313,14 +313,14 @@ def show_tile(tile: sections.Tile) -> None:
         ui.label(", ".join(texts)).classes("text-caption quiet")
         ui.label(tile.value).classes("text-h6")
         for text in filter(None, (tile.note, tile.more)):
-            ui.label(text).classes("text-caption quiet")
+            ui.label(say(text)).classes("text-caption quiet")
 
 
 def show_settings(section: sections.RunSection) -> None:
     """Shows the settings, first those that differ from the defaults."""
     names = ("name", "value", "default")
     columns = [{"name": name, "label": "", "field": name, "align": "left"} for name in names]
-    changed = [(name, value, f"default {default}") for name, value, default in section.changed]
+    changed = [(name, value, say("default {}", default)) for name, value, default in section.changed]
     usual = [(name, value, "") for name, value in section.settings]
     for title, rows in (("Different from the defaults", changed), ("Run", usual), ("Others", section.unchanged)):
         if rows:
@@ -350,7 +350,7 @@ class Head:
     def show(self, row: Row, section: sections.RunSection | None) -> None:
         """Shows the row of a run, and its section of the report if it could be read. Buttons stay while the state does."""
         self.env.text, self.algorithm.text = row.env or row.name, row.algorithm
-        self.facts.text = " · ".join([row.run, *(() if section is None else section.facts)])
+        self.facts.text = " · ".join([row.run, *(() if section is None else map(say, section.facts))])
         self.remarks.text = " · ".join(
             filter(None, [" ".join(f"#{tag}" for tag in row.remarks.tags), row.remarks.note])
         )

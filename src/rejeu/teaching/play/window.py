@@ -40,7 +40,7 @@ class LegendEntry(NamedTuple):
     keys: list[Keycap]
     """Alternative keys of the action."""
     label: str
-    """Description of the action."""
+    """Description of the action in English."""
 
 
 class Window:
@@ -182,7 +182,11 @@ class Window:
         rows: list[list[tuple[LegendEntry, int]]] = [[]]
         x = MARGIN
         for entry in entries:
-            wide = sum(self._key_width(text) + 4 for text, _ in entry.keys) + self._fonts[20].size(entry.label)[0] + 16
+            wide = (
+                sum(self._key_width(text) + 4 for text, _ in entry.keys)
+                + self._fonts[20].size(said(entry.label))[0]
+                + 16
+            )
             if x + wide > width and rows[-1]:
                 rows.append([])
                 x = MARGIN
@@ -205,7 +209,7 @@ class Window:
                     self.pygame.draw.rect(self.canvas, BLUE if down else LINE, plate, 1, border_radius=4)
                     self._write(text, (x + 6, y + 3), 22, WHITE if down else INK)
                     x += self._key_width(text) + 4
-                self._write(entry.label, (x + 2, y + 4), 20, FAINT)
+                self._write(said(entry.label), (x + 2, y + 4), 20, FAINT)
 
     def _write(self, text: str, corner: tuple[int, int], size: int, color: Color, right: bool = False) -> None:
         drawn = self._fonts[size].render(text, True, color)
@@ -216,7 +220,7 @@ def legend(keys: KeyMap) -> list[LegendEntry]:
     """Returns the entries of the legend in the order of the bindings: all keys of each action, and its description."""
     entries: dict[Action, LegendEntry] = {}
     for binding in keys.bindings:
-        entry = entries.setdefault(binding.action, LegendEntry([], said(binding.label)))
+        entry = entries.setdefault(binding.action, LegendEntry([], binding.label))
         entry.keys.append(("+".join(sorted(binding.keys)), equivalent_keys(binding, keys.bindings)))
     return list(entries.values())
 

@@ -10,6 +10,7 @@ const RejeuCharts = (() => {
   };
   // Plotly shows a few HTML tags in its labels; here all text is plain.
   const plain = (text) => String(text).replace(/&/g, "&amp;").replace(/</g, "&lt;");
+  const named = (chart, text) => chart.names?.[text] ?? text; // in the language of a page of the studio
   const switchedOff = new WeakMap(); // the numbers of the series that the reader switched off, by plot
   const drawn = new WeakMap(); // the chart that was drawn last, by plot
 
@@ -83,7 +84,7 @@ const RejeuCharts = (() => {
     const hidden = switchedOff.get(element);
     const stacked = chart.series.some((series) => series.kind === "area");
     const more = { layout: stacked ? { hovermode: "x unified" } : {} };
-    if (!chart.small) more.x = chart.x ?? (axis === "x" ? "environment steps" : "minutes of training");
+    if (!chart.small) more.x = chart.x ?? named(chart, axis === "x" ? "environment steps" : "minutes of training");
     const last = Math.max(0, ...chart.series.map((series) => series[axis].findLast((x) => x != null) ?? 0));
     more.range = chart.x_range ?? (last > 0 ? [0, last * (stacked ? 1 : 1.02)] : undefined);
     const axes = layout(chart, more);
@@ -166,19 +167,19 @@ const RejeuCharts = (() => {
 
   const digits = (value) => (Number.isInteger(value) ? {} : { maximumSignificantDigits: 6 });
   const short = (value) => (value == null ? "–" : value.toLocaleString("en-US", digits(value)).replace("-", "−"));
-  const rangeOf = (h, i) => `${short(i === 0 ? h.least : h.edges[i])} to ${short(i === h.counts.length - 1 ? h.most : h.edges[i + 1])}`;
+  const rangeOf = (h, i) => `${short(i === 0 ? h.least : h.edges[i])} ${named(h, "to")} ${short(i === h.counts.length - 1 ? h.most : h.edges[i + 1])}`;
 
 
   // Draws a histogram; the bar that is chosen has another color, and a click calls choose with the number of its bar.
   function histogram(element, h, chosen, choose, box) {
     const middles = h.counts.map((_, i) => (h.edges[i] + h.edges[i + 1]) / 2);
     const colors = h.counts.map((_, i) => (i === chosen ? color("accent") : color("dots")));
-    const text = h.counts.map((n, i) => `${n.toLocaleString("en-US")} episodes<br>${rangeOf(h, i)}`);
+    const text = h.counts.map((n, i) => `${n.toLocaleString("en-US")} ${named(h, "episodes")}<br>${rangeOf(h, i)}`);
     const bars = {
       type: "bar", x: middles, y: h.counts, width: h.edges[1] - h.edges[0], hovertext: text, hovertemplate: "%{hovertext}<extra></extra>",
       marker: { color: colors, line: { color: color("card"), width: 1 } },
     };
-    const axes = layout({ y: "episodes" }, { x: "return", layout: { dragmode: false, bargap: 0 } });
+    const axes = layout({ y: named(h, "episodes") }, { x: named(h, "return"), layout: { dragmode: false, bargap: 0 } });
     Object.assign(axes.yaxis, { rangemode: "tozero", exponentformat: "none" });
     const isNew = !element.classList.contains("js-plotly-plot");
     Plotly.react(element, [bars], axes, bare);
