@@ -9,6 +9,7 @@ import pytest
 
 from rejeu.lab.cli import dumps, main
 from rejeu.lab.reporting import rows as module, run_list
+from rejeu.lab.reporting.report import sections
 from rejeu.lab.reporting.rows import COLUMNS, RowReader, cells
 from rejeu.lab.runs.output import noted_in
 from tests.lab.reporting.report.folders import CONFIG, write
@@ -40,6 +41,7 @@ def test_the_rate_is_what_training_measured_last(tmp_path):
     (row,) = RowReader(tmp_path).read()
     assert row.steps_per_second == 70.0
     assert cells(row)["rate"] == "70/s"
+    assert sections.facts(run_list.read(run))[-1] == "70 steps/s"
 
 
 def test_a_run_is_read_again_only_after_it_has_changed(tmp_path, reads):

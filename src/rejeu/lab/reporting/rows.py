@@ -218,15 +218,10 @@ def nothing(path: Path, state: Literal["unread", "damaged"]) -> Row:
 
 def describe(run: RunSummary) -> Row:
     """Returns the row of a run, as plain values."""
-    compiling = run.metrics.column("time/compile_seconds")
-    seconds = run.seconds - (float(compiling[-1]) if len(compiling) and np.isfinite(compiling[-1]) else 0.0)
-    rates = run.metrics.column("time/fps")
-    rates = rates[np.isfinite(rates)]  # without compilation, as training measures it
-    rate = float(rates[-1]) if len(rates) else run.steps / seconds if seconds > 0 else math.nan
-    config = run.config
+    rate, config = run.steps_per_second, run.config
     seconds_left = max(config.steps - run.steps, 0) / rate if config.steps and rate else math.nan
     if config.minutes is not None:
-        seconds_left = max(60 * config.minutes - seconds, 0.0)
+        seconds_left = max(60 * config.minutes - run.stepping_seconds, 0.0)
     returns = run.episodes.column("return")[-WINDOW:]
     means = run.metrics.column("rollout/ep_rew_mean")
     folder = RunFolder(run.path)

@@ -102,6 +102,19 @@ class RunSummary:
     """One line for each thing that was missing or damaged."""
 
     @property
+    def stepping_seconds(self) -> float:
+        """Training time so far without compilation."""
+        compiling = self.metrics.column("time/compile_seconds")
+        return self.seconds - (float(compiling[-1]) if len(compiling) and np.isfinite(compiling[-1]) else 0.0)
+
+    @property
+    def steps_per_second(self) -> float:
+        """Without compilation, as training measured it last; NaN if unknown."""
+        rates = self.metrics.column("time/fps")
+        rates, seconds = rates[np.isfinite(rates)], self.stepping_seconds
+        return float(rates[-1]) if len(rates) else self.steps / seconds if seconds > 0 else math.nan
+
+    @property
     def error(self) -> str:
         """The error that ended the run; empty if there was none, or the run was resumed since."""
         return next((text for text in self.warnings[-1:] if ERROR.match(text)), "")

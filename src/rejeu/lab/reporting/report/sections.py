@@ -253,7 +253,7 @@ def facts(run: RunSummary) -> list[str]:
     texts += [f"seed {config.seed}"] if config.seed is not None else []
     texts += [f"{counted(config.n_envs, 'environment')} at once"] if config.n_envs else []
     texts += [f"{shown(config.backend)} backend"] if config.backend else []
-    texts += [f"{run.steps / run.seconds:,.0f} steps/s"] if run.seconds > 0 else []
+    texts += [f"{run.steps_per_second:,.0f} steps/s"] if math.isfinite(run.steps_per_second) else []
     return texts
 
 
