@@ -36,12 +36,9 @@ def test_the_tests_plan_and_commands_of_a_new_project_are_those_of_its_environme
     assert {job.run.env for job in plan.jobs} == {"tiny_robot/Reach-v0"}
     readme = (project / "README.md").read_text()
     commands = [line.split(maxsplit=1)[1] for line in readme.splitlines() if line.startswith("    rejeu")]
-    assert [parsing.parse(shlex.split(command), COMMANDS, TASKS, "")[0] for command in commands] == [
-        "check",
-        "train",
-        "sweep",
-        "studio",
-    ]
+    parsed = [parsing.parse(shlex.split(command), COMMANDS, TASKS, "") for command in commands]
+    assert [name for name, _ in parsed] == ["check", "train", "sweep", "studio"]
+    assert parsed[-1][1].env == "tiny_robot:tiny_robot/Reach-v0"  # else the studio would not act in it
     metadata = tomllib.loads((project / "pyproject.toml").read_text())
     assert metadata["project"]["name"] == "tiny_robot"
 

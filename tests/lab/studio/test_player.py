@@ -105,7 +105,7 @@ def test_what_cannot_be_shown_is_said_in_one_line(folder, monkeypatch):
     for change, problem in (
         ({"env": "my_env:Walk-v0"}, "no file may name what is imported"),
         ({"env": "NoSuch-v0"}, "NoSuch"),
-        ({"env_argument": "my_env.py"}, "name it again: --env my_env.py"),
+        ({"env_argument": "my_env.py"}, "such as rejeu studio, and name it again: --env my_env.py"),
     ):
         folder.config.write_text(json.dumps({**config, **change}), encoding="utf-8")
         one = LivePlayer(folder.path, RunOptions(), lambda *_: None)

@@ -300,7 +300,8 @@ class RunConfig(EnvironmentOptions):
         options = self.again()
         return CheckpointError(
             f"{where} names an environment that is imported or made with more than numbers, which no file may ask for; "
-            f"if you trust it, name it again:{options if len(options) < 500 else ' --env ENV'}"
+            f"if you trust it, repeat the command, such as rejeu studio, "
+            f"and name it again:{options if len(options) < 500 else ' --env ENV'}"
         )
 
     def environment_words(self, option: bool = False) -> list[str]:
