@@ -154,6 +154,7 @@ def test_a_preset_for_envpool_trains_on_gymnasium_without_it_and_says_so(tmp_pat
     assert train(tmp_path / "run", "--seed", "1") == 0
     said = (
         'backend       gymnasium; EnvPool would be faster (about 770 MB with its assets): pip install "rejeu[envpool]"'
+        ", or train jax/Pendulum-v1"
     )
     assert said in capsys.readouterr().out
     assert json.loads((tmp_path / "run" / "config.json").read_text())["backend"] == "gymnasium"

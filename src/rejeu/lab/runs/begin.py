@@ -84,7 +84,8 @@ def make_env(arguments: Train, environment: Environment, preset: Preset | None, 
 def describe_backend(env: VectorEnv, environment: Environment, preset: Preset | None) -> str:
     """Returns the backend, with a hint if the preset uses EnvPool and that is not installed."""
     is_slower = env.backend == "gymnasium" and environment.is_plain and preset and preset.backend == "envpool"
-    hint = f'; EnvPool would be faster ({ENVPOOL_SIZE}): pip install "rejeu[envpool]"'
+    twin = next((f", or train {name}" for name, env_id in presets.TWINS.items() if env_id == environment.env_id), "")
+    hint = f'; EnvPool would be faster ({ENVPOOL_SIZE}): pip install "rejeu[envpool]"{twin}'
     return env.backend + (hint if is_slower and not is_envpool_installed() else "")
 
 
