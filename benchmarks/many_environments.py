@@ -1,7 +1,7 @@
 """Compares PPO in one program, with 2,048 environments on one core, with Rejax, jaxnasium and rl2xla.
 
     python benchmarks/many_environments.py --rejax-python PATH --jaxnasium-python PATH --rl2xla-python PATH
-    python benchmarks/many_environments.py --cases 64-64 --libraries rejeu rejax --rejax-python PATH --rounds 1 --out /tmp/out.json
+    python benchmarks/many_environments.py --cases 64-64 --libraries rejeu rejax --rejax-python PATH --rounds 1
 
 CartPole of each library, rollouts of 128 steps, four epochs of four minibatches, separate networks of actor and critic with
 tanh, Adam with a constant rate, no evaluations. ``measurements.md`` says what remains different.
@@ -231,7 +231,12 @@ class Process:
     """A library that trains in a process of its own."""
 
     def __init__(self, case: str, library: str, python: str, core: int) -> None:
-        environment = {**os.environ, "JAX_PLATFORMS": "cpu", "JAX_COMPILATION_CACHE_DIR": "", "PYTHONWARNINGS": "ignore"}
+        environment = {
+            **os.environ,
+            "JAX_PLATFORMS": "cpu",
+            "JAX_COMPILATION_CACHE_DIR": "",
+            "PYTHONWARNINGS": "ignore",
+        }
         environment |= dict.fromkeys(("NPROC", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
         environment["PYTHONPATH"] = str(ROOT / "src") if library == "rejeu" else ""
         words = [python, __file__, "--child", json.dumps([case, library, core])]

@@ -13,7 +13,15 @@ import rejeu
 from rejeu.algorithms import ppo
 from rejeu.algorithms.actor_critic.config import ActorCriticConfig
 from rejeu.algorithms.actor_critic.network import ActorCritic, action_kind, is_value
-from rejeu.algorithms.actor_critic.steps import Samples, explained_variance, permuted, shuffled, standardized
+from rejeu.algorithms.actor_critic.steps import (
+    Samples,
+    explained_variance,
+    flat,
+    permuted,
+    samples,
+    shuffled,
+    standardized,
+)
 from rejeu.core.algorithm import Clock, Rollout
 from rejeu.core.prng import nth
 from rejeu.core.spaces import leaves
@@ -123,9 +131,7 @@ def test_the_gradient_of_the_loss_equals_finite_differences_in_float64(name):
     old_value = np.float32(hand.value(obs) + rng.choice([-0.7, -0.2, 0.2, 0.7], n))
     advantage, target = rng.normal(size=(2, n)).astype(np.float32)
     batch = Samples(obs, action, old_log_prob, old_value, advantage, target, np.ones(n, bool))
-    (total, losses), given = jax.jit(jax.value_and_grad(ppo.loss, has_aux=True), static_argnums=2)(
-        network, batch, config, CLOCK
-    )
+    (total, losses), given = jax.jit(ppo.gradient, static_argnums=2)(network, batch, config, CLOCK)
 
     def expected():
         scaled = by_hand.standard(np.float64(advantage))
@@ -137,6 +143,24 @@ def test_the_gradient_of_the_loss_equals_finite_differences_in_float64(name):
         assert float(value) == pytest.approx(vars(expected())[field], rel=1e-4, abs=1e-5), field
     slopes = gradient(hand.everything, lambda: expected().total)
     assert_equal_layers(by_hand.Network(given).everything, slopes, "gradient", atol=1e-5, rtol=1e-4)
+
+
+def test_blocks_of_steps_change_neither_gradient_nor_values(monkeypatch):
+    """Three blocks, the last of which has no step that counts, and the second some."""
+    space = ACTIONS["choice"][0]
+    config = ppo.Config(ent_coef=0.1, clip_range=0.1, policy_kwargs={"net_arch": [4]})
+    network, rng = bold(draw(leaves(OBS_SPACE), action_kind(space), config.policy_kwargs)), np.random.default_rng(0)
+    steps, n = random_rollout(space), N_STEPS * N_ENVS
+    log_prob, value, advantage, target = rng.normal(0.0, 0.1, (4, n)).astype(np.float32)
+    batch = Samples(*map(flat, (steps.obs, steps.action)), log_prob, value, advantage, target, np.arange(n) < n // 2)
+
+    def evaluated():
+        return ppo.gradient(network, batch, config, CLOCK), samples(network, steps, 0.9)
+
+    whole = evaluated()
+    monkeypatch.setattr("rejeu.algorithms.actor_critic.steps.BLOCK", n // 3)
+    for together, by_blocks in zip(*map(jax.tree.leaves, (whole, evaluated())), strict=True):
+        np.testing.assert_allclose(by_blocks, together, rtol=1e-4, atol=1e-6)
 
 
 # Whole updates.

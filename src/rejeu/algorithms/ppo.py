@@ -42,6 +42,7 @@ from rejeu.algorithms.actor_critic.steps import (
     explained_variance,
     initial_state,
     masked_mean,
+    mean_of_blocks,
     minibatches,
     samples,
     standardized,
@@ -129,7 +130,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         order_key = nth(state.key, state.n_rollouts)
         minibatch, n_minibatches = minibatches(data, order_key, config.n_epochs, config.batch_size)
         network, optimizer_state, n_steps, losses = epochs(
-            loss, state.network, state.optimizer, minibatch, n_minibatches, optimizer, config, clock
+            gradient, state.network, state.optimizer, minibatch, n_minibatches, optimizer, config, clock
         )
         state = state.after(network, optimizer_state, n_steps)
         return state, metrics_of(network, n_steps, losses, data.value, data.target, data.valid, config, clock)
@@ -165,7 +166,7 @@ def metrics_of(
 
 
 def epochs(
-    loss: Callable[[PyTree, PyTree, PyTree, Clock], tuple[Array, Losses]],
+    gradient: Callable[[PyTree, PyTree, PyTree, Clock], tuple[tuple[Array, Losses], PyTree]],
     network: PyTree,
     optimizer_state: PyTree,
     minibatch: Callable[[Array], PyTree],
@@ -177,10 +178,10 @@ def epochs(
     """Takes a gradient step on each minibatch, and returns network, optimizer, steps taken and mean losses.
 
     Args:
-        loss: of a network on a minibatch, and its parts.
+        gradient: the loss of a network on a minibatch, its parts, and its gradient.
         network: as it collected the rollout.
         optimizer_state: of ``optimizer``.
-        minibatch: ``minibatch(i)`` returns the i-th of all epochs, as ``loss`` takes it.
+        minibatch: ``minibatch(i)`` returns the i-th of all epochs, as ``gradient`` takes it.
         n_minibatches: of all epochs, ``int32[]``.
         optimizer: without a learning rate.
         config: the hyperparameters.
@@ -195,7 +196,7 @@ def epochs(
         carry: tuple[Array, Array, PyTree, PyTree, Losses],
     ) -> tuple[Array, Array, PyTree, PyTree, Losses]:
         i, stopped, network, optimizer_state, sums = carry
-        (_, losses), gradients = jax.value_and_grad(loss, has_aux=True)(network, minibatch(i), config, clock)
+        (_, losses), gradients = gradient(network, minibatch(i), config, clock)
         after, after_state = clip_and_descend(network, gradients, optimizer_state, optimizer, config, clock.progress)
         if config.target_kl is not None:
             stopped = losses.approx_kl > KL_FACTOR * config.target_kl
@@ -210,21 +211,33 @@ def epochs(
     return network, optimizer_state, i - stopped, jax.tree.map(lambda total: total / jnp.maximum(i, 1), sums)
 
 
-def loss(network: ActorCritic, batch: Samples, config: Config, clock: Clock) -> tuple[Array, Losses]:
-    """Returns the total loss of a minibatch and its parts (see the docstring of this module)."""
-    distribution, value = network.both(batch.obs)
-    return loss_of(distribution, value, batch, config, clock)
+def gradient(
+    network: ActorCritic, batch: Samples, config: Config, clock: Clock
+) -> tuple[tuple[Array, Losses], ActorCritic]:
+    """Returns the total loss of a minibatch, its parts, and its gradient (see the docstring of this module)."""
+
+    def loss(network: ActorCritic, block: Samples) -> tuple[Array, Losses]:
+        return loss_of(*network.both(block.obs), block, config, clock)
+
+    of_block = jax.value_and_grad(loss, has_aux=True)
+    return mean_of_blocks(lambda block: of_block(network, block), scaled(batch, config))
+
+
+def scaled(batch: Samples, config: Config) -> Samples:
+    """Returns a minibatch with its advantages as the loss takes them."""
+    if not config.normalize_advantage:
+        return batch
+    return batch._replace(advantage=standardized(batch.advantage, batch.valid))
 
 
 def loss_of(distribution: Any, value: Array, batch: Samples, config: Config, clock: Clock) -> tuple[Array, Losses]:
-    """Returns the total loss of a minibatch and its parts from the outputs of the network."""
+    """Returns the total loss of :func:`scaled` steps and its parts from the outputs of the network."""
     log_prob = distribution.log_prob(batch.action)
-    advantage = standardized(batch.advantage, batch.valid) if config.normalize_advantage else batch.advantage
     clip = at(config.clip_range, clock.progress)
     # Padding may hold anything: a ratio that overflows there would make the gradient NaN, although it does not count.
     log_ratio = jnp.where(batch.valid, log_prob - batch.log_prob, 0.0)
     ratio = jnp.exp(log_ratio)
-    policy_loss = masked_mean(surrogate(ratio, advantage, clip), batch.valid)
+    policy_loss = masked_mean(surrogate(ratio, batch.advantage, clip), batch.valid)
     if config.clip_range_vf is not None:
         reach = at(config.clip_range_vf, clock.progress)
         value = batch.value + jnp.clip(value - batch.value, -reach, reach)

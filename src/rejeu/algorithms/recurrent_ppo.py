@@ -39,7 +39,7 @@ from rejeu.algorithms.actor_critic.steps import (
     shuffled,
     with_advantages,
 )
-from rejeu.algorithms.ppo import ADAM_EPSILON, Losses, epochs, loss_of
+from rejeu.algorithms.ppo import ADAM_EPSILON, Losses, epochs, loss_of, scaled
 from rejeu.algorithms.search import Choice, SearchSpace
 from rejeu.core.algorithm import Algorithm, Clock, Explorer, Masked, Metrics, PyTree, Rollout, renew, unmasked
 from rejeu.core.prng import nth
@@ -245,7 +245,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
             return sequences._replace(valid=sequences.valid & exists[None]), started[:, index], memory
 
         network, optimizer_state, n_taken, losses = epochs(
-            loss,
+            jax.value_and_grad(loss, has_aux=True),
             state.network,
             state.optimizer,
             minibatch,
@@ -286,4 +286,5 @@ def loss(
     distribution = network.policy(after, flat(unmasked(batch.obs)[1]))
     shape = config.policy_kwargs
     read = jax.lax.stop_gradient(after) if shape.shared_lstm and not shape.share_layers else after
-    return loss_of(distribution, network.value(read), flat(batch._replace(obs=())), config, clock)
+    steps = scaled(flat(batch._replace(obs=())), config)
+    return loss_of(distribution, network.value(read), steps, config, clock)

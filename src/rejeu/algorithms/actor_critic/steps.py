@@ -14,6 +14,7 @@ from jax import Array
 from rejeu.algorithms.actor_critic.config import OnPolicyConfig
 from rejeu.algorithms.actor_critic.gae import advantages
 from rejeu.algorithms.actor_critic.network import ActorCritic, Distribution, is_value
+from rejeu.core import xla
 from rejeu.core.algorithm import PyTree, Rollout, Scalar, clip, descend
 from rejeu.core.distributions import is_squashed
 from rejeu.core.schedules import at
@@ -21,6 +22,9 @@ from rejeu.core.schedules import at
 D = TypeVar("D")
 MOST_SORTED = 2**14
 """Steps of a rollout up to which they are sorted by random numbers, which leaves these 17 bits or more of a word."""
+BLOCK = 2**11
+"""Steps for which a network is evaluated at once on a CPU, if there are more. Its hidden layers then stay in the cache: with
+minibatches of 65,536 steps, a gradient takes 0.6 of the time with layers of 256 units, and 0.4 with 64."""
 N_ROUNDS = 8
 """Rounds of the network that permutes more steps, four for each half of a number."""
 
@@ -79,12 +83,42 @@ def samples(network: ActorCritic, rollout: Rollout, gae_lambda: float) -> Sample
     Values and log-probabilities are computed here, in one pass over all steps, rather than when acting: the network is
     still the one that chose the actions.
     """
+
+    def evaluate(block: tuple[PyTree, PyTree, Array]) -> tuple[Array, Array, Array]:
+        obs, next_obs, action = block
+        distribution, value = network.both(obs)
+        return distribution.log_prob(action), value, network.value(next_obs)
+
     shape = rollout.reward.shape
-    distribution, value = network.both(flat(rollout.obs))
-    next_value = network.value(flat(rollout.next_obs))
-    log_prob = distribution.log_prob(flat(rollout.action))
+    steps = blocks(flat((rollout.obs, rollout.next_obs, rollout.action)))
+    log_prob, value, next_value = jax.lax.map(evaluate, steps)
     evaluated = [x.reshape(shape) for x in (log_prob, value, next_value)]
     return flat(with_advantages(rollout, gae_lambda, *evaluated))
+
+
+def blocks(steps: PyTree) -> PyTree:
+    """Returns leaves ``(n, ...)`` as equal blocks ``(n_blocks, size, ...)``.
+
+    Their size is the largest divisor of ``n`` from half of ``BLOCK`` to ``BLOCK``. If there is none, and on a GPU, all steps
+    are a single block.
+    """
+    n = len(jax.tree.leaves(steps)[0])
+    sizes = [size for size in range(BLOCK, BLOCK // 2 - 1, -1) if n % size == 0 and xla.platform() == "cpu"]
+    return jax.tree.map(lambda x: x.reshape(-1, (sizes or [n])[0], *x.shape[1:]), steps)
+
+
+def mean_of_blocks(function: Callable[[Samples], PyTree], steps: Samples) -> PyTree:
+    """Returns the means over valid steps that ``function`` gives, as those of all blocks weighted by their valid steps."""
+    n_valid, split = jnp.maximum(jnp.sum(steps.valid), 1), blocks(steps)
+    if len(split.valid) == 1:
+        return function(steps)
+
+    def add(sums: PyTree, block: Samples) -> tuple[PyTree, None]:
+        share = jnp.sum(block.valid) / n_valid
+        return jax.tree.map(lambda total, mean: total + share * mean, sums, function(block)), None
+
+    shapes = jax.eval_shape(function, jax.tree.map(lambda x: x[0], split))
+    return jax.lax.scan(add, jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes), split)[0]
 
 
 def with_advantages(rollout: Rollout, gae_lambda: float, log_prob: Array, value: Array, next_value: Array) -> Samples:
