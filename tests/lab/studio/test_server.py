@@ -25,6 +25,7 @@ from rejeu.lab.studio import server
 from rejeu.lab.studio.guard import Guard
 from rejeu.lab.studio.layout import address
 from tests.lab.studio.conftest import Served, opened, serving
+from tests.tiers import exhaustive
 
 
 @pytest.fixture(scope="module")
@@ -122,6 +123,20 @@ def test_it_listens_on_this_computer_only_and_takes_the_next_port(tmp_path, serv
         socket.create_connection(("127.0.0.2", port), timeout=1).close()  # this computer too, by another address
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows frees a port at once")
+def test_the_port_is_taken_again_though_its_connections_linger():
+    """A tunnel and the tabs of the browser lead to the same port, also after a studio that has just ended."""
+    with server.bound(0) as listener:
+        port = listener.getsockname()[1]
+        with socket.create_connection((server.HOST, port)) as client:
+            listener.accept()[0].close()  # the side that closes first waits
+            client.recv(1)
+    with server.bound(port) as listener:
+        assert listener.getsockname()[1] == port
+        with server.bound(port) as following:
+            assert following.getsockname()[1] != port
+
+
 def test_without_the_extra_there_is_one_line(tmp_path):
     (tmp_path / "nicegui.py").write_text("raise ModuleNotFoundError", encoding="utf-8")
     path = os.pathsep.join([str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])])
@@ -149,6 +164,22 @@ def test_an_empty_folder_says_so_and_leads_to_a_new_run(browser, served):
         assert not page.locator("table").is_visible()
         page.locator(".page").get_by_role("link", name="Another environment").click()
         page.wait_for_url("**/new")
+
+
+@exhaustive
+@pytest.mark.parametrize(
+    ("language", "words"), [("en", "open the address that it prints"), ("fr", "l'adresse qu'il affiche")]
+)
+def test_a_page_whose_studio_has_ended_says_where_to_go(browser, tmp_path, language, words):
+    served = Served(tmp_path)
+    try:
+        with opened(browser, served, f"/?language={language}") as page:
+            served.end(kill=True)
+            page.wait_for_selector("#popup[aria-hidden=false]")
+            assert words in page.evaluate("getComputedStyle(document.querySelector('#popup'), '::after').content")
+            page.messages.clear()  # connections that were refused
+    finally:
+        served.process.kill()
 
 
 def test_ctrl_c_ends_it(tmp_path):

@@ -28,8 +28,8 @@ EVERY = 1.0
 """Seconds between two looks whether what a page shows has changed."""
 MODES = {None: "brightness_auto", False: "light_mode", True: "dark_mode"}
 """Symbols of the colors of a page: those of the system, light and dark."""
-
-
+LOST = "If the studio has ended, start it again and open the address that it prints."
+"""What a page adds when its connection is lost: a studio that was started again has another token."""
 COOKIE = "rejeu_language"
 """Cookie of the browser with the language of the pages."""
 
@@ -53,6 +53,9 @@ def frame(request: Request, title: str, path: str, links: Sequence[tuple[str, st
     )
     figures.add_scripts()
     ui.add_css(HERE / "layout.css")
+    ui.add_css(
+        f'#popup::after {{ content: "{say(LOST)}"; max-width: 20rem; }}'
+    )  # NiceGUI's message of a lost connection
     ui.colors(primary="#2f6db5", positive="#1b7a43")
     dark = ui.dark_mode(None)
     with ui.header().classes("header items-center gap-1 no-wrap"):

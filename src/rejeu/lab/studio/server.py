@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import secrets
 import socket
+import sys
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from typing import NamedTuple
@@ -111,6 +112,8 @@ def bound(port: int) -> socket.socket:
     """
     for number in range(port, min(port + PORTS, 65536)):
         listener = socket.socket()
+        if sys.platform != "win32":  # connections of a studio that has just ended do not hold the port
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             listener.bind((HOST, number))
             listener.listen()
