@@ -1,6 +1,13 @@
 """The comparison of runs that were chosen in the table of runs, in headless Chromium."""
 
-from rejeu.lab.studio.compare import MOST_DRAWN
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+from fastapi import Request
+
+from rejeu.lab.reporting.rows import nothing
+from rejeu.lab.studio.compare import MOST_DRAWN, choice_of, compared
 from tests.lab.reporting.test_comparison import write_run
 from tests.lab.studio.conftest import HOSTILE, check_widths, opened, serving
 from tests.tiers import exhaustive
@@ -39,6 +46,24 @@ def test_rows_that_are_chosen_are_compared_in_groups(browser, common):
 def test_what_cannot_be_compared_is_one_line(browser, common):
     with opened(browser, common, "/compare?run=no-such-run") as page:
         page.wait_for_selector("text=there is nothing to compare")
+
+
+def test_a_folder_in_the_address_stands_for_its_runs_and_names_of_no_run_get_a_note(tmp_path):
+    for name in ("sweep/a", "sweep/b", "sweep2"):
+        write_run(tmp_path / name)
+    states = {"sweep/a": "finished", "sweep/b": "finished", "sweep2": "finished", "away": "gone"}
+    rows = [
+        replace(nothing(tmp_path / name, "unread"), run=name, path=tmp_path / name, state=state)
+        for name, state in states.items()
+    ]
+    studio = SimpleNamespace(rows=rows)
+    scope = {"type": "http", "path": "/", "headers": [(b"host", b"localhost")], "query_string": b""}
+    choice = choice_of(Request(scope))
+    comparison = compared(studio, ["sweep", "renamed", "away"], choice)
+    assert [run.name for run in comparison.groups[0].runs] == ["a", "b"]
+    assert comparison.notes[0] == "not compared, since renamed, moved or deleted: renamed, away"
+    with pytest.raises(ValueError, match="nothing to compare; not compared, since renamed, moved or deleted: renamed"):
+        compared(studio, ["renamed"], choice)
 
 
 @exhaustive

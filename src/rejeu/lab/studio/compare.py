@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 from fastapi import Request
 from nicegui import ui
 
 from rejeu.core.errors import expected_errors, one_line
+from rejeu.core.records import shown
 from rejeu.core.types import JsonObject
 from rejeu.lab.reporting.comparison import MAX_LISTED, Comparison, Improvement, compare
 from rejeu.lab.reporting.rows import Row
@@ -60,7 +62,7 @@ def build(studio: Studio, request: Request) -> None:
 
     async def look() -> None:
         nonlocal previous
-        rows = selected(studio, runs)
+        rows = selected(studio, runs)[0]
         state = [(row.run, row.changed) for row in rows], {**choice.values}
         if state == previous or not (studio.version or runs):
             return
@@ -69,7 +71,7 @@ def build(studio: Studio, request: Request) -> None:
             link.props["href"] = choice.address(f"/save/comparison/{ending}")
         status.text = say("comparing {} runs ...", len(rows))
         try:
-            comparison = await asyncio.to_thread(compare, [row.path for row in rows], **arguments_of(choice))
+            comparison = await asyncio.to_thread(compared, studio, runs, choice)
         except expected_errors() as error:
             results.clear()
             status.text = one_line(error)
@@ -95,14 +97,31 @@ def choice_of(request: Request) -> Choice:
     return Choice(request, usual, {name: names.__contains__ for name, names in CHOICES.items()}, ["run"])
 
 
-def arguments_of(choice: Choice) -> JsonObject:
-    """Returns the keyword arguments of a comparison."""
-    return {name: text or None for name, text in choice.values.items()}
+def compared(studio: Studio, runs: Sequence[str], choice: Choice) -> Comparison:
+    """Returns the comparison of runs, with a note about names that lead to none.
+
+    Raises:
+        ValueError: if there is nothing to compare.
+        FileNotFoundError: if a run has just disappeared.
+    """
+    rows, missing = selected(studio, runs)
+    names = f"not compared, since renamed, moved or deleted: {shown(', '.join(missing), 200)}"
+    notes = (names,) if missing else ()
+    if missing and not rows:
+        raise ValueError(f"there is nothing to compare; {names}")
+    arguments: JsonObject = {name: text or None for name, text in choice.values.items()}
+    comparison = compare([row.path for row in rows], **arguments)
+    return replace(comparison, notes=notes + comparison.notes)
 
 
-def selected(studio: Studio, runs: Sequence[str]) -> list[Row]:
-    """Returns the rows of runs; without a name those of all that could be read."""
-    return [row for row in studio.rows if row.run in runs or (not runs and row.state not in ("damaged", "gone"))]
+def selected(studio: Studio, runs: Sequence[str]) -> tuple[list[Row], list[str]]:
+    """Returns the rows of runs and of folders of runs, without a name all readable ones; and the names that lead to none."""
+    present = [row for row in studio.rows if row.state != "gone"]
+    if not runs:
+        return [row for row in present if row.state != "damaged"], []
+    members = {name: [row for row in present if row.run == name or row.run.startswith(f"{name}/")] for name in runs}
+    chosen = {row.run for rows in members.values() for row in rows}
+    return [row for row in present if row.run in chosen], [name for name, rows in members.items() if not rows]
 
 
 def show(comparison: Comparison) -> None:

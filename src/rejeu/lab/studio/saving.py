@@ -9,9 +9,9 @@ from nicegui import app
 
 from rejeu.core.errors import expected_errors, one_line
 from rejeu.lab.reporting import run_list
-from rejeu.lab.reporting.comparison import Comparison, compare
+from rejeu.lab.reporting.comparison import Comparison
 from rejeu.lab.reporting.report import render
-from rejeu.lab.studio.compare import arguments_of, choice_of, selected
+from rejeu.lab.studio.compare import choice_of, compared
 from rejeu.lab.studio.state import Studio
 
 FORMATS = {"html": Comparison.to_html, "csv": Comparison.to_csv, "curves.csv": Comparison.curves_csv}
@@ -30,9 +30,8 @@ def add_downloads(studio: Studio) -> None:
     def save_comparison(request: Request, ending: str) -> Response:
         if ending not in FORMATS:
             return Response(status_code=404)
-        rows = selected(studio, request.query_params.getlist("run"))
         try:
-            comparison = compare([row.path for row in rows], **arguments_of(choice_of(request)))
+            comparison = compared(studio, request.query_params.getlist("run"), choice_of(request))
             return attached(FORMATS[ending](comparison), f"comparison.{ending}")
         except expected_errors() as error:
             return Response(one_line(error), 400, media_type="text/plain")
