@@ -2,6 +2,7 @@
 
 import csv
 import io
+import itertools
 import json
 import math
 from dataclasses import replace
@@ -189,9 +190,9 @@ def test_settings_that_differ_between_environments_are_no_groups_by_default(tmp_
 
 
 def test_settings_whose_labels_begin_alike_are_different_groups(tmp_path):
-    for i, last in enumerate((0.1, 0.2)):
+    for i, (last, x) in enumerate(itertools.product((0.1, 0.2), (0, 1))):
         noise = {"noise": "normal", "mean": [0.0] * 100, "sigma": [0.0] * 100 + [last]}
-        write_run(tmp_path / str(i), seed=i, hyperparameters={"action_noise": noise}, env_kwargs={"x": [0] * 90 + [i]})
+        write_run(tmp_path / str(i), seed=i, hyperparameters={"action_noise": noise}, env_kwargs={"x": [0] * 90 + [x]})
     comparison = compare(tmp_path, "setting", samples=10)
     assert len({group.label for group in comparison.groups}) == 2
     assert len({group.env_id for group in comparison.groups}) == 2
@@ -268,6 +269,45 @@ def test_runs_without_episodes_are_left_out(runs):
         compare(folder)
 
 
+def test_where_runs_of_full_length_have_no_episode_no_group_is_called_best(runs):
+    """The runs left have the scores of episodes that ended early, which says nothing about their group."""
+    for i in range(3):
+        (runs / f"PPO_{i}" / "episodes.csv").unlink()
+    comparison = compare(runs, samples=10)
+    assert [len(group.runs) for group in comparison.groups] == [5, 2]
+    assert (comparison.standings, comparison.improvements) == (["", ""], ())
+    assert comparison.notes[:2] == (
+        "3 runs on CartPole-v1 (3 PPO) have no episode yet and are left out: PPO_0, PPO_1, PPO_2",
+        "no group on CartPole-v1 is called best, because runs that trained as long have ended no episode; the score by "
+        "evaluation includes those that were evaluated",
+    )
+
+
+def test_a_run_that_has_just_begun_takes_no_place_from_others(runs):
+    begun = write_run(runs / "begun", seed=9, steps=100)
+    (begun / "episodes.csv").unlink()
+    comparison = compare(runs, samples=10)
+    assert comparison.standings == ["", "best"]
+    assert len(comparison.improvements) == 1
+
+
+def test_score_by_evaluation_includes_runs_of_which_no_training_episode_has_ended(runs):
+    for i in range(3):
+        (runs / f"PPO_{i}" / "episodes.csv").unlink()
+    comparison = compare(runs, score="evaluation", samples=10)
+    np.testing.assert_allclose(comparison.groups[1].scores[0], [21, 22, 23, 24, 25])
+    assert comparison.standings == ["", "best"]
+
+
+def test_labels_name_no_setting_that_only_other_environments_have(tmp_path):
+    for env, gamma in (("A-v0", 0.9), ("B-v0", 0.99)):
+        for rate in (0.1, 0.2):
+            hyperparameters = {"gamma": gamma, "learning_rate": rate}
+            write_run(tmp_path / f"{env}{rate}", env=env, hyperparameters=hyperparameters)
+    labels = [group.label for group in compare(tmp_path, "setting", samples=10).groups]
+    assert labels == 2 * ["DQN, learning_rate=0.1", "DQN, learning_rate=0.2"]
+
+
 @pytest.mark.parametrize("score", ["training", "evaluation"])
 def test_offline_runs_are_compared_by_their_evaluations(tmp_path, score):
     for seed in range(2):
@@ -283,9 +323,9 @@ def test_run_in_progress_is_compared_by_its_means(tmp_path):
     (folder / "metrics.csv").write_text("step,rollout/ep_rew_mean,time/seconds\n500,3,1\n1000,5,2\n", encoding="utf-8")
     comparison = compare(folder, samples=10)
     assert comparison.groups[0].score[0] == 5.0
-    assert (
-        comparison.notes[0]
-        == "1 of 1 runs have no episodes on disk; the logged means of their latest episodes are used"
+    assert comparison.notes[0] == (
+        "1 of 1 runs have no episodes on disk; the logged means of their latest episodes are used, or else their "
+        "evaluations"
     )
 
 

@@ -19,10 +19,12 @@ from rejeu.core.types import JsonObject
 from rejeu.lab.reporting.grouping import (
     FINAL,
     N_POINTS,
+    NO_EPISODE,
     Axis,
     By,
     Curve,
     Score,
+    algorithm_label,
     cut_to_shortest,
     differing_settings,
     group_labels,
@@ -127,6 +129,8 @@ class Comparison:
     threshold: float | None
     notes: tuple[str, ...]
     """Lines about runs that were left out, cut or not comparable."""
+    unranked: frozenset[str] = frozenset()
+    """``env_id`` of the groups of which none is called best, because runs that trained as long have no score."""
 
     @property
     def definition(self) -> str:
@@ -143,7 +147,7 @@ class Comparison:
             peers = [peer.score for peer in self.groups if peer.env_id == group.env_id]
             _, low, _ = max(peers)
             reaching = [score for score in peers if score[2] >= low]
-            is_reaching = len(peers) > 1 and group.score in reaching
+            is_reaching = len(peers) > 1 and group.score in reaching and group.env_id not in self.unranked
             texts.append(("best" if len(reaching) == 1 else "may be best") if is_reaching else "")
         return texts
 
@@ -333,7 +337,7 @@ def compare(
         threshold = validation.number("threshold", threshold)
     samples, seed = validation.whole("samples", samples, 1), validation.whole("seed", seed, 0)
     summaries, notes = read_all(runs)
-    curves = comparable(summaries, x, score, notes)
+    curves, silent = comparable(summaries, x, score, notes)
     by, labels = group_labels([curve.run for curve in curves], by)
     for curve, label in zip(curves, labels, strict=True):
         curve.label = label
@@ -357,28 +361,64 @@ def compare(
         make_group(key, keyed[key], finals, draws[key], threshold, statistics.STATISTICS[statistic], mixes)
         for key in sorted(keyed)
     )
-    pairs = [(first, second) for first, second in itertools.combinations(sorted(keyed), 2) if first[0] == second[0]]
+    unranked = frozenset(env for (env, _), members in keyed.items() if any(curve.env in silent for curve in members))
+    ranked = [key for key in sorted(keyed) if key[0] not in unranked]
+    pairs = [(first, second) for first, second in itertools.combinations(ranked, 2) if first[0] == second[0]]
     improvements = tuple(compared(*pair, finals, draws) for pair in pairs)
     notes += coverage_notes([min(map(len, group.scores)) for group in groups])
-    return Comparison(groups, improvements, by, x, score, statistic, threshold, tuple(notes))
+    return Comparison(groups, improvements, by, x, score, statistic, threshold, tuple(notes), unranked)
 
 
-def comparable(runs: Sequence[RunSummary], axis: Axis, score: Score, notes: list[str]) -> list[Curve]:
+def comparable(runs: Sequence[RunSummary], axis: Axis, score: Score, notes: list[str]) -> tuple[list[Curve], set[str]]:
     """Returns the curves of the runs that can be compared, cut to the same length; notes say which cannot and why.
+
+    Also returns the environments of runs that trained as long, and have no score since none of their episodes has ended. The
+    scores of the other runs are then those of short episodes, and no estimate of their group's.
 
     Raises:
         ValueError: if none can.
     """
-    curves = [Curve.of(run, axis, score) for run in runs]
-    notes += [curve.problem for curve in curves if curve.problem]
-    curves = [curve for curve in curves if not curve.problem]
+    read = [Curve.of(run, axis, score) for run in runs]
+    curves = [curve for curve in read if not curve.problem]
+    notes += omission_notes([curve for curve in read if curve.problem])
     cut_to_shortest(curves, axis, notes)
-    late = [curve for curve in curves if curve.evaluation is not None and curve.evaluation[0][0] > curve.end]
-    notes += [f"{curve.run.name} has no evaluation within what is compared and is left out" for curve in late]
-    curves = [curve for curve in curves if curve not in late]
+    for curve in curves:
+        if curve.evaluation is not None and curve.evaluation[0][0] > curve.end:
+            curve.problem = "no evaluation within what is compared"
+    notes += omission_notes([curve for curve in curves if curve.problem])
+    curves = [curve for curve in curves if not curve.problem]
     if not curves:
         raise ValueError(f"there is nothing to compare; {'; '.join(notes)[:500] or 'no run was given'}")
-    return curves
+    ends = {curve.env: curve.end for curve in curves}
+    silent = {
+        curve.env
+        for curve in read
+        if curve.problem == NO_EPISODE and curve.env in ends and curve.end >= ends[curve.env]
+    }
+    notes += [
+        f"no group on {env or 'the environment'} is called best, because runs that trained as long have ended no episode; "
+        "the score by evaluation includes those that were evaluated"
+        for env in sorted(silent)
+    ]
+    return curves, silent
+
+
+def omission_notes(curves: Sequence[Curve]) -> list[str]:
+    """Returns a note for each problem of runs in an environment, with the number of runs of each algorithm."""
+    members: dict[tuple[str, str], list[RunSummary]] = {}
+    for curve in curves:
+        members.setdefault((curve.problem, curve.env), []).append(curve.run)
+    notes = []
+    for (problem, env), runs in members.items():
+        counts = Counter(map(algorithm_label, runs))
+        algorithms = ", ".join(f"{count} {name}" for name, count in counts.items())
+        names = shown(", ".join(run.name for run in runs), 100)
+        if len(runs) == 1:
+            notes.append(f"{names} has {problem} and is left out")
+        else:
+            environment = env or "the environment"
+            notes.append(f"{len(runs)} runs on {environment} ({algorithms}) have {problem} and are left out: {names}")
+    return notes
 
 
 def warnings_of(curves: Sequence[Curve]) -> list[str]:
@@ -403,7 +443,8 @@ def warnings_of(curves: Sequence[Curve]) -> list[str]:
     means = sum(not (len(curve.run.episodes) or curve.run.config.hyperparameters.get("offline")) for curve in curves)
     if means:
         notes.append(
-            f"{means} of {len(curves)} runs have no episodes on disk; the logged means of their latest episodes are used"
+            f"{means} of {len(curves)} runs have no episodes on disk; the logged means of their latest episodes are used, or "
+            "else their evaluations"
         )
     return notes
 

@@ -43,12 +43,14 @@ def group_labels(runs: Sequence[RunSummary], by: By | None) -> tuple[By, list[st
 
 
 def settings(runs: Sequence[RunSummary]) -> list[str]:
-    """Returns for each run the algorithm, and the settings in which the runs of this algorithm differ."""
+    """Returns for each run the algorithm, and the settings in which runs of this algorithm on one environment differ."""
     written = [*map(settings_of, runs)]
-    members: dict[str, list[dict[str, str]]] = {}
+    members: dict[tuple[str, str], list[dict[str, str]]] = {}
     for run, setting in zip(runs, written, strict=True):
-        members.setdefault(algorithm_label(run), []).append(setting)
-    differing = {algorithm: differing_names(group) for algorithm, group in members.items()}
+        members.setdefault((env_label(run), algorithm_label(run)), []).append(setting)
+    differing: dict[str, dict[str, None]] = {}
+    for (_, algorithm), group in members.items():
+        differing.setdefault(algorithm, {}).update(dict.fromkeys(differing_names(group)))
     labels = []
     for run, setting in zip(runs, written, strict=True):
         algorithm = algorithm_label(run)
@@ -119,6 +121,8 @@ SMOOTHING = 0.05
 """Width of the moving mean of a curve, as a share of what is compared."""
 FINAL = 0.1
 """Share of training, at its end, whose episodes make the final score."""
+NO_EPISODE = "no episode yet"
+"""The problem of a run of which no training episode has ended."""
 
 
 class Curve:
@@ -135,7 +139,7 @@ class Curve:
     @classmethod
     def of(cls, run: RunSummary, axis: Axis, score: Score) -> Curve:
         """Returns the curve of a run, or one with a ``problem``."""
-        name, table = run.name, run.evaluations
+        table = run.evaluations
         when, value = table.column("step" if axis == "steps" else "seconds"), table.column("mean_return")
         good = np.isfinite(when) & (np.abs(value) < HUGE)
         if len(run.episodes):
@@ -147,17 +151,21 @@ class Curve:
             y = run.metrics.column("rollout/ep_rew_mean")
         finite = np.isfinite(x) & (np.abs(y) < HUGE)
         x, y = x[finite], y[finite]
+        if score == "evaluation" and not len(x):
+            x, y = when[good], value[good]
+        whole = run.steps if axis == "steps" else run.seconds
         if not len(x) or x[-1] <= 0:
-            return cls(run, x[:0], y[:0], f"{name} has no episode yet and is left out")
+            curve = cls(run, x[:0], y[:0], NO_EPISODE)
+            curve.end = whole
+            return curve
         if (np.diff(x) < 0).any():  # time that was set back
             order = np.argsort(x, kind="stable")
             x, y = x[order], y[order]
         curve = cls(run, x, y)
-        whole = run.steps if axis == "steps" else run.seconds
         curve.end = max(curve.end, whole if math.isfinite(whole) else 0.0)  # the last episode ends before the run does
         if score == "evaluation":
             if not good.any():
-                return cls(run, x[:0], y[:0], f"{name} has no evaluation and is left out")
+                return cls(run, x[:0], y[:0], "no evaluation")
             curve.evaluation = when[good], value[good]
         return curve
 
