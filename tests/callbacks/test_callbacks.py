@@ -197,7 +197,7 @@ def test_time_left_counts_an_evaluation_once_and_not_for_each_of_the_next_steps(
     ticks = iter([0.0, *range(1, 50), 110.0])  # step 50 comes after an evaluation of a minute
     monkeypatch.setattr("time.perf_counter", lambda: float(next(ticks)))
     text = shown(100, None, range(1, 51), Console(file=io.StringIO(), force_terminal=False, width=200))
-    assert text.splitlines()[-1].split(" · ")[-1] == "1:50 left"
+    assert text.splitlines()[-1].split(" · ")[-1] == "1 min 50 s left"
 
 
 def test_progress_bar_draws_a_bar_on_a_terminal():

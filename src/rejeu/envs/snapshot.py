@@ -26,6 +26,7 @@ import msgspec
 import numpy as np
 from gymnasium import wrappers
 from gymnasium.envs import classic_control
+from gymnasium.envs.registration import EnvSpec
 from msgspec import Meta
 
 from rejeu.core.errors import DivergedError
@@ -76,6 +77,10 @@ REMEMBERED: dict[type, dict[str, Any]] = {
 MUJOCO = "gymnasium.envs.mujoco."
 MOST_OBJECTS, MOST_ITEMS, MOST_NUMBERS = 10_000, 1_000, 2**14
 """Upper limits of a fingerprint: its objects, the last items of each, and the numbers of an array, which is sampled."""
+PLAIN = bool, int, float, str, bytes, np.generic, type(None)
+COLLECTIONS = dict, list, tuple, set, deque
+FIXED = type, types.ModuleType, gym.Space, EnvSpec
+"""Types whose objects no step changes."""
 
 
 def state_of(env: gym.Env) -> list[Any] | None:
@@ -255,15 +260,13 @@ def fingerprint(env: Any) -> int:
     visited, waiting, digest = dict[int, Any](), deque([env]), 0  # seen keeps objects, so that no other gets their id
     while waiting and len(visited) < MOST_OBJECTS:
         value, content = waiting.popleft(), b""
-        if isinstance(value, bool | int | float | str | bytes | np.generic | None):
+        if isinstance(value, PLAIN):
             content = repr(value).encode()
         elif isinstance(value, np.ndarray) and value.dtype.kind != "O":
             content = value.ravel()[:: 1 + value.size // MOST_NUMBERS].tobytes()
-        elif id(value) not in visited and not isinstance(
-            value, type | types.ModuleType | gym.Space
-        ):  # no step changes these
+        elif id(value) not in visited and not isinstance(value, FIXED):
             visited[id(value)], content = value, type(value).__qualname__.encode()
-            items = [len(value), *value] if isinstance(value, dict | list | tuple | set | deque) else []
+            items = [len(value), *value] if isinstance(value, COLLECTIONS) else []
             items += value.values() if isinstance(value, dict) else []
             inside = (
                 value.bit_generator.state if isinstance(value, np.random.Generator) else getattr(value, "__dict__", {})
