@@ -31,6 +31,10 @@ from rejeu.envs.registry import (
 
 NO_LIMIT = 2**31 - 1
 """EnvPool's time limit of environments without one."""
+RACETRACKS = "racetrack", "racetrack-large", "racetrack-oval"
+TRAFFIC = "exit", "intersection", "lane-keeping", "merge", "roundabout", "two-way", "u-turn", *RACETRACKS
+DIFFERENT = frozenset(("CarRacing", "FetchSlide", "FetchSlideDense", *TRAFFIC))
+"""Names of environments of EnvPool 1.2.5 whose first observations are not those of Gymnasium's environment of this name."""
 
 
 class EnvPool(VectorEnv):
@@ -173,20 +177,31 @@ def check_envpool_knows(env_id: str) -> None:
     Raises:
         MissingExtra: if EnvPool is not installed, or its import fails.
         ValueError: if it does not have the environment, or if that has several players, with what to use instead.
+
+    Warns:
+        UserWarning: if it is not the same environment as Gymnasium's.
     """
     if env_id not in import_envpool().list_all_envs():
         missing = f"EnvPool does not have {env_id}; use backend='gymnasium'"
         raise ValueError(missing if register(env_id) else unknown_environment(env_id))
     if (n := import_envpool().make_spec(env_id).config.max_num_players) > 1:
         raise ValueError(f"{env_id} of EnvPool has {n} players, and rejeu trains one; use an environment with one")
+    if env_id.rpartition("-v")[0] in DIFFERENT:
+        warnings.warn(
+            f"{env_id} of EnvPool differs from Gymnasium's, from its first observations on; "
+            "an agent of one may fail in the other; use backend='gymnasium' or 'gymnasium-async' for Gymnasium's",
+            stacklevel=3,
+        )
 
 
 def envpool_knows(env_id: str) -> bool:
     """Returns whether EnvPool can be used for an id.
 
-    It must be installed, and have the environment. False if Gymnasium has only a newer version, or if the goals need a
-    package that is not installed.
+    It must be installed, and have the environment. False if its environment differs from Gymnasium's, if Gymnasium has only
+    a newer version, or if the goals need a package that is not installed.
     """
+    if env_id.rpartition("-v")[0] in DIFFERENT:
+        return False
     if not in_envpool(env_id) or (env_id not in gym.registry and newer_version(env_id) is not None):
         return False
     source = provider(env_id)
