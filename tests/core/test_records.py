@@ -32,6 +32,11 @@ def test_long_integers_and_nesting_within_the_limits_are_read():
     assert float(parse_json("9" * 300)) == 1e300
 
 
+def test_integers_that_no_float_holds_are_refused_by_their_place():
+    with pytest.raises(CheckpointError, match=r"\[0\]=10.*: number out of range"):
+        convert([10**400], list[float])
+
+
 class Inner(msgspec.Struct):
     n_envs: EnvCount
     seeds: list[Seed]
