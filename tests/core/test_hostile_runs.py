@@ -206,7 +206,7 @@ def test_environments_that_were_made_for_a_refused_run_are_closed(tmp_path):
             n_open[0] -= 1
             super().close()
 
-    gym.register("tests/Counted-v0", Counted)
+    gym.register("tests/Counted-v0", lambda: Counted())  # Gymnasium 1.3.0 takes no class of wrappers
     try:
         with shared_learners():
             agent = rejeu.SAC("MlpPolicy", rejeu.make_vector("tests/Counted-v0", 2, "gymnasium"), **OFF)
