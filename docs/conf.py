@@ -71,25 +71,17 @@ class English(SearchEnglish):
 
 
 def contents(index: str) -> str:
-    """Returns the hidden tables of contents of the home page: one for each of its sections with tables of links.
-
-    Pages to which it does not link are added as a last section.
-    """
+    """Returns the hidden tables of contents of the home page, one for each of its sections with lists of links."""
     sections: dict[str, list[str]] = {}
     for part in re.split(r"^## ", index, flags=re.MULTILINE)[1:]:
-        pages = [
-            link
-            for line in part.splitlines()
-            if line.startswith("|")
-            for link in re.findall(r"\]\(([\w/-]+)\.md\)", line)
-        ]
-        if pages:
+        items = [line for line in part.splitlines() if line.startswith("- ")]
+        if pages := re.findall(r"\]\(([\w/-]+)\.md\)", "\n".join(items)):
             sections[part.splitlines()[0]] = pages
     sections["API reference"] = ["api/index"]
-    known = {page for pages in sections.values() for page in pages} | {"index"}
-    found = [path.relative_to(DOCS).with_suffix("").as_posix() for path in sorted(DOCS.rglob("*.md"))]
-    if rest := [page for page in found if page not in known and not page.startswith("_")]:
-        sections["More"] = rest
+    linked = {page for pages in sections.values() for page in pages} | {"index"}
+    paths = [path.relative_to(DOCS).with_suffix("").as_posix() for path in sorted(DOCS.rglob("*.md"))]
+    if missing := [page for page in paths if page not in linked and not page.startswith("_")]:
+        logger.warning("no list of the home page has a link to: %s", ", ".join(missing))
     tables = [
         f"```{{toctree}}\n:hidden:\n:caption: {name}\n\n" + "\n".join(pages) + "\n```\n"
         for name, pages in sections.items()
