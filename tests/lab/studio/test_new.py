@@ -18,11 +18,11 @@ from rejeu.lab.reporting.rows import nothing
 from rejeu.lab.runs.arguments import Train
 from rejeu.lab.runs.config import options
 from rejeu.lab.studio import new, processes
+from rejeu.lab.studio.layout import completed
 from rejeu.lab.studio.new import (
     LEFT_OUT,
     command,
     command_text,
-    completed,
     lead_to,
     new_folder,
     prefilled,
@@ -122,10 +122,10 @@ def test_the_form_shows_the_values_of_the_preset_and_the_command_that_does_the_s
 
 @pytest.mark.parametrize(
     ("typed", "env_id"),
-    [("CartPole", "CartPole-v1"), ("LUNARLANDER-v", "LunarLander-v3"), ("Walk-v0", "Walk-v0"), (None, None)],
+    [("CartPole", "CartPole-v1"), ("LUNARLANDER-v", "LunarLander-v3"), ("Walk-v0", "Walk-v0"), ("", "")],
 )
 def test_the_beginning_of_an_id_is_completed(typed, env_id):
-    assert completed(typed) == env_id
+    assert completed(typed, ["CartPole-v1", "LunarLander-v3"]) == env_id
 
 
 def test_every_option_is_in_the_form_but_those_for_windows_and_programs():

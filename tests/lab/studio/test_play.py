@@ -48,6 +48,15 @@ def test_a_game_is_played_by_keys_recorded_and_read_again(browser, common):
     assert episode.actions.tolist() == [2, 2, 1]  # right, right, down
 
 
+def test_an_environment_that_was_typed_is_played_without_enter(browser, common):
+    with opened(browser, common, "/play") as page:
+        page.get_by_role("combobox", name="environment").click()
+        page.keyboard.type("frozenlake-")
+        page.get_by_role("button", name="Start").click()
+        page.wait_for_selector("text=press a key to begin")
+        assert page.url.endswith("/play?env=FrozenLake-v1")
+
+
 def test_two_agents_are_shown_side_by_side_from_the_same_start(browser, common):
     query = f"agent=anna.safetensors&agent={quote(f'group/{HOSTILE}')}.safetensors&watch=1&seed=3"
     with opened(browser, common, f"/play?{query}") as page:
@@ -105,6 +114,7 @@ def test_an_error_is_one_line_on_the_page(browser, common):
         (("", ("/etc/passwd",), True, None, False), "is not in the folder of the studio"),
         (("Pendulum-v1", ("anna.safetensors",), True, None, False), "plays CartPole-v1, not Pendulum-v1"),
         (("Pendulum-v1", (), False, None, False), "nobody plays"),
+        (("", (), True, None, False), "choose an environment"),
     ],
 )
 def test_an_address_names_no_code_and_no_file_elsewhere(common, wanted, message):

@@ -44,6 +44,8 @@ def asked_game(
         ValueError: if the environment or an agent cannot be used, or nobody plays.
         OSError: if there is no such model.
     """
+    if not env and not names:
+        raise ValueError(said("choose an environment"))
     if not names and not by_hand:
         raise ValueError("nobody plays; choose an agent, or play yourself")
     players = {name: find_agent(studio, name) for name in names}

@@ -103,6 +103,30 @@ def action(text: str, icon: str | None, on_click: Callable[..., object]) -> ui.b
     return ui.button(text, icon=icon, on_click=on_click).props("outline dense no-caps padding='2px 10px'")
 
 
+def env_select(ids: list[str], value: str | None = None) -> ui.select:
+    """Makes a field in which an environment is chosen or typed; what is typed counts without Enter."""
+
+    def take(text: str | None) -> None:
+        env_id = completed(text or "", ids)
+        if env_id and env_id != field.value:
+            field.set_options([*dict.fromkeys((*ids, env_id))], value=env_id)
+
+    field = ui.select(ids, label=say("environment"), value=value, with_input=True, new_value_mode="add-unique")
+    field.on_value_change(lambda event: take(event.value))
+    typed = "(event) => event.relatedTarget?.closest('.q-menu') || emit(event.target.value)"  # not while an option is clicked
+    return field.on("focusout", lambda event: take(event.args), js_handler=typed)
+
+
+def completed(text: str, ids: Sequence[str]) -> str:
+    """Returns an id of an environment that was typed, or the first that begins like it.
+
+    >>> [completed(text, ["CartPole-v1"]) for text in ("cartpole", "CartPole-v1", "my_env.py", "")]
+    ['CartPole-v1', 'CartPole-v1', 'my_env.py', '']
+    """
+    matches = [env_id for env_id in ids if text and env_id.lower().startswith(text.lower())]
+    return text if text in ids else next(iter(matches), text)
+
+
 def add_cells(table: ui.table, file: str) -> None:
     """Gives a table the cells in a file next to this one: Vue's templates, which escape what they are given."""
     text = (HERE / file).read_text(encoding="utf-8")

@@ -15,7 +15,6 @@ from typing import Any, Literal, get_args, get_origin
 
 from fastapi import Request
 from nicegui import ui
-from nicegui.events import ValueChangeEventArguments
 
 from rejeu.agents import AGENTS, presets
 from rejeu.checkpoints.run_folder import dated
@@ -29,7 +28,7 @@ from rejeu.lab.runs.arguments import Train, check_options
 from rejeu.lab.runs.config import Option, Topic, options
 from rejeu.lab.runs.read import MAX_NAME
 from rejeu.lab.studio import processes
-from rejeu.lab.studio.layout import action, address
+from rejeu.lab.studio.layout import action, address, env_select
 from rejeu.lab.studio.speech import say
 from rejeu.lab.studio.state import Studio
 from rejeu.logs.formatting import quoted
@@ -79,10 +78,6 @@ def build(studio: Studio, request: Request) -> None:
             fields[name].props["placeholder"] = text
         equivalent.text = command_text(texts, studio)
 
-    def complete(event: ValueChangeEventArguments) -> None:
-        fields["env"].value = completed(event.value)
-
-    fields["env"].on_value_change(complete)
     for field in fields.values():
         field.on_value_change(show)
     show()
@@ -106,17 +101,6 @@ def prefilled(request: Request) -> str | None:
     """Returns the environment that an address names, which may not be one that is imported."""
     env_id = request.query_params.get("env")
     return env_id if is_plain_id(env_id) else None
-
-
-def completed(text: str | None) -> str | None:
-    """Returns an id of an environment that was typed, or that of a preset which begins like it.
-
-    >>> completed("cartpole"), completed("CartPole-v1"), completed("my_env.py")
-    ('CartPole-v1', 'CartPole-v1', 'my_env.py')
-    """
-    ids = [preset.env_id for preset in presets.every()]
-    matches = [env_id for env_id in ids if text and env_id.lower().startswith(text.lower())]
-    return text if text in ids else next(iter(matches), text)
 
 
 def preset_texts(texts: Texts) -> dict[str, str]:
@@ -145,8 +129,7 @@ def make_field(option: Option, doc: str) -> Any:
     if option.type is bool:
         element: Any = ui.switch(label)
     elif option.field == "env":
-        names = sorted({preset.env_id for preset in presets.every()})
-        element = ui.select(names, label=say("environment"), with_input=True, new_value_mode="add-unique")
+        element = env_select(sorted({preset.env_id for preset in presets.every()}))
     elif option.field == "algorithm":
         element = ui.select(sorted(AGENTS), label=say("algorithm"), with_input=True, clearable=True)
     elif get_origin(option.type) is Literal:

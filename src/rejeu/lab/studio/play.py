@@ -11,7 +11,7 @@ from nicegui import ui
 
 from rejeu.agents import presets
 from rejeu.lab.studio.games import HostedGame, asked_game
-from rejeu.lab.studio.layout import address, follow, is_number
+from rejeu.lab.studio.layout import address, env_select, follow, is_number
 from rejeu.lab.studio.screen import CSS, Screen
 from rejeu.lab.studio.speech import say
 from rejeu.lab.studio.state import Studio
@@ -44,13 +44,7 @@ def build(studio: Studio, request: Request) -> None:
         .classes("w-full") as form,
         ui.row().classes("items-center w-full"),
     ):
-        env = ui.select(
-            environments(studio, env_id),
-            label=say("environment"),
-            value=env_id,
-            with_input=True,
-            new_value_mode="add-unique",
-        ).classes("w-64")
+        env = env_select(environments(studio, env_id), env_id).classes("w-64")
         agents = ui.select(offered(studio, env_id, names), label=say("agents"), value=names, multiple=True).classes(
             "w-64"
         )
