@@ -20,6 +20,9 @@ def test_an_agent_is_stepped_and_a_place_of_the_map_shows_its_episode(browser, c
         dot = goals.locator(".point").first.bounding_box()
         page.mouse.click(dot["x"] + dot["width"] / 2, dot["y"] + dot["height"] / 2)
         page.get_by_text("The best policy acts from the seed").wait_for()
+        page.wait_for_function(
+            "document.querySelector('.screen').getBoundingClientRect().top >= 48"
+        )  # below the header
         page.locator("figcaption", has_text="step 0").wait_for()
         page.get_by_role("button", name="one step").click()
         page.locator("figcaption", has_text="step 1").wait_for()

@@ -449,6 +449,10 @@ class LiveView:
         """Lets a policy act, from a seed or to a goal if one is given."""
         if goal is not None or (model, seed) != (self.player.model, self.player.seed):
             self.player.choose(model, seed, goal)
+            if (seed, goal) != (None, None):  # it was chosen further down the page
+                ui.run_javascript(
+                    f"getHtmlElement({self.screen.id}).scrollIntoView({{behavior: 'smooth', block: 'nearest'}})"
+                )
             self.page.choice.change(policy=model, seed="" if seed is None else str(seed))
             self.name()
 
