@@ -90,6 +90,10 @@ def test_groups_whose_intervals_meet_may_both_be_best_and_settings_that_differ_a
     by_rate = [[run for run in runs if run.config.hyperparameters["learning_rate"] == rate] for rate in (0.1, 0.2, 0.3)]
     assert differing_settings(by_rate) == [["learning_rate", "0.1", "0.2", "0.3"]]
     assert differing_settings([by_rate[0][:1], by_rate[0][1:]]) == [["net.width", "0", "8"]]
+    others = [
+        replace(run, config=replace(run.config, hyperparameters={"n_epochs": 4, "gamma": 0.9})) for run in by_rate[0]
+    ]
+    assert differing_settings([*by_rate[:2], others, others]) == [["learning_rate", "0.1", "0.2", "", ""]]
     by_folder = [replace(run, config=replace(run.config, algorithm=run.name[:3])) for run in runs]
     assert rejeu.compare(by_folder, "algorithm", samples=50).standings == ["may be best", "may be best", ""]
 

@@ -9,7 +9,6 @@ import hashlib
 import itertools
 import json
 import math
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Literal
 
@@ -66,7 +65,7 @@ def settings_of(run: RunSummary) -> dict[str, str]:
 
 
 def differing_settings(groups: Sequence[Sequence[RunSummary]]) -> list[list[str]]:
-    """Returns the settings in which groups of runs differ, that two of them have at least.
+    """Returns the settings in which those groups of runs differ that have them: another algorithm has others.
 
     Each is a row of texts: its name, then its values in each group, empty where there are none.
     """
@@ -76,9 +75,9 @@ def differing_settings(groups: Sequence[Sequence[RunSummary]]) -> list[list[str]
         for name, text in (setting for run in runs for setting in settings_of(run).items()):
             values.setdefault(name, set()).add(text)
         columns.append({name: shortened(", ".join(sorted(texts - {""}))) for name, texts in values.items()})
-    common = {name for name, n in Counter(name for column in columns for name in column).items() if n > 1}
-    shared = [{name: column.get(name, "") for name in common} for column in columns]
-    return [[name, *(column[name] for column in shared)] for name in differing_names(shared)]
+    names = sorted({name for column in columns for name in column})
+    differing = [name for name in names if len({column[name] for column in columns if name in column}) > 1]
+    return [[name, *(column.get(name, "") for column in columns)] for name in differing]
 
 
 def differing_names(settings: Sequence[Mapping[str, str]]) -> list[str]:
