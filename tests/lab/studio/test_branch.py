@@ -12,6 +12,7 @@ def test_a_run_is_branched_with_other_settings(browser, common):
     with opened(browser, common, "/run?run=trained") as page:
         page.get_by_role("button", name="Branch").click()
         page.get_by_label("from step").wait_for()
+        assert page.get_by_label("train for so many more steps").input_value() == "512"  # the run has reached its goal
         for label, text in (("settings that change", "learning_rate=0.5"), ("train for so many more steps", "64")):
             page.get_by_label(label).fill(text)
         page.get_by_label("new folder").fill("../elsewhere")

@@ -19,11 +19,14 @@ from rejeu.lab.studio.state import Studio
 def open_form(studio: Studio, name: str, path: Path) -> None:
     """Opens the form over the page of a run; ``name`` is that of its row."""
     steps = {step_of(file): f"{step_of(file):,}" for file in checkpoint_files(RunFolder(path).checkpoints)}
+    row = studio.row(name)
+    further = str(row.steps) if row is not None and row.state == "finished" else ""  # it has reached its goal
     with ui.dialog(value=True) as form, ui.card().classes("w-full").style("max-width: 30rem"):
         ui.label(say("A new run from a checkpoint of this one")).classes("text-weight-medium")
         step = ui.select(steps, label=say("from step"), value=next(iter(steps), None)).classes("w-full")
         settings = ui.input(say("settings that change"), placeholder="learning_rate=1e-4 gamma=0.9").classes("w-full")
-        more = ui.input(say("train for so many more steps (empty: to the goal of this run)")).classes("w-full")
+        more = ui.input(say("train for so many more steps"), value=further).classes("w-full")
+        more.props.update(hint=say("empty: to the goal of this run"))
         folder = ui.input(say("new folder"), value=f"{name}-branch").classes("w-full")
         message = ui.label().classes("text mono")
 
