@@ -164,7 +164,7 @@ class ThenAndNow:
 
     async def save(self, button: ui.button, suffix: str) -> None:
         """Writes the clip, and lets the browser save it."""
-        button.disable()
+        button.props["loading"] = True
         try:
             with tempfile.TemporaryDirectory() as temporary:
                 path = Path(temporary) / f"then-and-now-{self.seed}{suffix}"
@@ -173,4 +173,4 @@ class ThenAndNow:
         except Exception as error:  # the environment can raise anything
             ui.notify(one_line(error), type="negative")
         finally:
-            button.enable()
+            button.props["loading"] = False
