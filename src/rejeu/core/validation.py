@@ -12,6 +12,7 @@ import numbers
 import os
 import sys
 import textwrap
+import tomllib
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
@@ -183,26 +184,15 @@ def with_value(mapping: Mapping[str, object], path: Sequence[str], value: object
     return {**mapping, head: with_value(inner, tail, value, name)}
 
 
-ELSEWHERE = {
-    "lr": "the step size is called learning_rate",
-    "hidden_sizes": "the widths of the layers are policy_kwargs=dict(net_arch=[64, 64])",
-    "net_arch": 'it is in policy_kwargs: policy_kwargs=dict(net_arch=[64, 64]), or --set "policy_kwargs.net_arch=[64,64]"',
-    "use_sde": "state-dependent exploration (use_sde) is for PPO, A2C, TRPO, SAC and TQC with continuous actions",
-    "features_extractor_class": "networks of your own are given as policy_kwargs=dict(torso=..., encoder=..., head=...)",
-    "features_extractor_kwargs": "networks of your own are given as policy_kwargs=dict(torso=..., encoder=..., head=...)",
-    "optimizer_class": "the optimizer is called optimizer: optimizer='adamw', or an Optax optimizer",
-    "optimize_memory_usage": "observations are stored once anyway",
-    "n_envs": "give make_vector(id, n_envs=...) as env, or --envs",
-    "seeds": "several runs at once are rejeu.train_seeds(rejeu.PPO, policy, env, steps, seeds=...), or rejeu train --seeds",
-    "total_timesteps": "it is an argument of learn(), or --steps",
-}
-"""Where to find what goes by another name elsewhere; only asked for names that are unknown."""
+def hints(table: str) -> dict[str, str]:
+    """Returns where to find what goes by another name in other programs: ``"settings"`` or ``"options"``."""
+    return tomllib.loads(Path(__file__).with_name("hints.toml").read_text(encoding="utf-8"))[table]
 
 
 def unknown_name(key: str, names: Iterable[str], owner: str, shape: Sequence[str] = ()) -> str:
     """Returns the sentence for a misspelt name, with the nearest known one."""
-    if key in ELSEWHERE:
-        return f"{owner} has no setting {key!r}; {ELSEWHERE[key]}"
+    if hint := hints("settings").get(key):
+        return f"{owner} has no setting {key!r}; {hint}"
     if key in shape:
         return f"{owner} takes {key} in policy_kwargs: policy_kwargs={{{key!r}: ...}}"
     return f"{owner} has no setting {key!r}; {nearest(key, names, 'known: ' + ', '.join(names))}"

@@ -7,6 +7,7 @@ thousands of environments on a GPU.
 from __future__ import annotations
 
 from abc import abstractmethod
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -20,24 +21,8 @@ from rejeu.core.errors import requires
 from rejeu.core.types import Observation, PyTree
 from rejeu.envs.functional.protocol import FunctionalEnv, time_is_up
 
-INVERTED_PENDULUM = """
-<mujoco model="inverted pendulum">
-  <option timestep="0.02" gravity="0 0 -9.81"/>
-  <default><joint armature="0" damping="1"/><geom contype="0" conaffinity="0"/></default>
-  <worldbody>
-    <geom name="rail" type="capsule" fromto="-1 0 0 1 0 0" size="0.02"/>
-    <body name="cart">
-      <joint name="slider" type="slide" axis="1 0 0" range="-1 1" limited="true"/>
-      <geom type="box" size="0.1 0.1 0.05" mass="10"/>
-      <body name="pole">
-        <joint name="hinge" type="hinge" axis="0 1 0"/>
-        <geom type="capsule" fromto="0 0 0 0 0 0.6" size="0.05" mass="5"/>
-      </body>
-    </body>
-  </worldbody>
-  <actuator><motor joint="slider" gear="100" ctrlrange="-3 3" ctrllimited="true"/></actuator>
-</mujoco>
-"""
+INVERTED_PENDULUM = Path(__file__).with_name("inverted_pendulum.xml").read_text(encoding="utf-8")
+"""The model of :class:`InvertedPendulum`, in MuJoCo's XML."""
 
 
 class State(NamedTuple):

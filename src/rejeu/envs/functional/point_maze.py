@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Callable
+from pathlib import Path
 from typing import NamedTuple
 
 import equinox as eqx
@@ -15,39 +17,7 @@ from jax import Array
 from rejeu.core.validation import choice
 from rejeu.envs.functional.protocol import GoalEnv, time_is_up
 
-LAYOUTS = {
-    "open": """
-        #######
-        #.....#
-        #.....#
-        #.....#
-        #######""",
-    "u": """
-        #####
-        #...#
-        ###.#
-        #...#
-        #####""",
-    "medium": """
-        ########
-        #..##..#
-        #..#...#
-        ##...###
-        #..#...#
-        #.#..#.#
-        #...#..#
-        ########""",
-    "large": """
-        ############
-        #....#.....#
-        #.##.#.#.#.#
-        #......#...#
-        #.####.###.#
-        #..#.#.....#
-        ##.#.#.#.###
-        #..#...#...#
-        ############""",
-}
+LAYOUTS = tomllib.loads(Path(__file__).with_name("mazes.toml").read_text(encoding="utf-8"))
 """Walls (#) and free cells (.) of the mazes. A cell is 1 m wide."""
 RADIUS = 0.1
 """Half of the width of the point, in m."""

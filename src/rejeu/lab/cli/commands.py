@@ -485,17 +485,8 @@ COMMANDS = {command.__name__.lower(): command for commands in TASKS.values() for
 TRAINING = ("train", "resume", "branch", "clone")
 """Commands that are printed before JAX is imported, so that the wait begins with a line."""
 MODULES = {
-    "branch": "resume",
-    "class": "courses",
-    "course": "courses",
-    "evaluate": "models",
-    "export": "models",
-    "import": "models",
-    "play": "models",
-    "pull": "models",
-    "push": "models",
-    "record": "models",
-    "status": "runs",
-    "watch": "models",
+    **dict.fromkeys(("evaluate", "export", "import", "play", "pull", "push", "record", "watch"), "models"),
+    **dict.fromkeys(("class", "course"), "courses"),
+    **{"branch": "resume", "status": "runs"},
 }
 """The modules of commands whose module has another name."""

@@ -16,24 +16,8 @@ from pathlib import Path
 from typing import Any, Literal, NoReturn, get_args, get_origin
 
 from rejeu.core.types import Settings
-from rejeu.core.validation import field_docs, nearest, number, whole
+from rejeu.core.validation import field_docs, hints, nearest, number, whole
 from rejeu.lab.runs.config import Option, Topic, assigned, options
-
-ELSEWHERE = {
-    "--env": "the environment is given without an option: rejeu {command} ENV",
-    "--lr": "hyperparameters are given as --set learning_rate=1e-3",
-    "-n": "did you mean --steps?",
-    "--tensorboard": "logs are named by --log tensorboard",
-    "--tensorboard-log": "logs are named by --log tensorboard",
-    "--wandb": "logs are named by --log wandb",
-    "--track": "logs are named by --log wandb, mlflow or trackio",
-    "--n-envs": "did you mean --envs?",
-    "--n-timesteps": "did you mean --steps?",
-    "--total-timesteps": "did you mean --steps?",
-    "--max-episode-steps": "a time limit is given where the environment is registered, or by a wrapper",
-}
-"""Options of other programs, and what replaces them in ``rejeu train``, by their names."""
-
 
 HYPERPARAMETERS = """
 batch_size buffer_size clip_range ent_coef gae_lambda gamma gradient_steps learning_rate learning_starts max_grad_norm
@@ -244,8 +228,8 @@ def collected(option: Option, typed: Any) -> Any:
 
 def replacement(name: str, command: str, options: Collection[str]) -> str:
     """Returns the part of a message that says what to write instead of an unknown option."""
-    if name in ELSEWHERE and "--envs" in options:
-        return ELSEWHERE[name].format(command=command)
+    if "--envs" in options and (hint := hints("options").get(name)):
+        return hint.format(command=command)
     hyperparameter = name.removeprefix("--").replace("-", "_")
     if hyperparameter in HYPERPARAMETERS.split() and "--set" in options:
         return f"hyperparameters are given as --set {hyperparameter}=VALUE"
