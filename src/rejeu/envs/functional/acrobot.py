@@ -18,6 +18,8 @@ LENGTH, CENTER, MASS, INERTIA = 1.0, 0.5, 1.0, 1.0
 GRAVITY, TIME_STEP = 9.8, 0.2
 """In m/s^2 and s."""
 MAX_SPEEDS = 4 * np.pi, 9 * np.pi
+HIGH = np.array([1.0, 1.0, 1.0, 1.0, *MAX_SPEEDS], np.float32)
+"""Upper bounds of the observations."""
 """Of the two joints, in rad/s."""
 
 
@@ -39,14 +41,8 @@ class Acrobot(FunctionalEnv):
 
     max_episode_steps: int | None = eqx.field(static=True, default=500)
 
-    @property
-    def observation_space(self) -> spaces.Box:
-        high = np.array([1.0, 1.0, 1.0, 1.0, *MAX_SPEEDS], np.float32)
-        return spaces.Box(-high, high)
-
-    @property
-    def action_space(self) -> spaces.Discrete:
-        return spaces.Discrete(3)
+    observation_space = spaces.Box(-HIGH, HIGH)
+    action_space = spaces.Discrete(3)
 
     def reset(self, key: Array) -> tuple[State, Array]:
         physics = jax.random.uniform(key, (4,), minval=-0.1, maxval=0.1)

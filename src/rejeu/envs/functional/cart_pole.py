@@ -20,6 +20,8 @@ CART_MASS, POLE_MASS, HALF_LENGTH = 1.0, 0.1, 0.5
 """In kg and m."""
 MAX_POSITION, MAX_ANGLE = 2.4, math.radians(12.0)
 """Limits beyond which the episode terminates, in m and rad."""
+HIGH = np.array([2 * MAX_POSITION, np.inf, 2 * MAX_ANGLE, np.inf], np.float32)
+"""Upper bounds of the observations."""
 MAX_START = 0.05
 
 
@@ -41,14 +43,8 @@ class CartPole(FunctionalEnv):
 
     max_episode_steps: int | None = eqx.field(static=True, default=500)
 
-    @property
-    def observation_space(self) -> spaces.Box:
-        high = np.array([2 * MAX_POSITION, np.inf, 2 * MAX_ANGLE, np.inf], np.float32)
-        return spaces.Box(-high, high)
-
-    @property
-    def action_space(self) -> spaces.Discrete:
-        return spaces.Discrete(2)
+    observation_space = spaces.Box(-HIGH, HIGH)
+    action_space = spaces.Discrete(2)
 
     def reset(self, key: Array) -> tuple[State, Array]:
         physics = jax.random.uniform(key, (4,), minval=-MAX_START, maxval=MAX_START)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from copy import deepcopy
 from typing import Any
 
 import gymnasium as gym
@@ -63,8 +64,7 @@ class GymnasiumEnv(gym.Env[Any, Any]):
             raise ValueError(f"{type(env).__name__} has no drawing; register it with one, or use render_mode=None")
         self.functional = env
         self.render_mode = render_mode
-        self.observation_space = env.observation_space
-        self.action_space = env.action_space
+        self.observation_space, self.action_space = deepcopy((env.observation_space, env.action_space))
         self.over = True
         """Whether the episode has ended, or none has begun."""
         self._vector = JaxVector(env)

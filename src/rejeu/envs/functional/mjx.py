@@ -88,13 +88,8 @@ class InvertedPendulum(MjxEnv):
         self.n_frames = n_frames
         self.max_episode_steps = max_episode_steps
 
-    @property
-    def observation_space(self) -> spaces.Box:
-        return spaces.Box(-np.inf, np.inf, (4,))
-
-    @property
-    def action_space(self) -> spaces.Box:
-        return spaces.Box(-3.0, 3.0, (1,))
+    observation_space = spaces.Box(-np.inf, np.inf, (4,))
+    action_space = spaces.Box(-3.0, 3.0, (1,))
 
     def start(self, key: Array) -> tuple[Array, Array]:
         qpos, qvel = jax.random.uniform(key, (2, 2), minval=-0.01, maxval=0.01)

@@ -36,10 +36,9 @@ class Hill(FunctionalEnv):
     goal_velocity: float = eqx.field(static=True, default=0.0)
     """Velocity that the car must have at the goal."""
 
-    @property
-    def observation_space(self) -> spaces.Box:
-        low, high = [MIN_POSITION, -MAX_SPEED], [MAX_POSITION, MAX_SPEED]
-        return spaces.Box(np.array(low, np.float32), np.array(high, np.float32))
+    observation_space = spaces.Box(
+        np.array([MIN_POSITION, -MAX_SPEED], np.float32), np.array([MAX_POSITION, MAX_SPEED], np.float32)
+    )
 
     def reset(self, key: Array) -> tuple[State, Array]:
         position = jax.random.uniform(key, minval=-0.6, maxval=-0.4)
@@ -60,9 +59,7 @@ class MountainCar(Hill):
     goal_position: ClassVar[float] = 0.5
     max_episode_steps: int | None = eqx.field(static=True, default=200)
 
-    @property
-    def action_space(self) -> spaces.Discrete:
-        return spaces.Discrete(3)
+    action_space = spaces.Discrete(3)
 
     def step(self, key: Array, state: State, action: Array) -> tuple[State, Array, Array, Array, Array]:
         after = drive(state, 0.001 * (action - 1))
@@ -82,9 +79,7 @@ class MountainCarContinuous(Hill):
     goal_position: ClassVar[float] = 0.45
     max_episode_steps: int | None = eqx.field(static=True, default=999)
 
-    @property
-    def action_space(self) -> spaces.Box:
-        return spaces.Box(-1.0, 1.0, (1,), np.float32)
+    action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
 
     def step(self, key: Array, state: State, action: Array) -> tuple[State, Array, Array, Array, Array]:
         after = drive(state, 0.0015 * jnp.clip(action[0], -1.0, 1.0))

@@ -16,6 +16,7 @@ import numpy as np
 from gymnasium import spaces
 from jax import Array
 
+from rejeu.core.spaces import GOAL_KEYS
 from rejeu.envs.functional.protocol import GoalEnv, time_is_up
 from rejeu.envs.goals import PARKED, PARKING_WEIGHTS
 
@@ -77,14 +78,8 @@ class Parking(GoalEnv):
 
     max_episode_steps: int | None = eqx.field(static=True, default=500)
 
-    @property
-    def observation_space(self) -> spaces.Dict:
-        keys = ("observation", "achieved_goal", "desired_goal")
-        return spaces.Dict({key: spaces.Box(-np.inf, np.inf, (6,), np.float32) for key in keys})
-
-    @property
-    def action_space(self) -> spaces.Box:
-        return spaces.Box(-1.0, 1.0, (2,), np.float32)
+    observation_space = spaces.Dict({key: spaces.Box(-np.inf, np.inf, (6,), np.float32) for key in GOAL_KEYS})
+    action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
 
     def reset(self, key: Array) -> tuple[State, dict[str, Array]]:
         heading_key, goal_key = jax.random.split(key)

@@ -15,6 +15,8 @@ from rejeu.envs.functional.protocol import FunctionalEnv, time_is_up
 
 MAX_SPEED, MAX_TORQUE, TIME_STEP = 8.0, 2.0, 0.05
 """In rad/s, N m and s."""
+HIGH = np.array([1.0, 1.0, MAX_SPEED], np.float32)
+"""Upper bounds of the observations."""
 MASS, LENGTH = 1.0, 1.0
 """In kg and m."""
 
@@ -42,14 +44,8 @@ class Pendulum(FunctionalEnv):
     g: float = eqx.field(static=True, default=10.0)
     max_episode_steps: int | None = eqx.field(static=True, default=200)
 
-    @property
-    def observation_space(self) -> spaces.Box:
-        high = np.array([1.0, 1.0, MAX_SPEED], np.float32)
-        return spaces.Box(-high, high)
-
-    @property
-    def action_space(self) -> spaces.Box:
-        return spaces.Box(-MAX_TORQUE, MAX_TORQUE, (1,), np.float32)
+    observation_space = spaces.Box(-HIGH, HIGH)
+    action_space = spaces.Box(-MAX_TORQUE, MAX_TORQUE, (1,), np.float32)
 
     def reset(self, key: Array) -> tuple[State, Array]:
         angle, velocity = jax.random.uniform(key, (2,), minval=-1.0, maxval=1.0)

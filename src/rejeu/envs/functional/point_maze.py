@@ -14,6 +14,7 @@ import numpy as np
 from gymnasium import spaces
 from jax import Array
 
+from rejeu.core.spaces import GOAL_KEYS
 from rejeu.core.validation import choice
 from rejeu.envs.functional.protocol import GoalEnv, time_is_up
 
@@ -71,17 +72,10 @@ class PointMaze(GoalEnv):
     def observation_space(self) -> spaces.Dict:
         goal = np.array(self.walls.shape[::-1], np.float32) / 2
         high = np.array([*goal, MAX_SPEED, MAX_SPEED], np.float32)
-        return spaces.Dict(
-            {
-                "observation": spaces.Box(-high, high),
-                "achieved_goal": spaces.Box(-goal, goal),
-                "desired_goal": spaces.Box(-goal, goal),
-            }
-        )
+        bounds = zip(GOAL_KEYS, (high, goal, goal), strict=True)
+        return spaces.Dict({key: spaces.Box(-bound, bound) for key, bound in bounds})
 
-    @property
-    def action_space(self) -> spaces.Box:
-        return spaces.Box(-1.0, 1.0, (2,), np.float32)
+    action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
 
     @property
     def walls(self) -> np.ndarray:

@@ -6,6 +6,7 @@ Each environment has its own stream of random numbers. Environment ``i`` of ``re
 
 from __future__ import annotations
 
+from copy import deepcopy
 from functools import partial
 from typing import Any
 
@@ -172,8 +173,8 @@ class JaxVector(VectorEnv):
         self.env = env
         self.n_envs = n_envs = whole("n_envs", n_envs, least=1)
         self.env_id = type(env).__name__ if env_id is None else env_id
-        self.observation_space = env.observation_space
-        self.action_space, self._action_leaves = env.action_space, leaves(env.action_space)
+        self.observation_space, self.action_space = deepcopy((env.observation_space, env.action_space))
+        self._action_leaves = leaves(env.action_space)
         self.max_episode_steps = env.max_episode_steps
         self.reward_threshold = reward_threshold
         self.state: VectorState | None = None

@@ -11,7 +11,7 @@ from rejeu.core.language import Language, said
 from rejeu.core.types import JsonObject
 from rejeu.lab.reporting.rows import Row
 from rejeu.lab.studio.judging import Judging
-from rejeu.lab.studio.layout import EVERY, HERE, add_cells, address
+from rejeu.lab.studio.layout import HERE, add_cells, address, follow
 from rejeu.lab.studio.speech import language_here, say
 from rejeu.lab.studio.state import Studio
 from rejeu.teaching.courses import leaderboard
@@ -47,15 +47,12 @@ def build(studio: Studio, request: Request) -> None:
     table.classes("w-full class").props("flat bordered dense hide-pagination")
     add_cells(table, "classroom.vue")
     notes = ui.label().classes("text quiet")
-    previous: object = None
 
-    def look() -> None:
-        nonlocal previous
+    def state() -> object:
         judging.look()
-        now = judging.version, judging.now, judging.problem, studio.version
-        if now == previous:
-            return
-        previous = now
+        return judging.version, judging.now, judging.problem, studio.version
+
+    def show() -> None:
         board = judging.board(language)
         title.text = say("Leaderboard: {}", board.env_id)
         table.rows = [*lines(studio, judging, board)]
@@ -63,8 +60,7 @@ def build(studio: Studio, request: Request) -> None:
         explanation = f"{say(leaderboard.EPISODES, board.episodes)}. {say(PLACES)}" if board.rows else ""
         notes.text = "\n".join(filter(None, (doing, judging.problem, explanation, *leaderboard.notes(board))))
 
-    look()
-    ui.timer(EVERY, look)
+    follow(state, show)
 
 
 def columns(titles: list[str]) -> list[JsonObject]:

@@ -21,7 +21,6 @@ from rejeu.core.language import LANGUAGES, Language, chosen
 from rejeu.core.records import brief
 from rejeu.lab.studio import figures
 from rejeu.lab.studio.speech import QUASAR, say
-from rejeu.lab.studio.state import Studio
 
 HERE = Path(__file__).parent
 EVERY = 1.0
@@ -151,18 +150,18 @@ def failures_shown() -> Iterator[None]:
         ui.notify(brief(error), type="negative")
 
 
-def follow(studio: Studio, show: Callable[[], object], every: float = EVERY) -> None:
-    """Calls a function now, and again whenever the rows of the studio have changed, as long as the page is open."""
-    version = -1
+def follow(state: Callable[[], object], show: Callable[[], object]) -> None:
+    """Calls a function now, and again whenever ``state`` returns something else, as long as the page is open."""
+    previous: object = None
 
     def look() -> None:
-        nonlocal version
-        if version != studio.version:
-            version = studio.version
+        nonlocal previous
+        if (now := state()) != previous:
+            previous = now
             show()
 
     look()
-    ui.timer(every, look)
+    ui.timer(EVERY, look)
 
 
 def address(path: str, **query: str | Sequence[str]) -> str:

@@ -82,7 +82,7 @@ def build(studio: Studio, request: Request) -> None:
                 control.set_options(options, value=value)
 
     env.on_value_change(lambda: offer())
-    follow(studio, offer)
+    follow(lambda: studio.version, offer)
     start.on_click(start_anew)
     if env_id or names:
         begin()

@@ -154,7 +154,7 @@ def build(studio: Studio, request: Request) -> None:
     table.on("fold", lambda event: fold(str(event.args)))
     words.on_value_change(lambda event: choose(words=event.value or ""))
     grouping.on_value_change(lambda event: choose(groups=event.value))
-    follow(studio, show)
+    follow(lambda: studio.version, show)
 
 
 def marked(blocks: Iterable[Block], keys: Collection[str]) -> list[str]:
