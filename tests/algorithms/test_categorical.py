@@ -14,7 +14,7 @@ V_MIN, V_MAX, N_ATOMS = -3.0, 5.0, 9
 def by_loops(values: np.ndarray, probabilities: np.ndarray) -> np.ndarray:
     """Algorithm 1 of arXiv 1707.06887 for one distribution; a value on an atom gives it all of its probability."""
     projected, distance = np.zeros(N_ATOMS), (V_MAX - V_MIN) / (N_ATOMS - 1)
-    for value, probability in zip(np.float64(values), np.float64(probabilities), strict=True):
+    for value, probability in zip(*np.float64([values, probabilities]), strict=True):
         place = (min(max(value, V_MIN), V_MAX) - V_MIN) / distance
         low, high = int(np.floor(place)), int(np.ceil(place))
         if low == high:

@@ -16,7 +16,7 @@ def by_definition(reward, value, next_value, discount, ended, gae_lambda):
 
     Equation 16 of arXiv 1506.02438 as the sum that it is, not as a recursion; one environment after the other.
     """
-    reward, value, next_value, discount = map(np.float64, (reward, value, next_value, discount))
+    reward, value, next_value, discount = np.float64([reward, value, next_value, discount])
     result = np.zeros_like(reward)
     for t, env in np.ndindex(result.shape):
         weight = 1.0
