@@ -260,11 +260,9 @@ def actor_critic(policy: OriginalPolicy, latent: bool) -> Network:
     network |= under("value_torso", mlp(shared + policy.layers("mlp_extractor.value_net"), order))
     action, value = linear("action_net"), linear("value_net")
     if isinstance(policy.action_space, spaces.Box):
-        action = (
-            action | {"log_std": lambda view: view.get("log_std")}
-            if policy.squashes
-            else in_unit_range(policy.action_space, action, "log_std")
-        )
+        action |= {"log_std": lambda view: view.get("log_std")}
+        if not policy.squashes:
+            action = in_unit_range(policy.action_space, action, "log_std")
         network["log_std"] = action.pop("log_std")
     for name, head in (("", action), ("value_", value)):
         network |= under(f"{name}head", head if f"{name}torso.layers.0.bias" in network else reordered(head, order))
@@ -333,11 +331,9 @@ def parts_of(algorithm: str, policy: OriginalPolicy, n_quantiles: int) -> list[P
             ]
         parts = [Part("actor", network, "actor_optimizer", "actor", "actor.")]
         parts += [Part("critics", stack(online_critics), "critics_optimizer", "critic", "critic.")]
-        return (
-            parts
-            if algorithm == "CrossQ"
-            else [*parts, Part("target_critics", stack(critics(policy, "critic_target")))]
-        )
+        if algorithm != "CrossQ":
+            parts.append(Part("target_critics", stack(critics(policy, "critic_target"))))
+        return parts
     if algorithm in ("TD3", "DDPG"):
         name, gather = ("critics", stack) if algorithm == "TD3" else ("critic", lambda networks: networks[0])
         return [

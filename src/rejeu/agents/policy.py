@@ -222,9 +222,8 @@ def evaluation_env(
     """
     run = agent.run
     n_envs = MOST_ENVS if episodes is None else min(episodes, MOST_ENVS)
-    made_here = (
-        isinstance(env, str) or callable(env) or (env is None and (run.env is None or agent.identity.made_from_id))
-    )
+    has_none = env is None and (run.env is None or agent.identity.made_from_id)
+    made_here = isinstance(env, str) or callable(env) or has_none
     if env is not None:
         vector = agent.make_envs(env, n_envs if isinstance(env, str) else 1, seed=seed)
     elif run.env is None:

@@ -260,13 +260,8 @@ def hint_at_more_environments(agent: AnyAgent) -> None:
     """Warns if a run waits for a single registered environment, and names the call that makes eight; Python shows it once."""
     env, seconds = agent.run.env, agent.run.seconds
     is_slow = seconds["total"] > HINT_SECONDS and agent.record.steps_per_second < HINT_RATE
-    if (
-        is_slow
-        and env is not None
-        and env.n_envs == 1
-        and env.env_id in gym.registry
-        and time_shares(seconds)["env"] > 0.75
-    ):
+    is_single = env is not None and env.n_envs == 1 and env.env_id in gym.registry
+    if is_slow and is_single and time_shares(seconds)["env"] > 0.75:
         call = f"rejeu.make_vector({env.env_id!r}, n_envs=8)"
         hint = (
             f"most of the time goes into the only environment; {call} steps eight, on EnvPool where it has {env.env_id}"

@@ -431,9 +431,8 @@ def statistics_of(
     settings = {key: state[key] for key in keys}
     arrays = moments("statistics.returns", state["ret_rms"])
     obs = state["obs_rms"] if state["norm_obs"] else None
-    goals = (
-        [obs[key] for key in spaces.GOAL_KEYS[1:]] if isinstance(obs, dict) and {*spaces.GOAL_KEYS} <= {*obs} else []
-    )
+    has_goals = isinstance(obs, dict) and {*spaces.GOAL_KEYS} <= {*obs}
+    goals = [obs[key] for key in spaces.GOAL_KEYS[1:]] if has_goals else []
     if goals and not equal(*(moments("", rms) for rms in goals)):
         settings["share_goals"] = False
     for leaf, group in zip(leaves, spaces.groups(leaves, settings.get("share_goals", True)), strict=True):
@@ -491,9 +490,8 @@ def load_zip(
             raise Malformed(f"it is a model of {algorithm}, not of {name}; load it with {algorithm}.load")
     vecnormalize, notes = normalization_for(path, vecnormalize, changes)
     policy_class = model.readable("policy_class")
-    is_original = isinstance(policy_class, Name) and policy_class.module.startswith(
-        ("stable_baselines3.", "sb3_contrib.")
-    )
+    packages = ("stable_baselines3.", "sb3_contrib.")
+    is_original = isinstance(policy_class, Name) and policy_class.module.startswith(packages)
     if policy_class is not None and not is_original:
         notes.append(
             f"its policy class is not of Stable-Baselines3: it is read as {algorithm}, and what that class adds, such as "

@@ -62,24 +62,19 @@ def _spread(positions: Array, probabilities: Array, n_atoms: int) -> Array:
     On a GPU the order of a sum of scattered numbers is not fixed, and runs would not be reproducible.
     """
     atom = jnp.arange(n_atoms, dtype=jnp.float32).reshape(*[1] * (positions.ndim - 1), -1, 1)
-    return jnp.sum(
-        jnp.maximum(1.0 - jnp.abs(positions[..., None, :] - atom), 0.0) * probabilities[..., None, :], axis=-1
-    )
+    share = jnp.maximum(1.0 - jnp.abs(positions[..., None, :] - atom), 0.0)
+    return jnp.sum(share * probabilities[..., None, :], axis=-1)
 
 
 def _scattered(positions: Array, probabilities: Array, n_atoms: int) -> Array:
     """Returns the result of :func:`_spread` by adding to two atoms: for 101 atoms, a hundred times as fast on a CPU."""
-    shape, positions, probabilities = (
-        positions.shape,
-        positions.reshape(-1, positions.shape[-1]),
-        probabilities.reshape(-1, positions.shape[-1]),
-    )
+    shape, n = positions.shape, positions.shape[-1]
+    positions, probabilities = positions.reshape(-1, n), probabilities.reshape(-1, n)
     lower = jnp.clip(jnp.floor(positions), 0.0, n_atoms - 2.0)
     upper_share = positions - lower
     rows, lower = jnp.arange(positions.shape[0])[:, None], lower.astype(jnp.int32)
-    lower_sums = (
-        jnp.zeros((positions.shape[0], n_atoms), jnp.float32).at[rows, lower].add(probabilities * (1.0 - upper_share))
-    )
+    sums = jnp.zeros((positions.shape[0], n_atoms), jnp.float32)
+    lower_sums = sums.at[rows, lower].add(probabilities * (1.0 - upper_share))
     return lower_sums.at[rows, lower + 1].add(probabilities * upper_share).reshape(*shape[:-1], n_atoms)
 
 

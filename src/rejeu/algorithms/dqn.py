@@ -339,11 +339,8 @@ def value_network(
     key: Array, leaves: tuple[Leaf, ...], shape: PolicyConfig, n_actions: int, dueling: bool, n: int | None = None
 ) -> PyTree:
     """Returns a network from observations to values ``(batch, n_actions)``, or ``(batch, n_actions, n)`` for a number n."""
-    network_class, widths, n_outputs = (
-        Dueling if dueling else Network,
-        shape.critic_widths(HIDDEN_LAYERS),
-        n_actions * (n or 1),
-    )
+    network_class, widths = Dueling if dueling else Network, shape.critic_widths(HIDDEN_LAYERS)
+    n_outputs = n_actions * (n or 1)
     outputs = network_class(key, leaves, n_outputs, widths, shape, **({"n_streams": n} if dueling and n else {}))
     return outputs if n is None else DistributionalNetwork(outputs, n)
 

@@ -170,9 +170,8 @@ def ignore() -> None:
 
 def is_command() -> bool:
     """Returns whether this process is the command ``rejeu`` or ``python -m rejeu``, and not its worker process."""
-    processes = sys.modules.get(
-        "multiprocessing.process"
-    )  # which takes longer to import than all that is imported here
+    # It takes longer to import than all that is imported here.
+    processes = sys.modules.get("multiprocessing.process")
     if not sys.argv or (processes is not None and processes.parent_process() is not None):
         return False
     if sys.argv[0] == "-m":  # Python has not found the module yet; its name is the word before the arguments

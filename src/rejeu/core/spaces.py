@@ -652,9 +652,8 @@ def _bound(value: object, dtype: np.dtype) -> np.ndarray:
     if dtype.kind == "f":
         return bound.astype(dtype)
     limits = np.iinfo(dtype)
-    nearest = [
-        min(max(int(number), limits.min), limits.max) for number in bound.ravel()
-    ]  # floats may round beyond the largest
+    # Floats may round beyond the largest.
+    nearest = [min(max(int(number), limits.min), limits.max) for number in bound.ravel()]
     return np.array(nearest, dtype).reshape(bound.shape)
 
 

@@ -253,10 +253,8 @@ def environment_fault(env: Any, expected: str = "a gymnasium.Env") -> str | None
         return f"{name} has no {' and no '.join(missing)}; set it in __init__" if missing else None
     name, fix = type(env).__name__, "derive its class from gymnasium.Env"
     if callable(env):
-        name, fix = (
-            f"the {'class' if isinstance(env, type) else 'function'} {getattr(env, '__name__', name)}",
-            "call it",
-        )
+        name = f"the {'class' if isinstance(env, type) else 'function'} {getattr(env, '__name__', name)}"
+        fix = "call it"
     elif isinstance(env, str):
         fix = f"make it: gymnasium.make({env!r:.60})"
     elif hasattr(env, "possible_agents"):
@@ -411,11 +409,8 @@ def _array_fault(space: spaces.Space, obs: Observation, name: str, strict: bool)
     if array.dtype.kind not in "fiub":
         return f"{name} as {describe_value(obs)}, expected numbers of shape {leaf.shape} and dtype {space.dtype}"
     if array.shape != leaf.shape:
-        fix = (
-            f"return it with .reshape({leaf.shape})"
-            if array.size == math.prod(leaf.shape)
-            else "return the declared shape"
-        )
+        has_size = array.size == math.prod(leaf.shape)
+        fix = f"return it with .reshape({leaf.shape})" if has_size else "return the declared shape"
         return f"{name} of shape {array.shape}, expected {leaf.shape}; {fix}, or declare {array.shape} in the space"
     if not keeps_values(array, leaf.dtype):
         with np.errstate(invalid="ignore", over="ignore"):

@@ -317,11 +317,9 @@ def read(text: str, n: int) -> Noise:
             raise ValueError(f"action_noise={text!r}: {value.strip()!r} is not a number") from None
         if name == "adaptation_interval":
             settings[name] = int(settings[name])
-    return (
-        noise_class(**settings)
-        if noise_class is ParameterNoise
-        else noise_class(**{"mean": [0.0] * n, first: 0.1, **settings})
-    )
+    if noise_class is ParameterNoise:
+        return noise_class(**settings)
+    return noise_class(**{"mean": [0.0] * n, first: 0.1, **settings})
 
 
 def for_actions(noise: Noise | str, action_space: spaces.Space) -> Noise:

@@ -137,9 +137,8 @@ class Printer:
         out = operation.outputs[0]
 
         def read(index: Sequence[str]) -> str:
-            at = [
-                [i if n != 1 else "0" for i, n in zip(index, operand.shape, strict=False)] for operand in operands
-            ]  # or repeated
+            shapes = (zip(index, operand.shape, strict=False) for operand in operands)
+            at = [[i if n != 1 else "0" for i, n in sizes] for sizes in shapes]  # or repeated
             return text.format(*(operand.read(i) for operand, i in zip(operands, at, strict=True)))
 
         return Array(out.shape, str(out.dtype), read, is_stored=False)

@@ -154,12 +154,8 @@ class MLflow:
     def _started(self) -> Any:
         if self._client is None:
             client = self._mlflow.MlflowClient()
-            known_experiment = client.get_experiment_by_name(self.experiment)
-            experiment = (
-                client.create_experiment(self.experiment)
-                if known_experiment is None
-                else known_experiment.experiment_id
-            )
+            entry = client.get_experiment_by_name(self.experiment)
+            experiment = client.create_experiment(self.experiment) if entry is None else entry.experiment_id
             tags = {} if self.run_id is None else {"rejeu.run_id": self.run_id}
             earlier = client.search_runs([experiment], f"tags.`rejeu.run_id` = '{self.run_id}'") if tags else []
             if earlier:

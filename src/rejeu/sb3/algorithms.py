@@ -277,10 +277,8 @@ class Original(Agent):
         if self.run.step == 0:
             return 0.0
         config = self.config
-        line = schedules.Linear(
-            config.exploration_initial_eps, config.exploration_final_eps, config.exploration_fraction
-        )
-        return float(line(1.0 - self._current_progress_remaining))
+        first, last = config.exploration_initial_eps, config.exploration_final_eps
+        return float(schedules.Linear(first, last, config.exploration_fraction)(1.0 - self._current_progress_remaining))
 
     @exploration_rate.setter
     def exploration_rate(self, value: float) -> None:
@@ -574,11 +572,8 @@ class Original(Agent):
 
     def snapshot(self, path: Any, exclude: Iterable[str] = (), include: Iterable[str] = ()) -> Callable[[], Path]:
         """Returns a function that writes the model as it is now, as :meth:`save` does."""
-        arrays, header, defaults = (
-            super().get_parameters(),
-            model_files.header(self),
-            configs.to_json(type(self.config)()),
-        )
+        arrays, header = super().get_parameters(), model_files.header(self)
+        defaults = configs.to_json(type(self.config)())
         header["config"] |= {key: defaults[key] for key in {*exclude} & defaults.keys() - SHAPING}
         others = {*OUTPUTS, *include} - {*exclude} - defaults.keys()
         folder = {"tensorboard_log": self.tensorboard_log and str(self.tensorboard_log)}

@@ -183,11 +183,9 @@ def reported(agent: Any, broken: NonFiniteUpdate) -> NonFiniteError:
     first, last = turn[-1].steps[0], turn[-1].steps[-1]
     steps = f"step {last:,}" if first == last else f"steps {first:,} to {last:,}"
     cause = f"the batch held {', '.join(spoiled[:3])}" if spoiled else ""
-    remains = (
-        "The bad updates were undone"
-        if skips
-        else "The agent has the state after it: load a saved model or call restore_best() to go on"
-    )
+    remains = "The agent has the state after it: load a saved model or call restore_best() to go on"
+    if skips:
+        remains = "The bad updates were undone"
     message = (
         f"{_what(bad, broken.in_a_row, cause)}, in the update after environment {steps}. {remains}. {saved}"
         f"{_last_model(agent)}. {_advice(agent.config, spoiled, turn[-1].batches)}"

@@ -136,11 +136,9 @@ class ActorCritic(eqx.Module):
         torso, n_hidden = make_torso(keys[1], encoder.n_features, None, widths, shape)
         head = make_head(keys[2], n_hidden, action.n_outputs + std * action.n_stds, shape)
         value_encoder = None if shape.share_features_extractor else make_encoder(keys[3], leaves, shape)
-        value_torso, n_value = (
-            (None, n_hidden)
-            if shape.share_layers
-            else make_torso(keys[4], encoder.n_features, None, value_widths, shape)
-        )
+        value_torso, n_value = None, n_hidden
+        if not shape.share_layers:
+            value_torso, n_value = make_torso(keys[4], encoder.n_features, None, value_widths, shape)
         value_head = make_head(keys[5], n_value, 1, shape)
         if shape.ortho_init:
             fresh = jax.random.split(jax.random.fold_in(key, 1), 6)

@@ -58,12 +58,8 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
 
     def joined(choice: Array, box: Array) -> Array:
         """Returns combinations ``(batch,)`` and Box components as actions ``(batch, action_width)``."""
-        each = (
-            [component.astype(jnp.float32)[:, None] for component in jnp.unravel_index(choice, choices)]
-            if choices
-            else []
-        )
-        return jnp.concatenate([box, *each], axis=-1)[:, order]
+        components = jnp.unravel_index(choice, choices) if choices else ()
+        return jnp.concatenate([box, *(x.astype(jnp.float32)[:, None] for x in components)], axis=-1)[:, order]
 
     def parted(action: Array) -> tuple[Array, Array]:
         """Returns the combinations and Box components of actions."""
@@ -112,9 +108,9 @@ def column_sizes(space: spaces.Space) -> list[int]:
         return [0] * action_width(check_box_action(space, Config.name))
     if isinstance(space, spaces.Discrete):
         return [int(space.n)]
-    return (
-        [int(n) for n in space.nvec.ravel()] if isinstance(space, spaces.MultiDiscrete) else [2] * action_width(space)
-    )
+    if isinstance(space, spaces.MultiDiscrete):
+        return [int(n) for n in space.nvec.ravel()]
+    return [2] * action_width(space)
 
 
 def policy(actor: Network, obs: PyTree, n: int) -> tuple[Categorical, TanhNormal]:

@@ -122,10 +122,8 @@ def _check_array(method: str, name: str, value: Any, shape: tuple[int, ...], dty
     """Checks the shape of an array, and that its dtype is of one of these kinds."""
     array = jax.eval_shape(lambda: value) if isinstance(value, bool | float | int) else value
     if getattr(array, "shape", None) != shape or np.dtype(array.dtype).kind not in dtype_kinds:
-        dtype, axes = (
-            "a float" if dtype_kinds == "f" else "a bool",
-            "for each action, with one axis" if shape else "without axes",
-        )
+        dtype = "a float" if dtype_kinds == "f" else "a bool"
+        axes = "for each action, with one axis" if shape else "without axes"
         raise BadEnvironmentError(
             f"{method} returned {name} as {_shown(array)}, expected {dtype} {axes}: index or convert it"
         )

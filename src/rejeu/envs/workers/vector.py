@@ -88,9 +88,8 @@ class InWorkers(VectorEnv):
         """Allocates shared memory for the observations, and returns a function that returns each worker's use of it."""
         buffers = [context.RawArray(ctypes.c_byte, max(self.n_envs * leaf.nbytes, 1)) for leaf in self._leaves]
         self._rows = process.rows(self.observation_space, buffers, self.n_envs)
-        return partial(
-            partial, process.in_shared_memory, buffers, self.n_envs
-        )  # without the vector, which may be let go
+        # Without the vector, which may be let go.
+        return partial(partial, process.in_shared_memory, buffers, self.n_envs)
 
     def reset(self, seed: Seed = None) -> Observation:
         seed = self._seed if seed is None else checked_seed(seed, self.n_envs)

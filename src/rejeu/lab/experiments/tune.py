@@ -225,11 +225,9 @@ def how_far(study: Study) -> str:
     """Returns how many trials have ended, and which is the best so far."""
     n_ended, best = sum(trial.state.is_finished() for trial in study.trials()), study.best()
     text = f"{n_ended} of {study.plan.trials} trials have ended"
-    return (
-        text
-        if best is None
-        else f"{text}, best {study.plan.measure} {number(study.optuna_study.best_value)} (trial {best.number})"
-    )
+    if best is None:
+        return text
+    return f"{text}, best {study.plan.measure} {number(study.optuna_study.best_value)} (trial {best.number})"
 
 
 def lines(echo: Echo, study: Study) -> Callable[[], None]:

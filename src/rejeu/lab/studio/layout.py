@@ -47,14 +47,12 @@ def frame(request: Request, title: str, path: str, links: Sequence[tuple[str, st
     client.page = copy(client.page)  # its own, with the language of this browser
     language = asked_language(request)
     client.page.language = QUASAR[language]
-    client.title = " · ".join(
-        filter(None, [request.query_params.get("run") if path == "/run" else "", say(title), "rejeu"])
-    )
+    run = request.query_params.get("run") if path == "/run" else ""
+    client.title = " · ".join(filter(None, [run, say(title), "rejeu"]))
     figures.add_scripts()
     ui.add_css(HERE / "layout.css")
-    ui.add_css(
-        f'#popup::after {{ content: "{say(LOST)}"; max-width: 20rem; }}'
-    )  # NiceGUI's message of a lost connection
+    # NiceGUI's message of a lost connection.
+    ui.add_css(f'#popup::after {{ content: "{say(LOST)}"; max-width: 20rem; }}')
     ui.colors(primary="#2f6db5", positive="#1b7a43")
     dark = ui.dark_mode(None)
     with ui.header().classes("header items-center gap-1 no-wrap"):

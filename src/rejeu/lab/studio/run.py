@@ -198,9 +198,8 @@ class RunPage:
 
     def show_log(self) -> None:
         """Shows the end of the log."""
-        self.log.text = processes.read_log(self.path) or say(
-            "There is none: the studio did not start this run, nor a sweep."
-        )
+        none = say("There is none: the studio did not start this run, nor a sweep.")
+        self.log.text = processes.read_log(self.path) or none
 
 
 def next_seed(seeds: Sequence[float | None], current: int | None) -> int | None:
@@ -351,9 +350,8 @@ class Head:
         """Shows the row of a run, and its section of the report if it could be read. Buttons stay while the state does."""
         self.env.text, self.algorithm.text = row.env or row.name, row.algorithm
         self.facts.text = " · ".join([row.run, *(() if section is None else map(say, section.facts))])
-        self.remarks.text = " · ".join(
-            filter(None, [" ".join(f"#{tag}" for tag in row.remarks.tags), row.remarks.note])
-        )
+        tags = " ".join(f"#{tag}" for tag in row.remarks.tags)
+        self.remarks.text = " · ".join(filter(None, [tags, row.remarks.note]))
         self.remarks.set_visibility(bool(self.remarks.text))
         if row.state != self.state:
             self.state, self.badge.text = row.state, say(row.state)
@@ -375,9 +373,8 @@ class Head:
         """Shows how far training is: a bar, and what it has printed last; of one without a log what its files say."""
         self.progress.value = row.share or 0.0
         self.progress.props["indeterminate"] = row.share is None
-        self.status.text = (
-            processes.last_line(self.page.path) or say(row.reason) or f"{steps_text(row)} · {rate_text(row)}"
-        )
+        how_far = say(row.reason) or f"{steps_text(row)} · {rate_text(row)}"
+        self.status.text = processes.last_line(self.page.path) or how_far
 
 
 class LiveView:
@@ -400,9 +397,8 @@ class LiveView:
         self.screen.on_leave = self.player.close
         self.choose(page.choice["policy"], int(page.choice["seed"]) if page.choice["seed"] else None)
         ui.add_body_html(SEEN)
-        ui.timer(
-            0.0, lambda: ui.run_javascript("emitEvent('seen', !document.hidden)"), once=True
-        )  # once it is connected
+        # Once it is connected.
+        ui.timer(0.0, lambda: ui.run_javascript("emitEvent('seen', !document.hidden)"), once=True)
         ui.on("seen", lambda event: setattr(self.player, "is_seen", bool(event.args)))
         ui.timer(EVERY, self.look)
 

@@ -166,10 +166,8 @@ class ReplayBuffer(BaseBuffer):
         """
         timeouts = np.array([bool(info.get(TIME_LIMIT_TRUNCATED, False)) for info in infos])
         terminated, reward = np.asarray(done, bool) & ~timeouts, np.asarray(reward, np.float32)
-        ring, buffer_class = (
-            self.core.ring,
-            type(self.core),
-        )  # whose methods take what is given, also behind those of VecNormalize
+        # Methods of the class take what is given, also behind those of VecNormalize.
+        ring, buffer_class = self.core.ring, type(self.core)
         buffer_class.begin(self.core, obs)
         actions = np.asarray(action, ring.action.dtype).reshape(ring.n_envs, *ring.action.shape[1:])
         buffer_class.add(self.core, actions, reward, terminated, next_obs)

@@ -61,11 +61,8 @@ class VecCheckNan(VecEnvWrapper):
             bad = ~np.isfinite(array) if self.check_inf else np.isnan(array)
             if bad.any():
                 where = tuple(int(i) for i in np.argwhere(bad)[0])
-                after = (
-                    ""
-                    if self._last_actions is None or name == "the actions"
-                    else f" after the actions {self._last_actions}"
-                )
+                is_after = self._last_actions is not None and name != "the actions"
+                after = f" after the actions {self._last_actions}" if is_after else ""
                 message = f"{name}{f' under {key!r}' * bool(key)} contain {array[where]} at {where}{after}"
                 if self.raise_exception:
                     raise NotFiniteError(message)
