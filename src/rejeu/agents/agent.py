@@ -264,9 +264,8 @@ class Agent(AnyAgent):
         try:
             self.config = new
             self.build(self.observation_space, self.action_space)
-            arrays, others = (
-                dict(zip(names(x), jax.tree.leaves(x), strict=True)) for x in (learner.shapes, self.learner.shapes)
-            )
+            trees = learner.shapes, self.learner.shapes
+            arrays, others = (dict(zip(names(tree), jax.tree.leaves(tree), strict=True)) for tree in trees)
             if arrays != others or changed & {"action_masks", "action_repeat", "action_share"}:
                 raise ValueError(
                     f"{', '.join(changed)} cannot be set on a {self.name} whose networks were made without"

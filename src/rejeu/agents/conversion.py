@@ -326,9 +326,8 @@ def parts_of(algorithm: str, policy: OriginalPolicy, n_quantiles: int) -> list[P
         if algorithm == "CrossQ":
             network = renormalized(policy, network, "actor.latent_pi")
             n_actions = int(np.prod(policy.action_space.shape or ()))
-            online_critics = [
-                renormalized(policy, critic, f"critic.qf{i}", n_actions) for i, critic in enumerate(online_critics)
-            ]
+            numbered = enumerate(online_critics)
+            online_critics = [renormalized(policy, critic, f"critic.qf{i}", n_actions) for i, critic in numbered]
         parts = [Part("actor", network, "actor_optimizer", "actor", "actor.")]
         parts += [Part("critics", stack(online_critics), "critics_optimizer", "critic", "critic.")]
         if algorithm != "CrossQ":

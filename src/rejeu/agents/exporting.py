@@ -264,10 +264,8 @@ def moderate(x: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 def _sample(agent: AnyAgent, policy: Policy, rng: np.random.Generator) -> Any:
     """Returns a batch of one sample of the observation space, with a mask if the agent takes masks."""
-    obs = jax.tree.map(
-        lambda array: moderate(np.asarray(array)[None], rng),
-        spaces.plain(agent.observation_space, agent.observation_space.sample()),
-    )
+    drawn = spaces.plain(agent.observation_space, agent.observation_space.sample())
+    obs = jax.tree.map(lambda array: moderate(np.asarray(array)[None], rng), drawn)
     masks = policy.of("action_mask")
     if not masks:
         return obs

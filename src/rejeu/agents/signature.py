@@ -20,9 +20,8 @@ class Documentation:
         lines = [f"    {key}: {text}" for key, text in AGENT_ARGUMENTS.items()]
         for key, default in validation.field_defaults(config).items():
             text = f"{docs[key]} " if key in docs else ""
-            lines.append(
-                f"    {key}: {text}" + ("" if default is inspect.Parameter.empty else f"Default: {default!r}.")
-            )
+            has_default = default is not inspect.Parameter.empty
+            lines.append(f"    {key}: {text}" + f"Default: {default!r}." * has_default)
         config_text = inspect.cleandoc(config.__doc__ or "")
         return "\n".join([self.text, "", config_text, "", "Args:", *lines])
 

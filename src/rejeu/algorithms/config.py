@@ -420,10 +420,8 @@ def buffer_name(key: str, value: object) -> str | type:
 def buffer_settings(key: str, value: Any, buffer: str | type) -> Any:
     """Returns the settings of a replay buffer: a record or, for a class of the user's own, pairs of names and values."""
     if isinstance(buffer, type) and not issubclass(buffer, HerReplayBuffer):
-        return tuple(
-            (name, tuple(setting) if isinstance(setting, list) else setting)
-            for name, setting in dict(value or {}).items()
-        )
+        settings = dict(value or {}).items()
+        return tuple((name, tuple(entry) if isinstance(entry, list) else entry) for name, entry in settings)
     settings_class = HindsightConfig if isinstance(buffer, type) else REPLAY_BUFFERS[buffer]
     if settings_class is not None:
         return nested(key, value or {}, settings_class)

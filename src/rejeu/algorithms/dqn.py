@@ -481,9 +481,8 @@ def td_target(
     following = returns.describe(target_network, batch.next_obs, keys[1])
     if returns.munchausen is not None:
         current_values = returns.values(chooser, batch.obs, key)
-        return returns.target(
-            *munchausen_target(returns.munchausen, batch, current_values, forbid(values, mask), following)
-        )
+        next_values = forbid(values, mask), following
+        return returns.target(*munchausen_target(returns.munchausen, batch, current_values, *next_values))
     return returns.target(batch.reward, batch.discount, taken(following, greedy(values, mask)))
 
 

@@ -58,9 +58,8 @@ class Named(NamedTuple):
         """Returns the transformation; ``adam`` are the algorithm's settings of Adam, which its own replace."""
         settings = DEFAULTS.get(self.name, {}) | dict(self.settings)
         weight_decay, momentum = settings.pop("weight_decay", 0.0), settings.pop("momentum", 0.0)
-        rule = {"rmsprop": optax.scale_by_rms, "lion": optax.scale_by_lion, "adamw": optax.scale_by_adam}.get(
-            self.name, OPTIMIZERS[self.name]
-        )
+        rules = {"rmsprop": optax.scale_by_rms, "lion": optax.scale_by_lion, "adamw": optax.scale_by_adam}
+        rule = rules.get(self.name, OPTIMIZERS[self.name])
         is_adam = self.name in ("adam", "adamw", "nadam", "radam", "amsgrad")
         steps = [rule(**(adam | settings if is_adam else settings))]
         steps += [optax.trace(momentum)] if momentum else []

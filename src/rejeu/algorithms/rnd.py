@@ -69,9 +69,8 @@ def with_rnd(algorithm: Algorithm, obs_leaves: tuple[Leaf, ...], config: RndConf
 
     def init(key: Array) -> State:
         keys = [jax.random.fold_in(key, i) for i in (1, 2, 3)]
-        predictor, target = (
-            Network(key, obs_leaves, config.n_features, HIDDEN_LAYERS, PolicyConfig()) for key in keys[:2]
-        )
+        settings = obs_leaves, config.n_features, HIDDEN_LAYERS, PolicyConfig()
+        predictor, target = (Network(key, *settings) for key in keys[:2])
         optimizer = OPTIMIZER.init(predictor)
         return State(algorithm.init(key), predictor, target, optimizer, normalizer.init(), keys[2], jnp.int32(0))
 

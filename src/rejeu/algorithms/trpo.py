@@ -153,9 +153,8 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
             )
             return network, optimizer_state, total + loss
 
-        network, optimizer_state, total = jax.lax.fori_loop(
-            0, n_steps, fit, (network, state.optimizer, jnp.float32(0.0))
-        )
+        before = network, state.optimizer, jnp.float32(0.0)
+        network, optimizer_state, total = jax.lax.fori_loop(0, n_steps, fit, before)
         metrics = {
             "policy_objective": trust_region_step.objective,
             "kl_divergence_loss": trust_region_step.kl,

@@ -74,9 +74,8 @@ class ProgressBar(TrainingCallback):
         self._display = formatting.Display() if self._console.is_jupyter else None
         is_animated = self._console.is_terminal and not self._console.is_dumb_terminal
         self._live = Live(console=self._console, auto_refresh=False) if is_animated else None
-        self._period = (
-            NOTEBOOK_SECONDS if self._display is not None else REFRESH_SECONDS if is_animated else LINE_SECONDS
-        )
+        period = REFRESH_SECONDS if is_animated else LINE_SECONDS
+        self._period = NOTEBOOK_SECONDS if self._display is not None else period
         self._began = xla.clock()
         self._refresh_at = -math.inf
         self._taken, self._spent = steps_before, spent

@@ -144,9 +144,8 @@ def parse(
                     raise Malformed(f"it makes a set of a {type(items).__name__}, expected a list")
                 stack.append(items)
                 continue
-            stack.append(
-                {} if function == ("collections", "OrderedDict") and not arguments else call(function, arguments)
-            )
+            is_empty = function == ("collections", "OrderedDict") and not arguments
+            stack.append({} if is_empty else call(function, arguments))
         elif code == "BUILD":
             (state,) = popped(stack, 1)
             if isinstance(stack[-1], PickledCall):

@@ -120,9 +120,8 @@ def _resume_within(stack: ExitStack, file: checkpoint.Contents, cls: type[A], en
     if parts:
         ring = agent.run.replay.ring
         heads = [rows["head"] for rows in parts]
-        folder_of(agent, path.parent).row_files = RowFiles(
-            list(zip(header.rows, heads, strict=True)), ring, ring.version
-        )
+        pairs = list(zip(header.rows, heads, strict=True))
+        folder_of(agent, path.parent).row_files = RowFiles(pairs, ring, ring.version)
     return agent
 
 

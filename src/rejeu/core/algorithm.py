@@ -106,9 +106,8 @@ def rows_read(obs: PyTree) -> PyTree:
     rows, _, _, _, reads = unmasked(obs)[0]
 
     def read(x: Array) -> Array:
-        return jnp.take_along_axis(x, reads.reshape(*reads.shape, *[1] * (x.ndim - 2)), axis=1).reshape(
-            -1, *x.shape[2:]
-        )
+        index = reads.reshape(*reads.shape, *[1] * (x.ndim - 2))
+        return jnp.take_along_axis(x, index, axis=1).reshape(-1, *x.shape[2:])
 
     return jax.tree.map(read, rows)
 
@@ -356,6 +355,5 @@ def renew(ended: Array, fresh: PyTree, carry: PyTree) -> PyTree:
 
 def names(tree: PyTree) -> list[str]:
     """Returns the dotted path of each leaf of a tree, such as ``actor.torso.layers.0.weight``."""
-    return [
-        jax.tree_util.keystr(path, simple=True, separator=".") for path, _ in jax.tree_util.tree_leaves_with_path(tree)
-    ]
+    paths = [path for path, _ in jax.tree_util.tree_leaves_with_path(tree)]
+    return [jax.tree_util.keystr(path, simple=True, separator=".") for path in paths]

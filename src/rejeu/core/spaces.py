@@ -129,9 +129,8 @@ def flat_keys(tree_structure: PyTree) -> list[str] | None:
 
 def narrow(dtype: DTypeLike | None) -> str:
     """Returns the name of a dtype of 32 bits at most: 64-bit floats and integers become 32-bit."""
-    return {"float64": "float32", "int64": "int32", "uint64": "uint32", "bool": "int8"}.get(
-        np.dtype(dtype).name, np.dtype(dtype).name
-    )
+    name = np.dtype(dtype).name
+    return {"float64": "float32", "int64": "int32", "uint64": "uint32", "bool": "int8"}.get(name, name)
 
 
 def stored_dtype(space: spaces.Box) -> str:

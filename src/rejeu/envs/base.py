@@ -331,10 +331,8 @@ def step_whole(step_all: Callable[[np.ndarray], Step], before: PyTree, action: n
     unchanged = jax.tree.map(lambda leaf: leaf[~active], before)
     step = step_all(jax.tree.map(of_active, action))
     reward = np.where(active, step.reward, np.float32(0.0))
-    terminated, truncated = step.terminated & active, step.truncated & active
-    return step._replace(
-        obs=with_rows(step.obs, ~active, unchanged), reward=reward, terminated=terminated, truncated=truncated
-    )
+    flags = {"terminated": step.terminated & active, "truncated": step.truncated & active}
+    return step._replace(obs=with_rows(step.obs, ~active, unchanged), reward=reward, **flags)
 
 
 def with_rows(batch: PyTree, rows: np.ndarray, values: PyTree) -> PyTree:

@@ -268,9 +268,8 @@ def fingerprint(env: Any) -> int:
             visited[id(value)], content = value, type(value).__qualname__.encode()
             items = [len(value), *value] if isinstance(value, COLLECTIONS) else []
             items += value.values() if isinstance(value, dict) else []
-            inside = (
-                value.bit_generator.state if isinstance(value, np.random.Generator) else getattr(value, "__dict__", {})
-            )
+            is_generator = isinstance(value, np.random.Generator)
+            inside = value.bit_generator.state if is_generator else getattr(value, "__dict__", {})
             waiting.extend([*items[-MOST_ITEMS:], *inside.values()])
         digest = zlib.crc32(content, digest)
     return digest

@@ -182,9 +182,8 @@ def policy_of(
     scale = spaces.action_scaler(action_space, jnp)
 
     def act(obs: list[Array], mask: Array | None, memory: list[Array], start: Any, key: Any) -> list[Array]:
-        stacks = [
-            stack.pushed(i, value, obs[i], start) for i, value in zip(stacked, memory[n_carry:], strict=True) if stack
-        ]
+        frames = zip(stacked, memory[n_carry:], strict=True)
+        stacks = [stack.pushed(i, value, obs[i], start) for i, value in frames if stack]
         obs = [stacks[stacked.index(i)] if i in stacked else value for i, value in enumerate(obs)]
         arrays: PyTree = jax.tree.unflatten(structure, [value[None] for value in obs])
         arrays = arrays if mask is None else Masked(arrays, mask[None])

@@ -103,9 +103,8 @@ class Printer:
         for operation in program.operations:
             out = operation.outputs[0]
             if operation.name in MAPS:
-                self.known[out] = moved(
-                    self.view(operation.inputs[0]), out.shape, partial(MAPS[operation.name], operation)
-                )
+                move = partial(MAPS[operation.name], operation)
+                self.known[out] = moved(self.view(operation.inputs[0]), out.shape, move)
             elif (text := self.expression(operation)) is not None:
                 computed = self.computed(operation, text)
                 self.known[out] = computed if uses[out] == 1 else self.stored(computed)

@@ -155,9 +155,8 @@ class NumpyPolicy:
         """Builds the policy from its description and constants; ``largest`` limits the numbers of a space."""
         self.card: JsonObject = content["card"]
         """Where it is from, and what it takes and returns; see ``docs/deployment.md``."""
-        self.observation_space, self.action_space = (
-            spaces.rebuild(content[key], largest) for key in ("observation_space", "action_space")
-        )
+        described = content["observation_space"], content["action_space"]
+        self.observation_space, self.action_space = (spaces.rebuild(space, largest) for space in described)
         roles = [port["role"] for port in self.card["inputs"]]
         self.takes_masks = "action_mask" in roles
         self._leaves, self._n_states = spaces.leaves(self.observation_space), roles.count("state")

@@ -250,9 +250,8 @@ class _Tracing:
             inner = jax.make_jaxpr(partial(REWRITTEN[name], params))(*examples)
         before, where = self.where, _line(equation.source_info) or self.where
         if inner is not None and name not in ("scan", "while", "cond"):
-            constants = [
-                Value(np.shape(value), value.dtype, np.asarray(value)) for value in getattr(inner, "consts", ())
-            ]
+            consts = getattr(inner, "consts", ())
+            constants = [Value(np.shape(value), value.dtype, np.asarray(value)) for value in consts]
             self.where = where
             outputs_of_inner = self.inline(getattr(inner, "jaxpr", inner), [*constants, *inputs])
             self.where = before

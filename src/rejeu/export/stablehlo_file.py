@@ -30,10 +30,8 @@ def write(policy: Policy, card: JsonObject) -> bytes:
         results = policy.program(*(inputs[port.name] for port in policy.inputs))
         return {port.name: result for port, result in zip(policy.outputs, results, strict=True)}
 
-    examples = {
-        port.name: ShapeDtypeStruct(value.shape, value.dtype)
-        for port, value in zip(policy.inputs, policy.program.arguments, strict=True)
-    }
+    pairs = zip(policy.inputs, policy.program.arguments, strict=True)
+    examples = {port.name: ShapeDtypeStruct(value.shape, value.dtype) for port, value in pairs}
     try:
         exported = export.export(jax.jit(act), platforms=["cpu", "cuda", "tpu"])(examples)
     except NotImplementedError as error:

@@ -71,10 +71,8 @@ class Cell(eqx.Module):
         width = (4 if cell_type == "lstm" else 3) * size
         bound = 1.0 / math.sqrt(size)
         shapes = ((n_inputs, width), (size, width), (width,), (width,))
-        drawn = [
-            jax.random.uniform(k, shape, jnp.float32, -bound, bound)
-            for k, shape in zip(jax.random.split(key, 4), shapes, strict=True)
-        ]
+        pairs = zip(jax.random.split(key, 4), shapes, strict=True)
+        drawn = [jax.random.uniform(k, shape, jnp.float32, -bound, bound) for k, shape in pairs]
         self.inputs, self.recurrent, self.bias, self.recurrent_bias = drawn
         self.kind = cell_type
 

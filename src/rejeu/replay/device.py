@@ -142,10 +142,8 @@ class DeviceReplay:
         envs = jnp.arange(self.n_envs)
         head = ring.head + advances.astype(jnp.int32)
         index = jnp.where(advances, self.positions(envs, head), len(ring.kind))
-        stores = [
-            put(store, index, leaf.astype(store.dtype))
-            for store, leaf in zip(ring.obs, jax.tree.leaves(obs), strict=True)
-        ]
+        pairs = zip(ring.obs, jax.tree.leaves(obs), strict=True)
+        stores = [put(store, index, leaf.astype(store.dtype)) for store, leaf in pairs]
         kinds_of_rows = put(ring.kind, index, jnp.full(self.n_envs, STEP, jnp.uint8))
         episode = put(ring.episode, index, ring.n_begun - 1) if self.strategy is not None else ring.episode
         return ring._replace(obs=stores, kind=kinds_of_rows, episode=episode, head=head)

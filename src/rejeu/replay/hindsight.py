@@ -270,9 +270,8 @@ def checked_strategy(strategy: object) -> str | GoalStrategy | MixedStrategies:
             '{"future": 2, "desired": 2}; register_goal_strategy gives a function a name'
         )
     pairs = zip(names, shares, strict=True)
-    return MixedStrategies(
-        tuple((name, whole(f"goal_selection_strategy {name}", n, 1, MAX_SHARE)) for name, (_, n) in pairs)
-    )
+    label = "goal_selection_strategy"
+    return MixedStrategies(tuple((name, whole(f"{label} {name}", n, 1, MAX_SHARE)) for name, (_, n) in pairs))
 
 
 def registered_strategy(strategy: Any) -> str | GoalStrategy:

@@ -322,10 +322,8 @@ def stacked_leaves(leaves: tuple[Leaf, ...], frame_stack: int | None) -> tuple[b
         ValueError: if ``frame_stack`` is given and there is no such leaf.
     """
     images = [leaf.dtype == "uint8" and len(leaf.shape) >= 3 and leaf.shape[0] == frame_stack for leaf in leaves]
-    stacked = tuple(
-        is_image and leaf.path not in ("achieved_goal", "desired_goal")
-        for is_image, leaf in zip(images, leaves, strict=True)
-    )
+    pairs = zip(images, leaves, strict=True)
+    stacked = tuple(is_image and leaf.path not in ("achieved_goal", "desired_goal") for is_image, leaf in pairs)
     if frame_stack is not None and not any(stacked):
         descriptions = ", ".join(f"{leaf.path or 'observation'} {leaf.dtype}{list(leaf.shape)}" for leaf in leaves)
         raise ValueError(

@@ -145,9 +145,8 @@ class RolloutBuffer:
     def _stores(self) -> dict[str, np.ndarray]:
         stored = {f"obs.{i}": store for i, store in enumerate(self.obs)}
         stored |= {f"next_obs.{i}": store for i, store in enumerate(self.next_obs)}
-        return stored | {
-            name: getattr(self, name) for name in ("action", "reward", "discount", "ended", "valid", "running_return")
-        }
+        names = ("action", "reward", "discount", "ended", "valid", "running_return")
+        return stored | {name: getattr(self, name) for name in names}
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Restores the arrays of :meth:`arrays`.

@@ -204,9 +204,8 @@ class Original(Agent):
             value = getattr(config, name)
             if isinstance(value, schedules.Live):
                 return value.value
-            return (
-                utils.of_remaining(value) if configs.takes_schedule(type(config), name) and callable(value) else value
-            )
+            is_schedule = configs.takes_schedule(type(config), name) and callable(value)
+            return utils.of_remaining(value) if is_schedule else value
         if name in policies.NETWORKS:
             return getattr(self.policy, name)
         if name in RUN:
@@ -598,9 +597,8 @@ class Original(Agent):
             if self.run.replay is None and self.config.hindsight is None:  # loaded without environments
                 with checkpoint.opened(exact_path, "replay") as file:
                     n_envs = file.specs["head"].shape[0]
-                like: Any = SimpleNamespace(
-                    n_envs=n_envs, observation_space=self.observation_space, action_space=self.action_space
-                )
+                settings = {"observation_space": self.observation_space, "action_space": self.action_space}
+                like: Any = SimpleNamespace(n_envs=n_envs, **settings)
                 self.run.replay = self.make_buffer(like)
             super().load_replay_buffer(exact_path)  # type: ignore[misc]
 

@@ -143,9 +143,8 @@ def shape_of(agent_class: type[Agent], policy_kwargs: Arguments) -> tuple[Settin
     settings = policy_kwargs.get("features_extractor_kwargs") or {}
     shape |= encoder_of(policy_kwargs.get("features_extractor_class"), settings, normalizes)
     optimizer = optimizer_of(policy_kwargs.get("optimizer_class"), policy_kwargs.get("optimizer_kwargs") or {})
-    return {key: value for key, value in shape.items() if value is not None}, others | (
-        {} if optimizer is None else {"optimizer": optimizer}
-    )
+    others |= {} if optimizer is None else {"optimizer": optimizer}
+    return {key: value for key, value in shape.items() if value is not None}, others
 
 
 def unsupported(name: str, value: object, effect: str = "has no effect") -> None:

@@ -259,9 +259,8 @@ def permuted(key: Array, n: int, n_first: Array, n_epochs: int) -> Array:
     def again(drawn: Array) -> Array:
         return jnp.where(drawn < n_first, drawn, encrypted(drawn))
 
-    drawn = jax.lax.while_loop(
-        lambda drawn: jnp.any(drawn >= n_first), again, encrypted(jnp.minimum(number, n_first - 1))
-    )
+    first = encrypted(jnp.minimum(number, n_first - 1))
+    drawn = jax.lax.while_loop(lambda drawn: jnp.any(drawn >= n_first), again, first)
     return jnp.where(number < n_first, drawn, number).astype(jnp.int32)
 
 

@@ -167,9 +167,8 @@ def collide(state: State) -> tuple[Array, Array, Array]:
     theorem). The impact is the shortest displacement along such a direction that separates them, ``float (2,)``; with
     several walls, that of the last. Shapes of the others: ``bool (4,)``.
     """
-    centers, half_sizes, reach = (
-        jnp.asarray(a, state.position.dtype) for a in (WALL_CENTERS, WALL_HALF_SIZES, WALL_REACH)
-    )
+    measures = WALL_CENTERS, WALL_HALF_SIZES, WALL_REACH
+    centers, half_sizes, reach = (jnp.asarray(a, state.position.dtype) for a in measures)
     forward = jnp.stack([jnp.cos(state.heading), jnp.sin(state.heading)])
     sideways = jnp.stack([-forward[1], forward[0]])
     axes = jnp.stack([forward, sideways, jnp.array([1.0, 0.0]), jnp.array([0.0, 1.0])])  # (4, 2)

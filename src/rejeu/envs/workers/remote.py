@@ -59,9 +59,8 @@ class RayOptions:
         validation.coerce(self, ("num_cpus", "memory"), validation.number, optional=True, least=0)
         if not isinstance(self.resources, Mapping):
             raise TypeError(f"resources={self.resources!r} must be a dict of numbers by name")
-        resources = {
-            str(key): validation.number(f"resources[{key!r}]", need, least=0) for key, need in self.resources.items()
-        }
+        needs = self.resources.items()
+        resources = {str(key): validation.number(f"resources[{key!r}]", need, least=0) for key, need in needs}
         validation.assign(self, resources=resources)
 
     def reserved(self, is_local: bool) -> Settings:

@@ -107,9 +107,8 @@ def watch_together(arguments: Watch) -> tuple[int, None]:
     if arguments.fps is not None or arguments.episodes is not None:
         raise ValueError("--fps and --episodes are for one agent, in a window; leave them out")
     models = [find_model(run, arguments.best_or_last) for run in arguments.runs]
-    guests = {
-        str(run): (model, environment_of(model, arguments)) for run, model in zip(arguments.runs, models, strict=True)
-    }
+    pairs = zip(arguments.runs, models, strict=True)
+    guests = {str(run): (model, environment_of(model, arguments)) for run, model in pairs}
     seed = [] if arguments.seed is None else [("seed", str(arguments.seed))]
     page = "/play", [*(("agent", name) for name in guests), ("watch", "1"), *seed]
     open_studio(Path("runs"), guests=guests, page=page, options=arguments)

@@ -160,10 +160,8 @@ def train_together(arguments: Train) -> tuple[int, JsonObject]:
         folder = open_folder(path, Plan(jobs=jobs, threads=threads_of(1)), None, arguments)
         sessions = [first, *(with_seed(first, job.seed, stack) for job in jobs[1:])]
         works = folder.works()
-        sessions = [
-            session.in_folder(work.files, f"seed {work.job.seed}: ")
-            for session, work in zip(sessions, works, strict=True)
-        ]
+        pairs = zip(sessions, works, strict=True)
+        sessions = [session.in_folder(work.files, f"seed {work.job.seed}: ") for session, work in pairs]
         echo(
             header(
                 first.config, first.environment, f"{first.backend}, {len(jobs)} seeds in one program", RunFolder(path)

@@ -14,9 +14,7 @@ from rejeu.core.validation import with_value
 if TYPE_CHECKING:
     from optuna.trial import BaseTrial
 
-RANGES: dict[str, type[Range]] = {
-    range_class.prefix: range_class for range_class in (Uniform, LogUniform, NearOne, Integers)
-}
+RANGES: dict[str, type[Range]] = {entry.prefix: entry for entry in (Uniform, LogUniform, NearOne, Integers)}
 """The classes of ranges by their prefixes."""
 COMPLEMENT = "1 - "
 """Begins the name of a parameter in Optuna whose distance from 1 is sampled."""

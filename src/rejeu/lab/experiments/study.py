@@ -217,9 +217,8 @@ class Study:
         """Returns a trial as plain values, those of a file that may be damaged."""
         with readable(self.folder.journal):
             evaluations = {step: float(value) for step, value in sorted(trial.intermediate_values.items())}
-            value = (
-                evaluations.get(max(evaluations, default=0), math.nan) if trial.value is None else float(trial.value)
-            )
+            last = evaluations.get(max(evaluations, default=0), math.nan)
+            value = last if trial.value is None else float(trial.value)
             return {
                 "index": trial.number,
                 "state": STATES[trial.state.name],

@@ -157,9 +157,8 @@ def make(
     default = dataclasses.replace(base, env_id=env_id, total_steps=total, **of_default)
     texts = {key: str(dimension) for key, dimension in space.items()}
     try:  # as it is read again, so that a study begins and goes on with the same
-        return convert(
-            json.loads(json_text(StudyPlan(default=default, fixed=values, space=texts, **settings))), StudyPlan
-        )
+        plan = StudyPlan(default=default, fixed=values, space=texts, **settings)
+        return convert(json.loads(json_text(plan)), StudyPlan)
     except CheckpointError as error:
         raise ValueError(str(error)) from None
     except TypeError as error:

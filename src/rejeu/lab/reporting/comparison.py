@@ -428,9 +428,8 @@ def warnings_of(curves: Sequence[Curve]) -> list[str]:
         runs = [curve.run for curve in members]
         texts = settings(runs)
         mixed += [label] if len({*texts}) > 1 else []
-        seeds = Counter(
-            (run.config.seed, setting) for run, setting in zip(runs, texts, strict=True) if run.config.seed is not None
-        )
+        pairs = [(run.config.seed, text) for run, text in zip(runs, texts, strict=True)]
+        seeds = Counter((seed, text) for seed, text in pairs if seed is not None)
         repeated += [label] if seeds and max(seeds.values()) > 1 else []
     notes = [
         f"{shown(label, 100)}: the runs of this group differ in their settings; group by setting to separate them"

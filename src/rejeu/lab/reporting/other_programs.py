@@ -70,9 +70,8 @@ def read_monitor(path: Path) -> RunSummary:
     valid = (length >= 0) & (length <= MAX_STEP)
     if not valid.all():
         n_bad = int(np.sum(~valid))
-        notes.append(
-            f"{counted(n_bad, 'damaged row')} without a valid length {'was' if n_bad == 1 else 'were'} left out"
-        )
+        rows = f"{counted(n_bad, 'damaged row')} without a valid length"
+        notes.append(f"{rows} {'was' if n_bad == 1 else 'were'} left out")
     order = np.argsort(seconds, kind="stable")
     order = order[valid[order]]
     steps = np.cumsum(length[order])

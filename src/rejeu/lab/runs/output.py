@@ -83,9 +83,8 @@ def reporter(agent: Agent, table: Sink, folder: RunFolder, label: str = "") -> C
             write = partial(atomic.write, folder.goals, written(("step", "success"), recent))
             agent.failed_writes.attempt(f"goals {folder.goals}", write, is_row=True)
         success = "" if math.isnan(evaluation.success_rate) else f"success {evaluation.success_rate:6.1%}  "
-        echo(
-            f"{label}step {result.step:>9,}  {success}return {evaluation.mean_return:,.2f}{'  (best)' if is_best else ''}"
-        )
+        ending = "  (best)" if is_best else ""
+        echo(f"{label}step {result.step:>9,}  {success}return {evaluation.mean_return:,.2f}{ending}")
 
     return report
 

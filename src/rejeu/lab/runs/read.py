@@ -314,9 +314,8 @@ def read_warnings(path: Path) -> tuple[str, ...]:
         lines = read_bytes(path, MAX_WARNINGS_BYTES).decode("utf-8", "replace").splitlines()
     except OSError:
         return ()
-    return tuple(
-        shown(line, 1000) for line in (*lines[: MAX_WARNINGS - 1], *lines[MAX_WARNINGS - 1 :][-1:]) if line.strip()
-    )
+    first, last = lines[: MAX_WARNINGS - 1], lines[MAX_WARNINGS - 1 :][-1:]
+    return tuple(shown(line, 1000) for line in (*first, *last) if line.strip())
 
 
 def find_videos(folder: RunFolder) -> Iterator[Path]:

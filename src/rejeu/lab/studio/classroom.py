@@ -19,9 +19,8 @@ from rejeu.teaching.courses.leaderboard import Leaderboard
 
 PLACES = "Models whose intervals overlap may be equally good: the place is the range that the intervals allow."
 NAMES = ("place", "name", "algorithm", "steps", "seed", "return", "interval", "success", "length")
-LEFT_OUT = dict.fromkeys(("algorithm", "steps", "seed", "length"), "gt-sm small") | dict.fromkeys(
-    ("bar", "success"), "gt-xs"
-)
+LEFT_OUT = dict.fromkeys(("algorithm", "steps", "seed", "length"), "gt-sm small")
+LEFT_OUT |= dict.fromkeys(("bar", "success"), "gt-xs")
 """Classes of columns that a phone, or the projector, leaves out."""
 
 

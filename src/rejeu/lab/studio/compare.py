@@ -147,9 +147,8 @@ def show(comparison: Comparison) -> None:
     if len(envs) > MOST_DRAWN:
         label = say("environments drawn, {} of {} at most", MOST_DRAWN, len(envs))
         first = [*envs][:MOST_DRAWN]
-        ui.select(
-            envs, label=label, value=first, multiple=True, with_input=True, on_change=lambda event: draw(event.value)
-        )
+        control = ui.select(envs, label=label, value=first, multiple=True, with_input=True)
+        control.on_value_change(lambda event: draw(event.value))
     charts = ui.element("div").classes("w-full charts")
     draw([*envs])
     if comparison.settings:

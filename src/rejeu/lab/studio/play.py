@@ -45,15 +45,13 @@ def build(studio: Studio, request: Request) -> None:
         ui.row().classes("items-center w-full"),
     ):
         env = env_select(environments(studio, env_id), env_id).classes("w-64")
-        agents = ui.select(offered(studio, env_id, names), label=say("agents"), value=names, multiple=True).classes(
-            "w-64"
-        )
+        choices = offered(studio, env_id, names)
+        agents = ui.select(choices, label=say("agents"), value=names, multiple=True).classes("w-64")
         agents.props(f"use-chips max-values={MOST_AGENTS}")
         by_hand = ui.switch(say("I play"), value="watch" not in asked)
         record = ui.switch(say("record")).bind_enabled_from(by_hand, "value")
-        number = ui.number(say("seed"), value=int(seed) if is_number(seed) else None, min=0, precision=0).classes(
-            "w-20"
-        )
+        usual_seed = int(seed) if is_number(seed) else None
+        number = ui.number(say("seed"), value=usual_seed, min=0, precision=0).classes("w-20")
         start = ui.button(say("Start"), icon="play_arrow").props("no-caps")
     stage = ui.column().classes("stage w-full")
 

@@ -269,9 +269,8 @@ def blocks_of(rows: Iterable[Row], labels: Iterable[str]) -> list[Block]:
 def together(label: str, rows: Sequence[Row]) -> Row:
     """Returns the row of a group: sums over its runs, and means over those of one environment that are not damaged."""
     sound, running = ([row for row in rows if keeps(row.state)] for keeps in ("damaged".__ne__, "running".__eq__))
-    envs, algorithms = (
-        sorted({*filter(None, names)}) for names in zip(*((row.env, row.algorithm) for row in rows), strict=True)
-    )
+    columns = zip(*((row.env, row.algorithm) for row in rows), strict=True)
+    envs, algorithms = (sorted({*filter(None, names)}) for names in columns)
     is_alike = len({row.env for row in sound}) == 1
     states = Counter(sorted((row.state for row in rows), key="running".__ne__))
     bests = np.array([row.best.mean_return for row in sound if row.best and is_alike])

@@ -158,9 +158,8 @@ class ThenAndNow:
         if playing is not None:
             is_loading = playing.opened is None and not playing.ended
             loading = say("agents are loaded and compiled ...")
-            self.status.text = (
-                loading if is_loading else say("start {}", self.seed) if not playing.said else playing.said
-            )
+            now = playing.said or say("start {}", self.seed)
+            self.status.text = loading if is_loading else now
 
     async def save(self, button: ui.button, suffix: str) -> None:
         """Writes the clip, and lets the browser save it."""

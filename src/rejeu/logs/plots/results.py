@@ -73,9 +73,8 @@ def learning_curve(
         shown_charts[0]["range"] = charts.fit(ends, np.array([history.best_return]))
 
     figure = drawing.make_figure("drawing a learning curve", height=6.4 if len(shown_charts) > 1 else 4.2)
-    panels = figure.subplots(len(shown_charts), sharex=True, squeeze=False, height_ratios=[3, 2][: len(shown_charts)])[
-        :, 0
-    ]
+    n, ratios = len(shown_charts), [3, 2][: len(shown_charts)]
+    panels = figure.subplots(n, sharex=True, squeeze=False, height_ratios=ratios)[:, 0]
     for panel, chart in zip(panels, shown_charts, strict=True):
         drawing.draw(panel, chart, along, unit)
     last = max((x for series in shown_charts[0]["series"] for x in series[along] if x is not None), default=0) * unit

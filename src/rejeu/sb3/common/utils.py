@@ -57,9 +57,8 @@ class FloatSchedule:
     def __init__(self, value_schedule: Any) -> None:
         if isinstance(value_schedule, FloatSchedule):
             value_schedule = value_schedule.value_schedule
-        self.value_schedule: Any = (
-            value_schedule if callable(value_schedule) else ConstantSchedule(float(value_schedule))
-        )
+        is_schedule = callable(value_schedule)
+        self.value_schedule: Any = value_schedule if is_schedule else ConstantSchedule(float(value_schedule))
 
     def __call__(self, progress_remaining: float) -> float:
         return float(self.value_schedule(progress_remaining))
@@ -214,9 +213,8 @@ def explained_variance(y_pred: np.ndarray, y_true: np.ndarray) -> float:
 def get_latest_run_id(log_path: str | Path = "", log_name: str = "") -> int:
     """Returns the highest k of the folders ``{log_name}_{k}`` in ``log_path``, 0 if there is none."""
     name = re.compile(re.escape(log_name) + r"_(\d+)")
-    run_ids = (
-        name.fullmatch(os.path.basename(path)) for path in glob.glob(os.path.join(glob.escape(str(log_path)), "*"))
-    )
+    paths = glob.glob(os.path.join(glob.escape(str(log_path)), "*"))
+    run_ids = (name.fullmatch(os.path.basename(path)) for path in paths)
     return max((int(match[1]) for match in run_ids if match), default=0)
 
 

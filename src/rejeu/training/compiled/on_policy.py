@@ -84,9 +84,8 @@ class OnPolicyProgram(Program):
         buffer.length = n
         buffer.started, buffer.carry = np.array(experience.started), jax.tree.map(jnp.array, experience.carry)
         if n:
-            stores, downloaded = (
-                jax.tree.leaves(data._replace(started=None, carry=None)) for data in (buffer.rollout(), experience)
-            )
+            both = [data._replace(started=None, carry=None) for data in (buffer.rollout(), experience)]
+            stores, downloaded = map(jax.tree.leaves, both)
             for host, device in zip(stores, downloaded, strict=True):
                 host[:n] = np.asarray(device)[:n]
 

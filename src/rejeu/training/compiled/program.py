@@ -326,9 +326,8 @@ def step_envs(program: Program, env: FunctionalEnv, loop: Loop, action: Array, t
     before = loop.carry.episodes
     assert before.env is not None
     space = spaces.limited(env.action_space, program.config.action_share)
-    vstate, obs, reward, terminated, truncated, success = step_all(
-        env, before.env, spaces.scale_action(space, action, jnp)
-    )
+    scaled = spaces.scale_action(space, action, jnp)
+    vstate, obs, reward, terminated, truncated, success = step_all(env, before.env, scaled)
     obs, reward = observed(env, obs), reward.astype(jnp.float32)
     episode_return, length = before.episode_return + reward, before.length + 1
     ended = terminated | truncated

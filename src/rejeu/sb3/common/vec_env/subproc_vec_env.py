@@ -84,9 +84,8 @@ class SubprocVecEnv(SingleEnvs):
     def step_async(self, actions: Action) -> None:
         self._check_count(actions)
         self._n_steps += 1
-        self.workers.send(
-            {i: ("step_and_reset", action) for i, action in zip(range(self.num_envs), actions, strict=False)}
-        )
+        pairs = zip(range(self.num_envs), actions, strict=False)
+        self.workers.send({i: ("step_and_reset", action) for i, action in pairs})
         self.waiting = True
 
     def step_wait(self) -> VecEnvStepReturn:

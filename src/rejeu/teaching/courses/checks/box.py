@@ -21,9 +21,8 @@ def _action(state: Observation) -> AnyArray:
 def _layers() -> dict[str, PyTree]:
     """Returns a small critic. Both branches have as many outputs, so that their order shows."""
     rng, shapes = np.random.default_rng(0), {"state": (2, 4), "action": (1, 4), "common": (8, 5)}
-    layers: dict[str, PyTree] = {
-        key: [(rng.normal(size=shape), rng.normal(size=shape[1]))] for key, shape in shapes.items()
-    }
+    draw = rng.normal
+    layers: dict[str, PyTree] = {key: [(draw(size=shape), draw(size=shape[1]))] for key, shape in shapes.items()}
     return layers | {"output": (rng.normal(size=(5, 1)), np.array([-1.0]))}
 
 
