@@ -431,8 +431,9 @@ def statistics_of(
     settings = {key: state[key] for key in keys}
     arrays = moments("statistics.returns", state["ret_rms"])
     obs = state["obs_rms"] if state["norm_obs"] else None
-    has_goals = isinstance(obs, dict) and {*spaces.GOAL_KEYS} <= {*obs}
-    goals = [obs[key] for key in spaces.GOAL_KEYS[1:]] if has_goals else []
+    goals = []
+    if isinstance(obs, dict) and {*spaces.GOAL_KEYS} <= {*obs}:
+        goals = [obs[key] for key in spaces.GOAL_KEYS[1:]]
     if goals and not equal(*(moments("", rms) for rms in goals)):
         settings["share_goals"] = False
     for leaf, group in zip(leaves, spaces.groups(leaves, settings.get("share_goals", True)), strict=True):

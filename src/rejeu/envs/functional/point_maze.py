@@ -70,7 +70,7 @@ class PointMaze(GoalEnv):
 
     @property
     def observation_space(self) -> spaces.Dict:
-        goal = np.array(self.walls.shape[::-1], np.float32) / 2
+        goal: np.ndarray = np.array(self.walls.shape[::-1], np.float32) / 2
         high = np.array([*goal, MAX_SPEED, MAX_SPEED], np.float32)
         bounds = zip(GOAL_KEYS, (high, goal, goal), strict=True)
         return spaces.Dict({key: spaces.Box(-bound, bound) for key, bound in bounds})
