@@ -8,6 +8,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from functools import partial
 from itertools import islice
 from typing import Any, Literal, NamedTuple
 
@@ -72,6 +73,9 @@ class Finding(NamedTuple):
     level: Level
     text: str
     """The received value, the expected one, and the fix."""
+
+
+_error, _warning = partial(Finding, "error"), partial(Finding, "warning")
 
 
 class Problems(dict[str, Finding]):
@@ -165,9 +169,8 @@ def _played(env: gym.Env, effort: Effort) -> Problems:
         is_nested = isinstance(env.observation_space, spaces.Dict | spaces.Tuple)
         check_policy("MultiInputPolicy" if is_nested else "MlpPolicy", env.observation_space)
         random_action(env.action_space, 1, np.random.default_rng(SEED))
-        if (
-            not isinstance(env.action_space, spaces.Box) or env.action_space.dtype.kind == "f"
-        ):  # SAC takes whole numbers too
+        # Whole numbers of a Box are taken by SAC alone.
+        if not isinstance(env.action_space, spaces.Box) or env.action_space.dtype.kind == "f":
             check_action(env.action_space, "every algorithm")
     except (TypeError, ValueError) as error:
         problems.add("space", str(error))
@@ -326,19 +329,18 @@ def _gymnasium_messages(env: gym.Env, skip_render_check: bool) -> list[str]:
     ]
 
 
-def goal_problems(env: gym.Env, steps: Sequence[SeenStep], keeps_infos: bool = False) -> Iterator[tuple[Level, str]]:
+def goal_problems(env: gym.Env, steps: Sequence[SeenStep], keeps_infos: bool = False) -> Iterator[Finding]:
     """Yields the problems with the goals of an environment, from some of its steps: the first of each function."""
     try:
         check_goal_space(env.observation_space)
     except ValueError as error:
-        yield "error", str(error)
+        yield _error(str(error))
         return
     functions = _functions_of_goals(env)
     if "compute_reward" not in functions:
-        yield (
-            "error",
+        yield _error(
             "observations with a desired_goal need the method compute_reward(achieved_goal, desired_goal, info), and "
-            "there is none; add it, for hindsight replay",
+            "there is none; add it, for hindsight replay"
         )
         return
     ended = [step for step in steps if step.terminated][: MOST_GOALS // 4]
@@ -368,93 +370,86 @@ def _pairs(first: SeenStep, row: SeenStep) -> tuple[tuple[Any, Any], tuple[Any, 
     return (_goals(first)[0], _goals(row)[0]), (_goals(row)[1], _goals(first)[0])
 
 
-def _ends_at_goals(reward: Callable[..., Any], ended: Sequence[SeenStep]) -> Iterator[tuple[Level, str]]:
+def _ends_at_goals(reward: Callable[..., Any], ended: Sequence[SeenStep]) -> Iterator[Finding]:
     """Yields advice where an episode ended at its goal, in an environment without ``compute_terminated``."""
     for row in ended:
         _, desired = _goals(row)
         is_best = _agree(row.reward, one_number(_attempt(reward, desired, desired, row.info)))
         if is_best or success_of(row.info) == 1.0:
-            yield (
-                "warning",
+            yield _warning(
                 "an episode terminated at its goal, and there is no compute_terminated(achieved_goal, desired_goal, info); "
-                "add it, or hindsight replay teaches that episodes go on at all other goals",
+                "add it, or hindsight replay teaches that episodes go on at all other goals"
             )
 
 
 def _goal_faults(
     name: str, function: Callable[..., Any], rows: Sequence[SeenStep], keeps_infos: bool
-) -> Iterator[tuple[Level, str]]:
+) -> Iterator[Finding]:
     """Yields the problems with ``compute_reward`` or ``compute_terminated``, the worst first."""
     for row in rows:
         goals = copy.deepcopy(_goals(row))
         result = one_number(function(*goals, row.info))
         if (fault := _result_fault(name, result)) is not None:
-            yield "error", f"{name} of one goal returned {fault}"
+            yield _error(f"{name} of one goal returned {fault}")
         if not all(map(np.array_equal, goals, _goals(row))):
-            yield "error", f"{name} changes its arguments in place; compute new arrays: achieved_goal - desired_goal"
+            yield _error(f"{name} changes its arguments in place; compute new arrays: achieved_goal - desired_goal")
         for pair, before in zip(_pairs(rows[0], row), row.judged.get(name, ()), strict=False):
             after = _attempt(function, *pair, row.info)
             if not _agree(one_number(before), one_number(after)):
-                yield (
-                    "error",
+                yield _error(
                     f"{name} of the same two goals gave {before} after one step and {after} later: it reads something else, "
-                    "such as the state of the environment; compute it from its arguments alone",
+                    "such as the state of the environment; compute it from its arguments alone"
                 )
         yield from _against_step(name, result, row)
         alone = result if keeps_infos else _attempt(function, *_goals(row), {})
         if not _agree(result, one_number(alone)):
-            yield (
-                "error",
+            yield _error(
                 f"{name} gave {result} with the info of the step, and {_describe_result(alone)} with an empty info; let it "
-                "depend on the goals alone, or keep infos with replay_buffer_kwargs={'copy_info_dict': True}",
+                "depend on the goals alone, or keep infos with replay_buffer_kwargs={'copy_info_dict': True}"
             )
     if not keeps_infos:
         yield from _against_batches(name, function, rows)
 
 
-def _against_step(name: str, result: object, row: SeenStep) -> Iterator[tuple[Level, str]]:
+def _against_step(name: str, result: object, row: SeenStep) -> Iterator[Finding]:
     """Yields the difference between a step and the function for one goal."""
     if name == "compute_terminated" and result and not row.terminated:  # it may end otherwise, as in a crash
-        yield (
-            "error",
+        yield _error(
             "compute_terminated gave True where step gave terminated=False; hindsight replay goes by the former: let step "
-            "return it too",
+            "return it too"
         )
     if name == "compute_reward" and not _agree(result, row.reward):
         text = f"step gave the reward {row.reward}, and compute_reward of the same goals {result}"
         if row.terminated:
-            yield "warning", f"{text}, where the episode ended; hindsight replay will not know of the difference"
-        yield "error", f"{text}; they must agree: let step call compute_reward"
+            yield _warning(f"{text}, where the episode ended; hindsight replay will not know of the difference")
+        yield _error(f"{text}; they must agree: let step call compute_reward")
 
 
-def _against_batches(name: str, function: Callable[..., Any], rows: Sequence[SeenStep]) -> Iterator[tuple[Level, str]]:
+def _against_batches(name: str, function: Callable[..., Any], rows: Sequence[SeenStep]) -> Iterator[Finding]:
     """Yields the difference between the results for many goals at once and for each alone."""
     achieved, desired = (np.array([_goals(row)[k] for row in rows]) for k in range(2))
     achieved, desired = np.concatenate([achieved] * 2), np.concatenate([np.roll(desired, 1, axis=0), achieved])
     single = [one_number(_attempt(function, a, d, {})) for a, d in zip(achieved, desired, strict=True)]
     for result in single:
         if (fault := _result_fault(name, result)) is not None:
-            yield "error", f"{name} of goals of other steps returned {fault}; it must take any goals of the space"
+            yield _error(f"{name} of goals of other steps returned {fault}; it must take any goals of the space")
     if name == "compute_reward" and _agree(single, single[0]):
-        yield (
-            "warning",
+        yield _warning(
             f"compute_reward gave {single[0]} for each of {len(single)} pairs of goals, also of equal ones; let it compare "
-            "achieved_goal with desired_goal, with a tolerance that some pass and some do not",
+            "achieved_goal with desired_goal, with a tolerance that some pass and some do not"
         )
     whole = _attempt(function, achieved, desired, {})
     if isinstance(whole, Exception) or not is_batch(whole, len(achieved)):
         got = _describe_result(whole) if isinstance(whole, Exception) else f"gave {validation.describe_value(whole)}"
-        yield (
-            "warning",
+        yield _warning(
             f"{name} of {len(achieved)} goals at once {got}, expected numbers ({len(achieved)},); rejeu then calls it row by "
-            "row, which is slow: compute over the last axis, as np.linalg.norm(achieved - desired, axis=-1) does",
+            "row, which is slow: compute over the last axis, as np.linalg.norm(achieved - desired, axis=-1) does"
         )
     elif not _agree(whole, np.array(single)):
         at = int(np.flatnonzero(~np.isclose(whole, single, rtol=1e-4, atol=1e-5))[0])
-        yield (
-            "error",
+        yield _error(
             f"{name} of many goals at once gave {whole[at]} in row {at}, and {single[at]} of the same goals one by one; "
-            "compute each row by itself: over the last axis",
+            "compute each row by itself: over the last axis"
         )
 
 
