@@ -88,16 +88,8 @@ class Evaluation:
 
     def to_dict(self) -> JsonObject:
         """Returns the statistics by name, as ``rejeu evaluate --json`` prints them."""
-        return {
-            "episodes": self.n,
-            "cut": self.cut,
-            "mean_return": self.mean_return,
-            "std_return": self.std_return,
-            "return_interval": self.return_interval,
-            "mean_length": self.mean_length,
-            "success_rate": self.success_rate,
-            "success_interval": self.success_interval,
-        }
+        names = ("mean_return", "std_return", "return_interval", "mean_length", "success_rate", "success_interval")
+        return {"episodes": self.n, "cut": self.cut, **{name: getattr(self, name) for name in names}}
 
     def plot(self, path: str | Path | None = None) -> Picture:
         """Returns a matplotlib figure of the returns and their mean, which notebooks display.

@@ -26,6 +26,8 @@ MAX_CELLS = 2**23
 """Upper limit on the cells of one table; a million episodes fit."""
 MAX_LINE = 2**20
 """Upper limit on the bytes of a line."""
+MEANS = ("success_rate", "mean_return", "std_return", "mean_length")
+"""Columns of a table of evaluations that are attributes of :class:`rejeu.Evaluation`."""
 HUGE = 1e100
 """Magnitude from which a return is taken for damage."""
 
@@ -60,8 +62,7 @@ def evaluation_table(evaluations: Iterable[tuple[int, Any]], episodes: Table = E
     pairs = list(evaluations)
     steps = np.array([step for step, _ in pairs], np.float64)
     results = [result for _, result in pairs]
-    names = ("success_rate", "mean_return", "std_return", "mean_length")
-    columns = {name: np.array([getattr(evaluated, name) for evaluated in results], np.float64) for name in names}
+    columns = {name: np.array([getattr(evaluated, name) for evaluated in results], np.float64) for name in MEANS}
     columns["episodes"] = np.array([len(evaluated.returns) for evaluated in results], np.float64)
     if len(episodes):
         columns["seconds"] = np.interp(steps, episodes.column("step"), episodes.column("seconds"))

@@ -36,14 +36,9 @@ def run_clone(arguments: Clone) -> tuple[int, JsonObject]:
     stopwatch = Stopwatch()
     shown = demonstrations.read(arguments.dataset)
     environment = environment_of(shown, arguments)
-    task = Train(
-        env=environment.run.typed,
-        env_kwargs=environment.run.env_kwargs,
-        wrappers=environment.run.wrappers,
-        imports=environment.run.imports,
-        algorithm=arguments.algo,
-        **{name: getattr(arguments, name) for name in OF_TRAIN},
-    )
+    options = {name: getattr(arguments, name) for name in OF_TRAIN}
+    options |= {name: getattr(environment.run, name) for name in ("env_kwargs", "wrappers", "imports")}
+    task = Train(env=environment.run.typed, algorithm=arguments.algo, **options)
     with ExitStack() as stack:
         session, stop = begin(task, stack, write_report), stack.enter_context(Interrupt())
         expert = None if arguments.expert is None else expert_of(arguments.expert, arguments, environment)

@@ -14,15 +14,9 @@ from rejeu.logs.formatting import show_table
 
 def run_compare(arguments: Compare) -> tuple[int, JsonObject]:
     """Compares runs, prints a table, and writes what was asked for."""
-    comparison = compare(
-        arguments.runs,
-        arguments.by,
-        x=arguments.x,
-        score=arguments.score,
-        statistic=arguments.statistic,
-        normalize=references(arguments.reference) or arguments.normalize,
-        threshold=arguments.threshold,
-    )
+    options = {name: getattr(arguments, name) for name in ("by", "x", "score", "statistic", "threshold")}
+    normalize = references(arguments.reference) or arguments.normalize
+    comparison = compare(arguments.runs, normalize=normalize, **options)
     out = arguments.out or (Path("compare.html") if arguments.open else None)
     written = [] if out is None else comparison.save(out)
     if not arguments.json:

@@ -123,15 +123,8 @@ def run_play(arguments: Play) -> tuple[int, JsonObject]:
     environment = from_arguments(full_name(arguments.env), arguments)
     against = arguments.against
     agent = None if against is None else agent_of("--against", against, arguments.best_or_last, environment)
-    game = play(
-        environment.make,
-        keys=parse_keys(arguments.keys),
-        seed=arguments.seed,
-        fps=arguments.fps,
-        episodes=arguments.episodes,
-        record=arguments.record,
-        against=agent,
-    )
+    options = {name: getattr(arguments, name) for name in ("seed", "fps", "episodes", "record")}
+    game = play(environment.make, keys=parse_keys(arguments.keys), against=agent, **options)
     echo(scores(game))
     if (recording := game.players[0].recording) is not None:
         echo(recording)

@@ -21,7 +21,7 @@ from rejeu.envs.make import BACKENDS
 from rejeu.lab.cli.commands import Sweep
 from rejeu.lab.experiments.folder import Plan, SweepFolder, open_folder, read_folder
 from rejeu.lab.experiments.sweep import SweepResult, imports_of, make_launcher, prepare, states_text, train
-from rejeu.lab.experiments.work import Job, Work, again
+from rejeu.lab.experiments.work import FILES, Job, Work, again
 from rejeu.lab.reporting.comparison import By, Comparison, compare
 from rejeu.lab.reporting.report import write_report
 from rejeu.lab.runs.arguments import Resume, Train
@@ -119,15 +119,9 @@ def make_jobs(arguments: Train) -> tuple[Job, ...]:
     if arguments.ray not in (None, "auto"):
         os.environ["RAY_ADDRESS"] = arguments.ray  # no file may name an address
     run = RunConfig(**{**values, "ray": None if arguments.ray is None else "auto", "imports": ()})
-    return tuple(
-        Job(
-            name=f"seed_{seed}",
-            run=dataclasses.replace(run, seed=seed),
-            no_report=arguments.no_report,
-            no_video=arguments.no_video,
-        )
-        for seed in range(first, first + arguments.seeds)
-    )
+    seeds = range(first, first + arguments.seeds)
+    outputs = {name: getattr(arguments, name) for name in FILES}
+    return tuple(Job(name=f"seed_{seed}", run=dataclasses.replace(run, seed=seed), **outputs) for seed in seeds)
 
 
 def choose_folder(arguments: Train) -> Path:
@@ -162,11 +156,8 @@ def train_together(arguments: Train) -> tuple[int, JsonObject]:
         works = folder.works()
         pairs = zip(sessions, works, strict=True)
         sessions = [session.in_folder(work.files, f"seed {work.job.seed}: ") for session, work in pairs]
-        echo(
-            header(
-                first.config, first.environment, f"{first.backend}, {len(jobs)} seeds in one program", RunFolder(path)
-            )
-        )
+        backend = f"{first.backend}, {len(jobs)} seeds in one program"
+        echo(header(first.config, first.environment, backend, RunFolder(path)))
         for work in works:
             claim = hold(work.claim)
             assert claim is not None, "another process uses a new folder"
@@ -196,12 +187,7 @@ def train_sessions(sessions: list[Session], stop: Interrupt, stopwatch: Stopwatc
             training.start_call(agent, session.limits.steps, None, session.limits.minutes, session.log_interval, True)
             for agent, session in zip(agents, sessions, strict=True)
         ]
-        learn_together(
-            agents,
-            calls,
-            [learning.callbacks for learning in learnings],
-            [learning.sinks for learning in learnings],
-            progress_bar=True,
-        )
+        callbacks, sinks = zip(*((learning.callbacks, learning.sinks) for learning in learnings), strict=True)
+        learn_together(agents, calls, callbacks, sinks, progress_bar=True)
     finished = zip(sessions, learnings, strict=True)
     return [session.finish(learning, stop, stopwatch)[0] for session, learning in finished]

@@ -211,16 +211,9 @@ class RayLauncher:
         from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
         nodes = [node for node in ray.nodes() if node["Alive"]]
-        references = [
-            ray.remote(look)
-            .options(
-                num_cpus=0,
-                max_retries=0,
-                scheduling_strategy=NodeAffinitySchedulingStrategy(node["NodeID"], soft=False),
-            )
-            .remote(self._marker)
-            for node in nodes
-        ]
+        task, options = ray.remote(look), {"num_cpus": 0, "max_retries": 0}
+        there = [NodeAffinitySchedulingStrategy(node["NodeID"], soft=False) for node in nodes]
+        references = [task.options(**options, scheduling_strategy=node).remote(self._marker) for node in there]
         lost = ray.exceptions.NodeDiedError, ray.exceptions.TaskUnschedulableError, ray.exceptions.WorkerCrashedError
         for node, reference in zip(nodes, references, strict=True):
             where = f"the node {node['NodeManagerHostname']}"

@@ -84,10 +84,9 @@ class StudyFolder:
             Job(name=f"seed_{seed}", run=dataclasses.replace(run, seed=seed, imports=()), no_report=True, no_video=True)
             for seed in seeds
         ]
-        name = self.path.name
-        return [
-            Work(self.path, job, run.imports, True, f"{name}, {job.label}", keeps_checkpoints=False) for job in jobs
-        ]
+        names = [f"{self.path.name}, {job.label}" for job in jobs]
+        pairs = zip(jobs, names, strict=True)
+        return [Work(self.path, job, run.imports, True, name, keeps_checkpoints=False) for job, name in pairs]
 
 
 @dataclass(eq=False)

@@ -166,14 +166,11 @@ class Comparison:
                 "group": group.label,
                 "env": group.env_id,
                 "runs": len(group.runs),
-                "iqm": group.score[0],
-                "iqm_low": group.score[1],
-                "iqm_high": group.score[2],
+                **dict(zip(("iqm", "iqm_low", "iqm_high"), group.score, strict=True)),
                 "mean": group.mean,
                 "median": group.median,
                 "threshold": self.threshold,
-                "reached": None if group.reached is None else group.reached[0],
-                f"{self.axis}_to_threshold": None if group.reached is None else group.reached[1],
+                **dict(zip(("reached", f"{self.axis}_to_threshold"), group.reached or (None, None), strict=True)),
             }
             for group in self.groups
         ]

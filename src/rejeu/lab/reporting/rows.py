@@ -37,6 +37,8 @@ LONGEST = 10.0
 SLICE = 64
 """Most files of another program's run whose times are looked at."""
 
+OF_RUN = ("path", "name", "format", "state", "steps", "seconds", "warnings", "remarks")
+"""What a row has of its run as it is."""
 BEGINS = "begins; functions are compiled, which takes up to a minute"
 """Note on a run that has not taken a step."""
 
@@ -227,16 +229,11 @@ def describe(run: RunSummary) -> Row:
     folder = RunFolder(run.path)
     recent = returns if len(returns) else means[np.isfinite(means)][-1:]
     return Row(
-        path=run.path,
-        name=run.name,
-        format=run.format,
+        **{name: getattr(run, name) for name in OF_RUN},
         env=config.env,
         algorithm=config.algorithm,
         seed=config.seed,
-        state=run.state,
-        steps=run.steps,
         steps_asked=config.steps,
-        seconds=run.seconds,
         steps_per_second=rate,
         seconds_left=seconds_left if run.state == "running" else None,
         episodes=len(run.episodes),
@@ -246,8 +243,6 @@ def describe(run: RunSummary) -> Row:
         curve=curve(run),
         changed=max((time_of(path) or (0, 0))[0] for path in files(run.path)) / 1e9,
         pictures=tuple(path.name for path in (folder.video, folder.curve) if is_file(path)),
-        warnings=run.warnings,
-        remarks=run.remarks,
         notes=(*filter(None, [run.error if run.state == "crashed" else ""]), *run.notes),
     )
 

@@ -53,18 +53,11 @@ def begin(arguments: Train, stack: ExitStack, report: Report) -> Session:
     agent = AGENTS[config.algorithm](config.policy, env, **general, **config.hyperparameters)
     if env.backend not in ("envpool", "jax"):
         check_own_environment(environment, agent.config)
-    return Session(
-        agent,
-        config,
-        RunFolder(Path()),
-        environment,
-        stack.enter_context(closing(make_evaluation_env(config, environment))),
-        TrainingLimits(config.steps, config.minutes, pause_steps=arguments.pause),
-        is_new=True,
-        report=None if arguments.no_report else report,
-        has_video=not arguments.no_video,
-        backend=describe_backend(env, environment, preset),
-    )
+    evaluation_env = stack.enter_context(closing(make_evaluation_env(config, environment)))
+    limits = TrainingLimits(config.steps, config.minutes, pause_steps=arguments.pause)
+    run = agent, config, RunFolder(Path()), environment, evaluation_env, limits
+    outputs = None if arguments.no_report else report, not arguments.no_video
+    return Session(*run, True, *outputs, describe_backend(env, environment, preset))
 
 
 def make_env(arguments: Train, environment: Environment, preset: Preset | None, seed: int) -> VectorEnv:

@@ -26,7 +26,7 @@ from rejeu.lab.runs.read import RunSummary, read_warnings
 from rejeu.lab.runs.requests import keep_model
 from rejeu.logs.formatting import counted, quoted
 from rejeu.logs.logging import Sink
-from rejeu.logs.tables import written
+from rejeu.logs.tables import MEANS, written
 
 echo = partial(print, flush=True)
 MOST_GOALS = 100
@@ -64,18 +64,9 @@ def reporter(agent: Agent, table: Sink, folder: RunFolder, label: str = "") -> C
 
     def report(result: Evaluated, is_best: bool) -> None:
         evaluation = result.evaluation
-        table.write(
-            result.step,
-            {
-                "seconds": agent.seconds["total"],
-                "success_rate": evaluation.success_rate,
-                "mean_return": evaluation.mean_return,
-                "std_return": evaluation.std_return,
-                "mean_length": evaluation.mean_length,
-                "episodes": len(evaluation.returns),
-                "best": int(is_best),
-            },
-        )
+        means = {name: getattr(evaluation, name) for name in MEANS}
+        row = {"seconds": agent.seconds["total"], **means, "episodes": len(evaluation.returns), "best": int(is_best)}
+        table.write(result.step, row)
         keep_model(agent, folder.models, result.step)
         rows = zip(evaluation.successes.tolist(), evaluation.goals.tolist(), strict=False)
         recent.extend([result.step, success, *goal] for success, goal in rows)
@@ -93,7 +84,6 @@ def as_dict(
     agent: Agent, folder: RunFolder, evaluate: Evaluate, signal: int | None, is_complete: bool, stopwatch: Stopwatch
 ) -> JsonObject:
     """Returns how a run ended, for :func:`summary` and ``--json``."""
-    means = ("mean_return", "std_return", "mean_length", "success_rate")
     last = agent.history.summary(agent.stats_window_size).last
     best = evaluate.best
     seconds, compile_seconds = stopwatch.seconds()
@@ -109,7 +99,7 @@ def as_dict(
         "seconds": seconds,
         "compile_seconds": compile_seconds,
         "steps_per_second": agent.steps_per_second,
-        "training": {"episodes": last.n, **{name: getattr(last, name) for name in means}},
+        "training": {"episodes": last.n, **{name: getattr(last, name) for name in MEANS}},
         "best": None if best is None else {"step": best.step, **best.evaluation.to_dict()},
         "files": sorted(path.name for path in folder.path.iterdir()),
         "not_written": [*agent.failed_writes.failures],

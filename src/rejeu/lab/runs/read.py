@@ -177,8 +177,9 @@ def read_run(path: str | Path, columns: Collection[str] | None = None) -> RunSum
     metrics = statistics_rows(metrics)
     episodes = ordered(read_table(files.episodes, columns))
     goals, replays = (read_table(path) if is_file(path) else EMPTY for path in (files.goals, files.replays))
-    tables = (episodes, metrics, evaluations)
-    last_steps = [int(table.column("step")[-1]) for table in tables if len(table)]
+    tables: Settings = {"episodes": episodes, "metrics": metrics, "evaluations": evaluations}
+    last_steps = [int(table.column("step")[-1]) for table in tables.values() if len(table)]
+    tables |= {"goals": goals, "replays": replays}
     times = (episodes.column("seconds"), metrics.column("time/time_elapsed"), evaluations.column("seconds"))
     run = RunSummary(
         path=folder,
@@ -187,16 +188,12 @@ def read_run(path: str | Path, columns: Collection[str] | None = None) -> RunSum
         versions={shown(name): shown(version) for name, version in versions.items() if version is not None},
         steps=max(0, newest_step(files.checkpoints), *last_steps),
         seconds=max((column[-1] for column in times if len(column) and math.isfinite(column[-1])), default=math.nan),
-        episodes=episodes,
-        evaluations=evaluations,
-        metrics=metrics,
-        goals=goals,
-        replays=replays,
+        **tables,
         warnings=read_warnings(files.warnings),
         videos=tuple(find_videos(files)),
         models=tuple(path for path in (files.best, files.agent) if is_file(path)),
         remarks=read_remarks(files.remarks),
-        notes=(*notes, *(note for table in (*tables, goals, replays) for note in table.notes)),
+        notes=(*notes, *(note for table in tables.values() for note in table.notes)),
     )
     state = state_of(run)
     if state == "running":  # in its first seconds nothing was written

@@ -83,18 +83,9 @@ def train_on(
         echo(f"run folder    {folder.path}: {environment}, {config.algorithm}, seed {config.seed}")
         echo(f"checkpoint    {agent.resumed}")
         with closing(make_evaluation_env(config, environment)) as evaluation_env, Interrupt() as stop:
-            session = Session(
-                agent,
-                config,
-                folder,
-                environment,
-                evaluation_env,
-                limits,
-                is_new=False,
-                report=None if arguments.no_report else report,
-                has_video=not arguments.no_video,
-            )
-            return session.run(stop, stopwatch)
+            run = agent, config, folder, environment, evaluation_env, limits
+            outputs = None if arguments.no_report else report, not arguments.no_video
+            return Session(*run, False, *outputs).run(stop, stopwatch)
 
 
 def changes(arguments: Continued, config: DecidedRun) -> Settings:

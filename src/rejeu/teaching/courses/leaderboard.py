@@ -276,10 +276,7 @@ def to_dict(board: Leaderboard) -> JsonObject:
     """Returns a leaderboard as JSON values."""
     rows = [
         {
-            "name": row.name,
-            "algorithm": row.algorithm,
-            "steps": row.steps,
-            "seed": row.seed,
+            **{name: getattr(row, name) for name in ("name", "algorithm", "steps", "seed")},
             "places": [row.first, row.last],
             "mean_return": (result := row.evaluation).mean_return,
             "return_interval": [*row.interval],
