@@ -654,13 +654,12 @@ class Agent(AnyAgent):
             FileNotFoundError: if there is no such file.
             CheckpointError: if the file is damaged, or its algorithm, spaces, schema or shapes do not match.
         """
+
+        def make_envs(agent: Self) -> VectorEnv | None:
+            return None if env is None else agent.make_envs(env, seed=agent.identity.seed)
+
         with checkpoint.opened(find_model(path), "agent") as file:
-            agent = model_files.load(
-                cls,
-                file,
-                lambda agent: None if env is None else agent.make_envs(env, seed=agent.identity.seed),
-                changes,
-            )
+            agent = model_files.load(cls, file, make_envs, changes)
         agent.made_from_id = isinstance(env, str)
         return agent
 

@@ -86,12 +86,9 @@ def notes_beside(path: Path, used: Any, changes: Any = ()) -> list[str]:
     for key in ("env_wrapper", "vec_env_wrapper"):
         if wrapper := args.get(key):
             names = re.findall(r"[A-Za-z_]\w*(?:\.\w+)+", shown(wrapper, 300))
-            ours = [
-                f"--wrapper {':'.join(f'{HERE[start]}{name.removeprefix(start)}'.rsplit('.', 1))}"
-                for name in names
-                for start in HERE
-                if name.startswith(start)
-            ]
+            starts = [(name, start) for name in names for start in HERE if name.startswith(start)]
+            paths = [f"{HERE[start]}{name.removeprefix(start)}" for name, start in starts]
+            ours = [f"--wrapper {':'.join(path.rsplit('.', 1))}" for path in paths]
             notes.append(
                 f"config.yml: it was trained behind {shown(wrapper, 200)}; wrap the environment: {' '.join(ours)}"
             )

@@ -106,9 +106,8 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         if config.normalize_advantage:
             data = data._replace(advantage=standardized(data.advantage, data.valid))
         (_, losses), gradients = jax.value_and_grad(loss, has_aux=True)(state.network, data, config, clock)
-        network, optimizer_state = clip_and_descend(
-            state.network, gradients, state.optimizer, optimizer, config, clock.progress
-        )
+        descent = state.optimizer, optimizer, config, clock.progress
+        network, optimizer_state = clip_and_descend(state.network, gradients, *descent)
         metrics = {
             "policy_loss": losses.policy_loss,
             "value_loss": losses.value_loss,

@@ -32,7 +32,7 @@ from rejeu.algorithms.config import network_inputs
 from rejeu.algorithms.rollout_config import RolloutConfig
 from rejeu.algorithms.search import LogUniform, SearchSpace
 from rejeu.core import schedules
-from rejeu.core.algorithm import Algorithm, Clock, Explorer, Metrics, PyTree, Rollout, Scalar
+from rejeu.core.algorithm import Algorithm, Clock, Explorer, Metrics, PyTree, Rollout, Scalar, renew
 from rejeu.core.prng import nth
 from rejeu.core.schedules import Schedule, at
 from rejeu.core.spaces import action_dimension, check_action
@@ -170,9 +170,7 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
         candidate = begun * n_envs + jnp.arange(n_envs, dtype=jnp.int32)
         fresh = jax.vmap(lambda i: perturbed(actor, i, std, config.n_delta))(candidate)
         starts = ended | is_new
-        networks = jax.tree.map(
-            lambda new, old: jnp.where(starts.reshape(-1, *[1] * (old.ndim - 1)), new, old), fresh, playing.network
-        )
+        networks = renew(starts, fresh, playing.network)
         each = jax.tree.map(lambda leaf: leaf[:, None], obs)
         action = jax.vmap(act)(networks, each)[:, 0]
         number = jnp.broadcast_to(actor.n_rollouts, (n_envs,))

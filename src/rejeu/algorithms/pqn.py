@@ -178,8 +178,9 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
 
         def step(i: Array, learned: tuple[Network, PyTree, Array]) -> tuple[Network, PyTree, Array]:
             network, optimizer_state, sums = learned
+            batch = minibatch(i)
             network, optimizer_state, loss, q_value = minimize(
-                td_loss, network, optimizer_state, optimizer, rate, minibatch(i)
+                td_loss, network, optimizer_state, optimizer, rate, batch
             )
             return network, optimizer_state, sums + jnp.stack([loss, q_value])
 

@@ -134,9 +134,8 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     optimizer = optimizers.make(config.optimizer, config.max_grad_norm)
 
     def init(key: Array) -> State:
-        return initial_state(
-            key, lambda key: ActorCritic(key, obs_leaves, action_kind, shape, config.use_sde), optimizer
-        )
+        make = lambda key: ActorCritic(key, obs_leaves, action_kind, shape, config.use_sde)  # noqa: E731
+        return initial_state(key, make, optimizer)
 
     def update(state: State, rollout: Rollout, clock: Clock) -> tuple[State, Metrics]:
         warn_of_unused(config.sub_sampling_factor, rollout.reward.shape[1])
@@ -148,9 +147,8 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
 
         def fit(i: Array, learned: tuple[ActorCritic, PyTree, Array]) -> tuple[ActorCritic, PyTree, Array]:
             network, optimizer_state, total = learned
-            network, optimizer_state, loss, _ = minimize(
-                value_loss, network, optimizer_state, optimizer, rate, minibatch(i)
-            )
+            batch = minibatch(i)
+            network, optimizer_state, loss, _ = minimize(value_loss, network, optimizer_state, optimizer, rate, batch)
             return network, optimizer_state, total + loss
 
         before = network, state.optimizer, jnp.float32(0.0)
@@ -173,9 +171,8 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
 def warn_of_unused(factor: int, n_envs: int) -> None:
     """Warns if every ``factor``-th step is always one of the same environments, as they are side by side in a rollout."""
     if (shared := math.gcd(factor, n_envs)) > 1:
-        warnings.warn(
-            f"sub_sampling_factor={factor} takes {n_envs // shared} of {n_envs} environments only", stacklevel=2
-        )
+        text = f"sub_sampling_factor={factor} takes {n_envs // shared} of {n_envs} environments only"
+        warnings.warn(text, stacklevel=2)
 
 
 def policy_step(network: ActorCritic, data: Samples, config: Config) -> tuple[ActorCritic, TrustRegionStep]:

@@ -139,12 +139,10 @@ def is_deep(value: object, max_depth: int) -> bool:
     """Returns whether a JSON value has more than ``max_depth`` levels."""
     level = [value]
     for _ in range(max_depth):
-        level = [
-            child
-            for node in level
-            if isinstance(node, dict | list)
-            for child in (node.values() if isinstance(node, dict) else node)
+        children = [
+            node.values() if isinstance(node, dict) else node for node in level if isinstance(node, dict | list)
         ]
+        level = [child for nodes in children for child in nodes]
         if not level:
             break
     return bool(level)

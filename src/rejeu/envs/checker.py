@@ -321,12 +321,9 @@ def _gymnasium_messages(env: gym.Env, skip_render_check: bool) -> list[str]:
         except Exception as error:  # whatever it refuses by, such as its own mask, which that checker does not ask for
             refused = [] if attribute(env, masks.METHOD) or masks.MASK in env.reset()[1] else [f"{error}"]
     messages = [re.sub(r"\x1b\[[\d;]*m|WARN: ", "", str(warning.message)) for warning in caught] + refused
-    return [
-        f"gymnasium.utils.env_checker: {' '.join(message.split())}"
-        for message in dict.fromkeys(messages)
-        if "different from the unwrapped version" not in message
-        and "symmetric and normalized" not in message  # rejeu scales actions
-    ]
+    hidden = ("different from the unwrapped version", "symmetric and normalized")  # rejeu scales actions
+    shown = [text for text in dict.fromkeys(messages) if not any(part in text for part in hidden)]
+    return [f"gymnasium.utils.env_checker: {' '.join(text.split())}" for text in shown]
 
 
 def goal_problems(env: gym.Env, steps: Sequence[SeenStep], keeps_infos: bool = False) -> Iterator[Finding]:

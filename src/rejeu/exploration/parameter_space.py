@@ -28,7 +28,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from rejeu.core.algorithm import Algorithm, Clock, PyTree
+from rejeu.core.algorithm import Algorithm, Clock, PyTree, renew
 from rejeu.core.validation import coerce, number, whole
 from rejeu.networks import LayerNorm
 from rejeu.networks.batch_renorm import BatchRenorm
@@ -131,14 +131,11 @@ def begin_episodes(noise: ParameterNoise, state: State, begins: Array, target: f
     sigma = adapt(noise, state, begins, target)
 
     def drawn() -> list[Array]:
-        return [
-            jnp.where(
-                begins.reshape(-1, *[1] * (old.ndim - 1)),
-                sigma.astype(old.dtype) * jax.random.normal(jax.random.fold_in(key, i), old.shape, old.dtype),
-                old,
-            )
+        fresh = [
+            sigma.astype(old.dtype) * jax.random.normal(jax.random.fold_in(key, i), old.shape, old.dtype)
             for i, old in enumerate(state.perturbation)
         ]
+        return renew(begins, fresh, state.perturbation)
 
     return State(
         perturbation=jax.lax.cond(begins.any(), drawn, lambda: state.perturbation),

@@ -74,13 +74,9 @@ class FrameStack(NamedTuple):
 
     def begins_with_zeros(self, arrays: list[Any]) -> bool:
         """Returns whether these first observations of episodes, by leaf, hold zeros besides the newest frame."""
-        frames = [i for i, axis in enumerate(self.axes) if axis is not None]
         empty = self._replace(zeros=True)
-        return all(
-            np.array_equal(empty.pushed(i, first, self.newest(i, first), True), first)
-            for i in frames
-            for first in arrays[i]
-        )
+        firsts = [(i, first) for i, axis in enumerate(self.axes) if axis is not None for first in arrays[i]]
+        return all(np.array_equal(empty.pushed(i, first, self.newest(i, first), True), first) for i, first in firsts)
 
 
 def frame_stack_of(leaves: tuple[Leaf, ...], n: int) -> FrameStack:

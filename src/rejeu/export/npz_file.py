@@ -30,9 +30,8 @@ def described(program: TracedProgram) -> tuple[JsonObject, list[np.ndarray]]:
     def listed(values: Any) -> list[int]:
         return [numbers[value] for value in values]
 
-    steps = [
-        [name_of(value), listed(value.inputs), listed(value.outputs), parameters(value)] for value in program.operations
-    ]
+    operations = program.operations
+    steps = [[name_of(value), listed(value.inputs), listed(value.outputs), parameters(value)] for value in operations]
     description = {"inputs": listed(program.arguments), "operations": steps, "outputs": listed(program.outputs)}
     return description, [value.data for value in constants if value.data is not None]
 

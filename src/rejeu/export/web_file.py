@@ -120,9 +120,8 @@ def node(script: str, message: object) -> Any:
     with tempfile.TemporaryDirectory() as name:
         path = Path(name) / "main.js"
         path.write_text(script, encoding="utf-8")
-        completed = subprocess.run(
-            ["node", path], input=json.dumps(message), capture_output=True, text=True, check=True
-        )
+        sent = json.dumps(message)
+        completed = subprocess.run(["node", path], input=sent, capture_output=True, text=True, check=True)
     return json.loads(completed.stdout)
 
 

@@ -265,10 +265,8 @@ def time_chart(table: Table) -> Chart | None:
         return None
     at = rows[thinned(len(rows), MAX_POINTS // 2)]
     where = table.column("step")[at], table.column("time/time_elapsed")[at] / 60
-    shown_series = [
-        series("area", SHARES[name], f"area{i}", *where, np.clip(shares[name][at], 0, 1))
-        for i, name in enumerate(SHARES)
-    ]
+    values = [np.clip(shares[name][at], 0, 1) for name in SHARES]
+    shown_series = [series("area", SHARES[name], f"area{i}", *where, values[i]) for i, name in enumerate(SHARES)]
     return {"y": "", "percent": True, "range": [0, 1], "series": shown_series, "note": ""}
 
 
@@ -295,10 +293,8 @@ def histogram(values: np.ndarray, columns: Mapping[str, np.ndarray], command: st
     bar = np.clip(np.searchsorted(edges, values[rows_known], "right") - 1, 0, n_bars - 1)
     members = [rows_known[bar == i] for i in range(n_bars)]
     listed_rows = [rows_of_bar[thinned(len(rows_of_bar), LISTED)] for rows_of_bar in members]
-    rows = [
-        [plain(row) for row in np.array([column[rows_of_bar] for column in columns.values()]).T]
-        for rows_of_bar in listed_rows
-    ]
+    parts = [np.array([column[rows_of_bar] for column in columns.values()]) for rows_of_bar in listed_rows]
+    rows = [[plain(row) for row in part.T] for part in parts]
     return {
         "edges": plain(edges),
         "counts": [len(rows_of_bar) for rows_of_bar in members],

@@ -108,13 +108,11 @@ def cell(value: str) -> str:
 
 def csv_text(rows: Iterable[Mapping[str, object]]) -> str:
     """Returns rows as CSV. Text that a spreadsheet would take for a formula gets an apostrophe."""
-    rows = [
-        {
-            key: "'" + value if str(value)[:1] in FORMULA and isinstance(value, str) else value
-            for key, value in row.items()
-        }
-        for row in rows
-    ]
+
+    def as_text(value: object) -> object:
+        return f"'{value}" if isinstance(value, str) and value[:1] in FORMULA else value
+
+    rows = [{key: as_text(value) for key, value in row.items()} for row in rows]
     out = io.StringIO()
     writer = csv.DictWriter(out, list(rows[0]) if rows else [], lineterminator="\n")
     writer.writeheader()

@@ -89,13 +89,9 @@ class BatchRenorm(eqx.Module):
         ratio, shift = lax.stop_gradient(self._correction(batch_mean, batch_deviation))
         factor = self.scale * ratio / batch_deviation
         y = centered * factor[None] + (self.scale * shift + self.offset)[None]
-        moved = lax.stop_gradient(
-            (
-                MOMENTUM * self.mean + (1.0 - MOMENTUM) * batch_mean,
-                MOMENTUM * self.variance + (1.0 - MOMENTUM) * batch_variance,
-                self.n_batches + 1.0,
-            )
-        )
+        mean = MOMENTUM * self.mean + (1.0 - MOMENTUM) * batch_mean
+        variance = MOMENTUM * self.variance + (1.0 - MOMENTUM) * batch_variance
+        moved = lax.stop_gradient((mean, variance, self.n_batches + 1.0))
         return y, eqx.tree_at(_statistics, self, moved)
 
     def _correction(self, batch_mean: Array, batch_deviation: Array) -> tuple[Array, Array]:

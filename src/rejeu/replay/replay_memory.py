@@ -56,9 +56,8 @@ class ReplayMemory:
         action = spaces.random_action(action_space, 1, np.random.default_rng(0))
         row = 2 * sum(leaf.nbytes for leaf in self._leaves) + action.nbytes + 8
         check_memory(row * self.capacity, self.capacity, "capacity")
-        self._obs, self._next_obs = (
-            [np.zeros((self.capacity, *leaf.shape), leaf.dtype) for leaf in self._leaves] for _ in range(2)
-        )
+        zeros = [[np.zeros((self.capacity, *leaf.shape), leaf.dtype) for leaf in self._leaves] for _ in range(2)]
+        self._obs, self._next_obs = zeros
         self._action = np.zeros((self.capacity, *action.shape[1:]), action.dtype)
         self._reward, self._discount = np.zeros((2, self.capacity), np.float32)
         self._rng = np.random.default_rng(seed)

@@ -62,18 +62,15 @@ FIXED = {
     **dict.fromkeys(RUN, "learn(..., reset_num_timesteps=...)"),
     "_logger": "set_logger(...)",
     "_vec_normalize_env": "set_env(...)",
-    "log_ent_coef": "ent_coef",
-    "ent_coef_tensor": "ent_coef",
+    **dict.fromkeys(("log_ent_coef", "ent_coef_tensor"), "ent_coef"),
     "env": "set_env(...)",
 }
 """Attributes that are computed, and the way to change each."""
 PARTS = {
     "optimizer": "policy.optimizer",
     "actor_optimizer": "actor.optimizer",
-    "critic_optimizer": "critic.optimizer",
-    "critics_optimizer": "critic.optimizer",
-    "alpha_optimizer": "ent_coef_optimizer",
-    "log_alpha": "ent_coef_optimizer",
+    **dict.fromkeys(("critic_optimizer", "critics_optimizer"), "critic.optimizer"),
+    **dict.fromkeys(("alpha_optimizer", "log_alpha"), "ent_coef_optimizer"),
 }
 """Where :meth:`Original.get_parameters` has the fields of the algorithms' states that are no networks."""
 SHAPING = {

@@ -182,21 +182,12 @@ registered: dict[str, tuple[Preset, ...]] = {}
 TWINS = {
     "jax/Parking-v0": "parking-v0",
     "jax/Ball-v0": "rejeu/Ball-v0",
-    "jax/Acrobot-v1": "Acrobot-v1",
-    "jax/CartPole-v1": "CartPole-v1",
-    "jax/Pendulum-v1": "Pendulum-v1",
-    "jax/MountainCar-v0": "MountainCar-v0",
+    **{f"jax/{name}": name for name in ("Acrobot-v1", "CartPole-v1", "Pendulum-v1", "MountainCar-v0")},
 }
 """Environments in JAX that are equal to another environment, whose presets they have."""
 
-ALGORITHM_FOR = {
-    "Box": "SAC",
-    "Discrete": "DQN",
-    "MultiDiscrete": "PPO",
-    "MultiBinary": "PPO",
-    "Dict": "PPO",
-    "Tuple": "PPO",
-}
+COMBINED = ("MultiDiscrete", "MultiBinary", "Dict", "Tuple")
+ALGORITHM_FOR = {"Box": "SAC", "Discrete": "DQN", **dict.fromkeys(COMBINED, "PPO")}
 """The default algorithm of an environment without a preset, by the class of its action space."""
 FOR_LONG_RUNS = "XQC"
 """The one for vectors and Box actions in runs of 100,000 steps or 20 minutes; see docs/choosing.md."""

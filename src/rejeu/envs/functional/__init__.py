@@ -116,13 +116,8 @@ def register_with_gymnasium() -> None:
     """Registers with Gymnasium what is not registered yet."""
     for env_id, entry in REGISTRY.items():
         if env_id not in gym.registry:
-            gym.register(
-                env_id,
-                "rejeu.envs.functional.gym_env:GymnasiumEnv",
-                max_episode_steps=entry.max_episode_steps,
-                reward_threshold=entry.reward_threshold,
-                kwargs={"env": env_id},
-            )
+            limits = {name: getattr(entry, name) for name in ("max_episode_steps", "reward_threshold")}
+            gym.register(env_id, "rejeu.envs.functional.gym_env:GymnasiumEnv", **limits, kwargs={"env": env_id})
 
 
 if not TYPE_CHECKING:

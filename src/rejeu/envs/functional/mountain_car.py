@@ -36,9 +36,7 @@ class Hill(FunctionalEnv):
     goal_velocity: float = eqx.field(static=True, default=0.0)
     """Velocity that the car must have at the goal."""
 
-    observation_space = spaces.Box(
-        np.array([MIN_POSITION, -MAX_SPEED], np.float32), np.array([MAX_POSITION, MAX_SPEED], np.float32)
-    )
+    observation_space = spaces.Box(*np.array([[MIN_POSITION, -MAX_SPEED], [MAX_POSITION, MAX_SPEED]], np.float32))
 
     def reset(self, key: Array) -> tuple[State, Array]:
         position = jax.random.uniform(key, minval=-0.6, maxval=-0.4)

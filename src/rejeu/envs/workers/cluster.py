@@ -174,10 +174,7 @@ def check_versions(there: Mapping[str, str], where: str, here: Mapping[str, str]
         here: by default those of :func:`versions`.
     """
     here = versions() if here is None else here
-    wrong = [
-        f"{name} {there.get(name) or 'of no version'} and not {version}"
-        for name, version in here.items()
-        if there.get(name) != version
-    ]
+    different = [name for name in here if there.get(name) != here[name]]
+    wrong = [f"{name} {there.get(name) or 'of no version'} and not {here[name]}" for name in different]
     if wrong:
         raise ClusterError(f"{where} has {', '.join(wrong)} as here; install the same versions on all machines")

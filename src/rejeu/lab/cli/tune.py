@@ -78,9 +78,8 @@ def complete(study: Study, trial_env: Environment, workers: int | None) -> tuple
         result = tuning.run(study, trial_env.run, workers, stop, echo)
     echo()
     if stop.signal is not None:
-        echo(
-            f"stopped by {NAMES[stop.signal]}; rejeu resume {quoted(study.folder.path)}{trial_env.run.again()} continues"
-        )
+        again = f"rejeu resume {quoted(study.folder.path)}{trial_env.run.again()}"
+        echo(f"stopped by {NAMES[stop.signal]}; {again} continues")
     echo(str(result))
     if stop.signal is not None:
         return 128 + stop.signal, result.to_dict()

@@ -38,9 +38,8 @@ MAX_DOTS = 1000
 """Upper limit on the dots of one of its lines: a key ``a.b.c`` of 30,000 parts takes gigabytes to be read."""
 OWN_OF_JOBS = ("env", "env_kwargs", "wrappers", "imports", "algorithm", "seed", "hyperparameters")
 """Fields of a run that a plan names in another way, or not at all."""
-OF_RUNS = {
-    option.shown.name or option.field: option.field for option in options(RunConfig) if option.field not in OWN_OF_JOBS
-}
+SHARED = [option for option in options(RunConfig) if option.field not in OWN_OF_JOBS]
+OF_RUNS = {option.shown.name or option.field: option.field for option in SHARED}
 """Fields of a run by the names of their options, which are those of ``rejeu train``."""
 OPTIONS = (*OF_RUNS, *FILES)
 """All options of the runs of a plan."""

@@ -110,9 +110,8 @@ class Improvement:
 
         Where all pairs have the same winner, the bootstrap has no interval, and their number says how much that is.
         """
-        interval = (
-            f"{self.low:.0%} to {self.high:.0%}" if self.low < self.high else f"in all {self.pairs} pairs of runs"
-        )
+        has_interval = self.low < self.high
+        interval = f"{self.low:.0%} to {self.high:.0%}" if has_interval else f"in all {self.pairs} pairs of runs"
         return [self.label, self.other, self.env_id, f"{self.probability:.0%} ({interval})"]
 
 
@@ -280,9 +279,8 @@ class Comparison:
         return [atomic.write(path, texts[suffix]())]
 
     def __repr__(self) -> str:
-        lines = [
-            f"{group.label} on {group.env_id or 'an unknown environment'}: {group.interval}" for group in self.groups
-        ]
+        unknown = "an unknown environment"
+        lines = [f"{group.label} on {group.env_id or unknown}: {group.interval}" for group in self.groups]
         return "\n".join([*lines, self.definition, *(f"note: {note}" for note in self.notes)])
 
     def _repr_html_(self) -> str:

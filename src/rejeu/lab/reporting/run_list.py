@@ -78,10 +78,11 @@ def read_all(paths: str | Path | RunSummary | Iterable[str | Path | RunSummary])
 def distinct(runs: list[RunSummary]) -> list[RunSummary]:
     """Returns the runs; those of the same name, such as ``seed_0``, get the name of the folder above in front of it."""
     counts = Counter(run.name for run in runs)
-    return [
-        replace(run, name=shown(f"{run.path.parent.name}/{run.name}", MAX_NAME)) if counts[run.name] > 1 else run
-        for run in runs
-    ]
+
+    def longer(run: RunSummary) -> RunSummary:
+        return replace(run, name=shown(f"{run.path.parent.name}/{run.name}", MAX_NAME))
+
+    return [longer(run) if counts[run.name] > 1 else run for run in runs]
 
 
 def read_or_note(path: Path | RunSummary) -> RunSummary | str:

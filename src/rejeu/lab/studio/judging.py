@@ -87,9 +87,8 @@ class Judging:
                     break
                 name = self.now = leaderboard.name_of(path, self.folder, paths)
                 self._stamps[path] = time_of(path), time.monotonic()
-                self._results[path] = leaderboard.result_of(
-                    path, name, self._env_id, env, EPISODES, SEED, SECONDS, None
-                )
+                settings = EPISODES, SEED, SECONDS, None
+                self._results[path] = leaderboard.result_of(path, name, self._env_id, env, *settings)
                 self.version += 1
         self.now = ""
 

@@ -147,9 +147,8 @@ def in_form(doc: str) -> str:
     >>> in_form("With --backend ray: one module; repeat for several.")
     'With backend ray: one module; several with spaces between them.'
     """
-    return re.sub(r"--(?=\w)|rejeu (?=resume|branch|tune)", "", doc).replace(
-        "repeat for several", "several with spaces between them"
-    )
+    words = re.sub(r"--(?=\w)|rejeu (?=resume|branch|tune)", "", doc)
+    return words.replace("repeat for several", "several with spaces between them")
 
 
 def problem_of(option: Option, text: str | None) -> str | None:

@@ -483,12 +483,8 @@ class Episodes:
             self.figure = Figure(say("Returns of the trained agent"), height="200px", choose=self.choose)
             self.play = action(say("Play {} episodes", REPLAYS), "replay", lambda event: self.replay(event.sender))
             self.play.set_visibility(False)
-            self.table = ui.table(
-                rows=[],
-                columns=[column | {"label": say(str(column["label"]))} for column in EPISODES],
-                row_key="seed",
-                pagination=10,
-            ).props("flat dense")
+            columns = [column | {"label": say(str(column["label"]))} for column in EPISODES]
+            self.table = ui.table(rows=[], columns=columns, row_key="seed", pagination=10).props("flat dense")
             self.table.on("rowClick", lambda event: self.watch(event.args[1]))
             self.table.set_visibility(False)
             self.training_title = ui.label(say("Returns of the training episodes")).classes("text")

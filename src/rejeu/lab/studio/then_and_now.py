@@ -7,10 +7,12 @@ import math
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from nicegui import ui
+from nicegui.events import ClickEventArguments
 from PIL import Image, ImageDraw, ImageFont
 
 from rejeu.agents import load
@@ -127,18 +129,13 @@ class ThenAndNow:
         self.folder, self.options, self.seed = folder, options, 0
         self.playing: HostedGame | None = None
         with ui.expansion(say("Then and now")).classes("w-full"):
-            ui.label(say("An early, a middle, the best and the current policy, from the same start")).classes(
-                "text quiet"
-            )
+            policies = say("An early, a middle, the best and the current policy, from the same start")
+            ui.label(policies).classes("text quiet")
             with ui.row().classes("gap-2"):
                 action(say("Play"), "play_arrow", self.play)
                 action(say("another start"), "casino", lambda: self.play(self.seed + 1))
                 for name, suffix in FORMATS.items():
-                    action(
-                        say("save as {}", name),
-                        "download",
-                        lambda event, suffix=suffix: self.save(event.sender, suffix),
-                    )
+                    action(say("save as {}", name), "download", partial(self.save, suffix=suffix))
             self.stage = ui.element("div").classes("w-full one-row")
             self.status = ui.label().classes("text quiet")
         ui.timer(EVERY, self.look)
@@ -161,9 +158,9 @@ class ThenAndNow:
             now = playing.said or say("start {}", self.seed)
             self.status.text = loading if is_loading else now
 
-    async def save(self, button: ui.button, suffix: str) -> None:
+    async def save(self, event: ClickEventArguments, suffix: str) -> None:
         """Writes the clip, and lets the browser save it."""
-        button.props["loading"] = True
+        event.sender.props["loading"] = True
         try:
             with tempfile.TemporaryDirectory() as temporary:
                 path = Path(temporary) / f"then-and-now-{self.seed}{suffix}"
@@ -172,4 +169,4 @@ class ThenAndNow:
         except Exception as error:  # the environment can raise anything
             ui.notify(one_line(error), type="negative")
         finally:
-            button.props["loading"] = False
+            event.sender.props["loading"] = False

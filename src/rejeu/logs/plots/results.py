@@ -103,12 +103,8 @@ def evaluation(evaluation: Any, path: str | Path | None = None, title: str = "")
     low, high = evaluation.return_interval
     if math.isfinite(low):
         panel.axhspan(low, high, color=drawing.LINE_COLOR, alpha=0.15, linewidth=0, label="95 % CI")
-    panel.axhline(
-        evaluation.mean_return,
-        label=f"mean {drawing.thousands(round(evaluation.mean_return, 2))}",
-        zorder=3,
-        **drawing.LINE,
-    )
+    mean = f"mean {drawing.thousands(round(evaluation.mean_return, 2))}"
+    panel.axhline(evaluation.mean_return, label=mean, zorder=3, **drawing.LINE)
     for mask, marker, color, label in (
         (np.isnan(successes), "o", drawing.DOT_COLOR, "episodes"),
         (successes == 1, "o", drawing.GOOD_COLOR, f"success ({np.sum(successes == 1):,})"),

@@ -176,15 +176,8 @@ class EvalCallback(EventCallback):
         if self.model.get_vec_normalize_env() is not None:
             sync_envs_normalization(self.training_env, self.eval_env)
         self._is_success_buffer = []
-        returns, lengths = evaluate_policy(
-            self.model,
-            self.eval_env,
-            self.n_eval_episodes,
-            self.deterministic,
-            self.render,
-            self._record_success,
-            return_episode_rewards=True,
-        )
+        settings = self.n_eval_episodes, self.deterministic, self.render, self._record_success
+        returns, lengths = evaluate_policy(self.model, self.eval_env, *settings, return_episode_rewards=True)
         assert isinstance(returns, list)
         assert isinstance(lengths, list)
         self._write(returns, lengths)

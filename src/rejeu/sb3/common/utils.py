@@ -198,9 +198,8 @@ class Tensor(np.ndarray):
     ) -> Any:
         """Returns the result of a function of PyTorch's, which calls this where an argument is of this class."""
         torch = sys.modules["torch"]
-        in_torch = jax.tree.map(
-            lambda x: torch.as_tensor(np.asarray(x)) if isinstance(x, cls) else x, (args, kwargs or {})
-        )
+        as_torch = lambda x: torch.as_tensor(np.asarray(x)) if isinstance(x, cls) else x  # noqa: E731
+        in_torch = jax.tree.map(as_torch, (args, kwargs or {}))
         return function(*in_torch[0], **in_torch[1])
 
 

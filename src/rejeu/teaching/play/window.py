@@ -182,11 +182,8 @@ class Window:
         rows: list[list[tuple[LegendEntry, int]]] = [[]]
         x = MARGIN
         for entry in entries:
-            wide = (
-                sum(self._key_width(text) + 4 for text, _ in entry.keys)
-                + self._fonts[20].size(said(entry.label))[0]
-                + 16
-            )
+            keys = sum(self._key_width(text) + 4 for text, _ in entry.keys)
+            wide = keys + self._fonts[20].size(said(entry.label))[0] + 16
             if x + wide > width and rows[-1]:
                 rows.append([])
                 x = MARGIN

@@ -286,10 +286,8 @@ def value_text(value: object) -> str:
     ('linear: start 0.2, end 0.0, fraction 1.0', 'None')
     """
     if isinstance(value, dict) and isinstance(label := value.get("schedule", value.get("noise")), str):
-        parameters = ", ".join(
-            f"{name} {value_text(entry)}" for name, entry in value.items() if name not in ("schedule", "noise")
-        )
-        return shown(f"{label}: {parameters}", 200)
+        parameters = {name: entry for name, entry in value.items() if name not in ("schedule", "noise")}
+        return shown(f"{label}: {', '.join(f'{name} {value_text(parameters[name])}' for name in parameters)}", 200)
     if value is None or isinstance(value, bool):
         return str(value)
     return shown(value if isinstance(value, str) else json.dumps(value), 200)
