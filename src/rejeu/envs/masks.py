@@ -279,8 +279,8 @@ def make_masked(
     if not callable(env):
         raise TypeError(f"env must be an id, an environment or a function that makes one, got {type(env).__name__}")
     backend = "gymnasium" if backend in ("auto", "envpool") else backend
-    workers = {"worker_timeout": worker_timeout, "restart_workers": restart_workers}
-    vector = make_vector(partial(with_mask, env), n_envs, backend, seed, **workers)
+    make = partial(with_mask, env)
+    vector = make_vector(make, n_envs, backend, seed, worker_timeout=worker_timeout, restart_workers=restart_workers)
     masked = MaskedVector(vector)
     masked.made_from = made_from
     return masked

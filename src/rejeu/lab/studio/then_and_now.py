@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 from nicegui import ui
-from nicegui.events import ClickEventArguments
 from PIL import Image, ImageDraw, ImageFont
 
 from rejeu.agents import load
@@ -135,7 +134,8 @@ class ThenAndNow:
                 action(say("Play"), "play_arrow", self.play)
                 action(say("another start"), "casino", lambda: self.play(self.seed + 1))
                 for name, suffix in FORMATS.items():
-                    action(say("save as {}", name), "download", partial(self.save, suffix=suffix))
+                    save = partial(self.save, suffix=suffix)
+                    action(say("save as {}", name), "download", lambda event, save=save: save(event.sender))
             self.stage = ui.element("div").classes("w-full one-row")
             self.status = ui.label().classes("text quiet")
         ui.timer(EVERY, self.look)
@@ -158,9 +158,9 @@ class ThenAndNow:
             now = playing.said or say("start {}", self.seed)
             self.status.text = loading if is_loading else now
 
-    async def save(self, event: ClickEventArguments, suffix: str) -> None:
+    async def save(self, button: ui.button, suffix: str) -> None:
         """Writes the clip, and lets the browser save it."""
-        event.sender.props["loading"] = True
+        button.props["loading"] = True
         try:
             with tempfile.TemporaryDirectory() as temporary:
                 path = Path(temporary) / f"then-and-now-{self.seed}{suffix}"
@@ -169,4 +169,4 @@ class ThenAndNow:
         except Exception as error:  # the environment can raise anything
             ui.notify(one_line(error), type="negative")
         finally:
-            event.sender.props["loading"] = False
+            button.props["loading"] = False
