@@ -81,7 +81,7 @@ def by_definition(reward, next_value, discount, ended, q_lambda):
     The n-step return sums n rewards and bootstraps from the highest value in the state that follows them. The last one ends
     with the episode or the rollout.
     """
-    reward, next_value, discount = map(np.float64, (reward, next_value, discount))
+    reward, next_value, discount = np.float64([reward, next_value, discount])
     result = np.zeros_like(reward)
     for t, env in np.ndindex(result.shape):
         rewards, weight = 0.0, 1.0
