@@ -120,6 +120,9 @@ def test_the_best_model_is_written_late_as_it_was_when_it_was_the_best(tmp_path,
     assert not all(np.array_equal(saved[key], value) for key, value in agent.get_parameters().items())
 
 
+@pytest.mark.filterwarnings(
+    r"ignore:Exception ignored in. <function ZipFile\.__del__"
+)  # NumPy 2.0 closes no file that is full
 def test_hooks_that_cannot_write_do_not_end_training(tmp_path, disk):
     paths = {"log_path": tmp_path, "best_model_save_path": tmp_path}
     hooks = [
