@@ -33,6 +33,9 @@ def test_runs_are_listed_and_seeds_folded(browser, served, width):
         page.wait_for_selector("text=1 run, 0 running")
         assert page.locator("tbody tr").all_inner_texts()[0].split("\n")[0].strip() == "seeds/seed_1"
         assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
+        assert not [
+            url for url in page.requests if "plotly" in url
+        ]  # without charts the page need not wait for its 5 MB
 
 
 def test_a_run_that_changes_and_one_that_disappears_are_followed(browser, served):

@@ -14,7 +14,7 @@ from rejeu.core.records import shown
 from rejeu.core.types import JsonObject
 from rejeu.lab.reporting.comparison import MAX_LISTED, Comparison, Improvement, compare
 from rejeu.lab.reporting.rows import Row
-from rejeu.lab.studio.figures import Figure
+from rejeu.lab.studio.figures import Figure, add_scripts
 from rejeu.lab.studio.layout import Choice
 from rejeu.lab.studio.speech import say, translated
 from rejeu.lab.studio.state import Studio
@@ -48,6 +48,7 @@ SCORES = """<q-td :props="props">{{ props.row[0] }} <q-badge v-if="props.row.sta
 
 def build(studio: Studio, request: Request) -> None:
     """Makes the page of the runs that its address names as ``run``; of all that could be read, if it names none."""
+    add_scripts()
     for theme, colors in zip((":root", ".body--dark"), zip(*GROUP_COLORS, strict=True), strict=True):
         ui.add_css(f"{theme} {{ {''.join(f'--group{i}: {color};' for i, color in enumerate(colors))} }}")
     runs, choice = request.query_params.getlist("run"), choice_of(request)

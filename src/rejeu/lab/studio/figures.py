@@ -70,7 +70,11 @@ def serve_scripts() -> None:
 
 
 def add_scripts() -> None:
-    """Adds the scripts and the colors to the page that is built."""
+    """Adds the scripts to the page that is built. They are large: others are shown sooner without them."""
     ui.add_head_html("".join(f'<script src="{url}"></script>' for url in SCRIPTS))
+
+
+def add_colors() -> None:
+    """Adds the colors of charts to the page that is built."""
     css = (TEMPLATES / "charts.css").read_text(encoding="utf-8")
     ui.add_css(re.sub(r"@media [^{]+\{\s*:root (\{.*?\})\s*\}", r".body--dark \1", css, flags=re.DOTALL))

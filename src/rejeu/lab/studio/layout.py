@@ -49,7 +49,7 @@ def frame(request: Request, title: str, path: str, links: Sequence[tuple[str, st
     client.page.language = QUASAR[language]
     run = request.query_params.get("run") if path == "/run" else ""
     client.title = " · ".join(filter(None, [run, say(title), "rejeu"]))
-    figures.add_scripts()
+    figures.add_colors()
     ui.add_css(HERE / "layout.css")
     # NiceGUI's message of a lost connection.
     ui.add_css(f'#popup::after {{ content: "{say(LOST)}"; max-width: 20rem; }}')

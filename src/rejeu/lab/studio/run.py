@@ -27,7 +27,7 @@ from rejeu.lab.runs import requests
 from rejeu.lab.runs.read import Remarks, is_file
 from rejeu.lab.studio import moving, processes
 from rejeu.lab.studio.branch import open_form
-from rejeu.lab.studio.figures import Figure
+from rejeu.lab.studio.figures import Figure, add_scripts
 from rejeu.lab.studio.layout import EVERY, Choice, action, address, failures_shown, form_buttons, is_number
 from rejeu.lab.studio.player import BEST, CURRENT, LiveEpisode, LivePlayer, lower_priority
 from rejeu.lab.studio.runs import COLORS
@@ -79,6 +79,7 @@ def build(studio: Studio, request: Request) -> None:
         ui.timer(EVERY, look)
         return
     ui.add_css(CSS)
+    add_scripts()
     RunPage(studio, name, row.path, Choice(request, USUAL, VALID, ["run"]))
 
 
