@@ -41,7 +41,7 @@ def test_page_is_drawn_without_errors_and_requests(browser, report, width, schem
         page = opened.page
         assert opened.messages == []
         assert opened.requests == []
-        assert page.locator(".plot .main-svg").count() >= 2 * page.locator(".plot").count()
+        assert page.locator("div.plot .main-svg").count() >= 2 * page.locator("div.plot").count()
         assert page.evaluate("document.documentElement.scrollWidth") <= width
         background = page.evaluate("getComputedStyle(document.body).backgroundColor")
         assert (sum(map(int, background[4:-1].split(","))) < 300) == (scheme == "dark")
