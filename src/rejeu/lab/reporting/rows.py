@@ -38,7 +38,7 @@ SLICE = 64
 """Most files of another program's run whose times are looked at."""
 
 OF_RUN = ("path", "name", "format", "state", "steps", "seconds", "warnings", "remarks")
-"""What a row has of its run as it is."""
+"""Fields of a run that its row copies."""
 BEGINS = "begins; functions are compiled, which takes up to a minute"
 """Note on a run that has not taken a step."""
 

@@ -28,7 +28,7 @@ EVERY = 1.0
 MODES = {None: "brightness_auto", False: "light_mode", True: "dark_mode"}
 """Symbols of the colors of a page: those of the system, light and dark."""
 LOST = "If the studio has ended, start it again and open the address that it prints."
-"""What a page adds when its connection is lost: a studio that was started again has another token."""
+"""Advice of a page whose connection is lost: a studio that was started again has another token."""
 COOKIE = "rejeu_language"
 """Cookie of the browser with the language of the pages."""
 
