@@ -134,8 +134,10 @@ def make(config: Config, observation_space: spaces.Space, action_space: spaces.S
     optimizer = optimizers.make(config.optimizer, config.max_grad_norm)
 
     def init(key: Array) -> State:
-        make = lambda key: ActorCritic(key, obs_leaves, action_kind, shape, config.use_sde)  # noqa: E731
-        return initial_state(key, make, optimizer)
+        def make_network(key: Array) -> ActorCritic:
+            return ActorCritic(key, obs_leaves, action_kind, shape, config.use_sde)
+
+        return initial_state(key, make_network, optimizer)
 
     def update(state: State, rollout: Rollout, clock: Clock) -> tuple[State, Metrics]:
         warn_of_unused(config.sub_sampling_factor, rollout.reward.shape[1])

@@ -293,8 +293,8 @@ def histogram(values: np.ndarray, columns: Mapping[str, np.ndarray], command: st
     bar = np.clip(np.searchsorted(edges, values[rows_known], "right") - 1, 0, n_bars - 1)
     members = [rows_known[bar == i] for i in range(n_bars)]
     listed_rows = [rows_of_bar[thinned(len(rows_of_bar), LISTED)] for rows_of_bar in members]
-    parts = [np.array([column[rows_of_bar] for column in columns.values()]) for rows_of_bar in listed_rows]
-    rows = [[plain(row) for row in part.T] for part in parts]
+    points = [np.array([column[rows_of_bar] for column in columns.values()]) for rows_of_bar in listed_rows]
+    rows = [[plain(row) for row in points_of_bar.T] for points_of_bar in points]
     return {
         "edges": plain(edges),
         "counts": [len(rows_of_bar) for rows_of_bar in members],

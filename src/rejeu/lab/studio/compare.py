@@ -121,8 +121,8 @@ def selected(studio: Studio, runs: Sequence[str]) -> tuple[list[Row], list[str]]
     if not runs:
         return [row for row in present if row.state != "damaged"], []
     members = {name: [row for row in present if row.run == name or row.run.startswith(f"{name}/")] for name in runs}
-    chosen = {row.run for rows in members.values() for row in rows}
-    return [row for row in present if row.run in chosen], [name for name, rows in members.items() if not rows]
+    names = {row.run for rows in members.values() for row in rows}
+    return [row for row in present if row.run in names], [run for run, rows in members.items() if not rows]
 
 
 def show(comparison: Comparison) -> None:
