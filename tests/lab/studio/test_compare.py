@@ -48,6 +48,11 @@ def test_what_cannot_be_compared_is_one_line(browser, common):
         page.wait_for_selector("text=there is nothing to compare")
 
 
+def test_a_folder_without_runs_is_said_to_be_one_in_the_language_of_the_page(browser, tmp_path):
+    with serving(tmp_path) as served, opened(browser, served, "/compare?language=fr") as page:
+        page.wait_for_selector("text=Il n'y a pas encore d'entraînement dans ce dossier.")
+
+
 def test_a_folder_in_the_address_stands_for_its_runs_and_names_of_no_run_get_a_note(tmp_path):
     for name in ("sweep/a", "sweep/b", "sweep2"):
         write_run(tmp_path / name)

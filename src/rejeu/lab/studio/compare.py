@@ -75,7 +75,7 @@ def build(studio: Studio, request: Request) -> None:
             comparison = await asyncio.to_thread(compared, studio, runs, choice)
         except expected_errors() as error:
             results.clear()
-            status.text = one_line(error)
+            status.text = one_line(error) if rows or runs else say("There is no run in this folder yet.")
         else:
             status.text = "\n".join(comparison.notes)
             results.clear()
