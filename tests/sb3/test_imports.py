@@ -39,6 +39,17 @@ print(type(agent.get_env()).__name__)
     assert ran.stdout == "DummyVecEnv\n", ran.stderr
 
 
+def test_the_modules_of_the_base_classes_can_be_imported_before_any_other():
+    script = """
+from rejeu.sb3.common.off_policy_algorithm import *
+from rejeu.sb3.common.on_policy_algorithm import OnPolicyAlgorithm
+from rejeu.sb3 import PPO, SAC
+assert issubclass(SAC, OffPolicyAlgorithm) and issubclass(PPO, OnPolicyAlgorithm)
+"""
+    ran = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stderr
+
+
 def test_what_is_missing_cannot_be_imported():
     with pytest.raises(ImportError, match="NoSuchAlgorithm"):
         exec("from rejeu.sb3 import NoSuchAlgorithm")

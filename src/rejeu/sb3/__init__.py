@@ -1,7 +1,8 @@
 """Stable-Baselines3's API at its own module paths.
 
 To port a script, replace ``stable_baselines3`` by ``rejeu.sb3`` in its imports. Names that rejeu does not have cannot be
-imported. The algorithms of sb3-contrib (``QRDQN``, ``TQC``, ``CrossQ``, ``RecurrentPPO``, ``MaskablePPO``) are included.
+imported. The algorithms of sb3-contrib (``QRDQN``, ``TQC``, ``CrossQ``, ``TRPO``, ``ARS``, ``RecurrentPPO``, ``MaskablePPO``)
+are included.
 
 >>> from rejeu.sb3 import SAC, HerReplayBuffer
 >>> from rejeu.sb3.common.env_util import make_vec_env

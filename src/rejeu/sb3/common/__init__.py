@@ -16,3 +16,5 @@ class RMSpropTFLike:
 
 define(f"{__name__}.sb2_compat", {})
 define(f"{__name__}.sb2_compat.rmsprop_tf_like", {"RMSpropTFLike": RMSpropTFLike})
+define(f"{__name__}.on_policy_algorithm", {}, "OnPolicyAlgorithm")
+define(f"{__name__}.off_policy_algorithm", {}, "OffPolicyAlgorithm")

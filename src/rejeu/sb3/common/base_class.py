@@ -8,7 +8,7 @@ from rejeu.agents import (
     OnPolicyAgent as OnPolicyAlgorithm,
 )
 from rejeu.envs.registry import make_env
-from rejeu.sb3.modules import define, passes_on
+from rejeu.sb3.modules import passes_on
 
 
 def maybe_make_env(env: Any, verbose: int = 0) -> Any:
@@ -16,6 +16,4 @@ def maybe_make_env(env: Any, verbose: int = 0) -> Any:
     return make_env(env, render_mode="rgb_array") if isinstance(env, str) else env
 
 
-define("rejeu.sb3.common.on_policy_algorithm", {"OnPolicyAlgorithm": OnPolicyAlgorithm})
-define("rejeu.sb3.common.off_policy_algorithm", {"OffPolicyAlgorithm": OffPolicyAlgorithm})
 passes_on(__name__)
