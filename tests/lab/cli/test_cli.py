@@ -274,6 +274,13 @@ def test_help_lists_commands_by_task(capsys):
     assert sorted(name for title in [*lists][1:] for name in lists[title]) == sorted(cli.COMMANDS)
 
 
+@pytest.mark.parametrize(("command", "usage"), [("train", "ENV"), ("runs", "[FOLDER]"), ("compare", "RUN ...")])
+def test_the_first_line_of_help_says_which_words_may_be_left_out(capsys, command, usage):
+    with pytest.raises(SystemExit):
+        main([command, "--help"])
+    assert capsys.readouterr().out.startswith(f"usage: rejeu {command} {usage} [options]\n")
+
+
 def test_help_of_train_begins_with_what_people_need_first_and_has_five_groups(capsys):
     lists = help_of(capsys, "train")
     assert lists.pop("positional arguments") == ["ENV"]

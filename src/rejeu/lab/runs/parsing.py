@@ -114,10 +114,10 @@ def make_parser(command: str, schema: type, declared: Iterable[Option], with_hel
     The options of a command that has many are listed in groups.
     """
     declared = tuple(declared)
-    positional = "".join(f" {option.name}" for option in declared if option.shown.is_positional)
+    words = [entry.name if entry.is_required else f"[{entry.name}]" for entry in declared if entry.shown.is_positional]
     parser = Parser(
         f"rejeu {command}",
-        f"rejeu {command}{positional} [options]",
+        " ".join(["rejeu", command, *words, "[options]"]),
         description=filled(inspect.cleandoc(schema.__doc__ or "")) if with_help else None,
         formatter_class=argparse.RawDescriptionHelpFormatter,
         argument_default=argparse.SUPPRESS,
