@@ -16,6 +16,7 @@ from rejeu.core.interrupt import Stopped
 from rejeu.lab import cli
 from rejeu.lab.cli import main, runs
 from rejeu.lab.cli.commands import COMMANDS, TASKS
+from rejeu.teaching.courses import leaderboard
 
 ROOT = Path(__file__).parents[3]
 PENDULUM = "Pendulum-v1"
@@ -142,6 +143,11 @@ def test_check_prints_its_findings_and_nothing_of_the_environment(capsys):
     assert result.keys() == documented_keys("check")
     assert result["errors"] == len([one for one in result["findings"] if one["level"] == "error"]) > 0
     assert "a line of the environment" in messages
+
+
+def test_the_keys_of_a_leaderboard_are_documented():
+    board = leaderboard.Leaderboard("CartPole-v1", 50, rows=(), problems=(), language="en", equal=())
+    assert {*leaderboard.to_dict(board), "file"} == documented_keys("class")
 
 
 def test_an_error_leaves_standard_output_empty(capsys):

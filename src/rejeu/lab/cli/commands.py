@@ -196,8 +196,8 @@ class Export(RunOptions):
     to: Annotated[str | None, Shown(f"{{{','.join(FORMATS)}}}")] = None
     """Format; by default that of the suffix of --out, else onnx."""
     out: Annotated[Path | None, Shown("PATH")] = None
-    """File to write, or an existing folder; by default policy.onnx, .c, .stablehlo or .html in the folder of the run, or
-    next to the model under its name."""
+    """File to write, or an existing folder; by default policy.onnx, .c, .stablehlo, .npz or .html in the folder of the
+    run, or next to the model under its name."""
     noise: bool = False
     """Sample from the policy, with the random numbers as inputs, instead of taking its mode."""
     batch: Count = None
