@@ -175,9 +175,9 @@ def _of_id(
 def auto_backend(env_id: str, n_envs: int, env_kwargs: Arguments = MappingProxyType({})) -> Backend:
     """Returns the backend that ``"auto"`` stands for. It does not depend on the speed of the machine.
 
-    ``"jax"`` if it is an environment in JAX; ``"envpool"`` if EnvPool is installed and has the environment, no arguments are
-    given, and there are at least four environments or Gymnasium does not have it; else ``"gymnasium"``. Worker processes are
-    used only on request.
+    ``"jax"`` if it is an environment in JAX; ``"envpool"`` if EnvPool is installed and has the same environment, no arguments
+    are given, and there are at least four environments or Gymnasium does not have it; else ``"gymnasium"``. Worker processes
+    are used only on request.
 
     >>> auto_backend("Pendulum-v1", 1), auto_backend("Pendulum-v1", 8, {"g": 9.81})
     ('gymnasium', 'gymnasium')
