@@ -252,8 +252,9 @@ def clone(
     """Trains the policy of an agent to act as demonstrated (behavior cloning), and returns the loss of the last updates.
 
     The loss of continuous actions is the squared error of the deterministic action in [-1, 1], of other actions minus their
-    log-probability. For DQN, QR-DQN and PQN, whose policy follows from values, it is ``max_a (Q(s, a) + m(a)) - Q(s, a*)`` for
-    the demonstrated ``a*``, where the margin ``m`` is 0.8 except at ``a*`` (Hester et al. 2018, arXiv 1704.03732, equation 2).
+    log-probability. For DQN, QR-DQN, IQN and PQN, whose policy follows from values, it is
+    ``max_a (Q(s, a) + m(a)) - Q(s, a*)`` for the demonstrated ``a*``, where the margin ``m`` is 0.8 except at ``a*`` (Hester
+    et al. 2018, arXiv 1704.03732, equation 2).
     Critics learn nothing. Adam begins anew; the optimizers of the agent are not touched. Batch normalization and projection
     are as in training.
 
