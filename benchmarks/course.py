@@ -24,7 +24,7 @@ from trials.provenance import provenance, write
 
 RESULT = Path(__file__).parent / "results" / "course.json"
 LEFT_OUT = ("by_hand(", "draw_training(", "plt.show(", "show_videos(", ".save(")
-"""Cells with these words play, draw or save, and train nothing of what is measured."""
+"""Cells with these words play, draw or save, and train nothing that is measured."""
 ROW = re.compile(r"(.{24}) +(\d+) +(-?[\d.]+) ± +([\d.]+) +(\S+) +(\d+)%")
 
 

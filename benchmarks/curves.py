@@ -94,8 +94,8 @@ def plot(path: Path, published: list[dict[str, Any]]) -> None:
 def plot_goals(panel: Any, title: str, folders: list[Path]) -> None:
     """Plots the success rates of files of ``learning.py`` against steps: the mean of the seeds and their range."""
     style.format_axes(panel)
-    found = {path: curved(path) for folder in folders for path in sorted(folder.glob("*.json"))}
-    for i, (path, runs) in enumerate((path, runs) for path, runs in found.items() if runs):
+    runs_by_path = {path: curved(path) for folder in folders for path in sorted(folder.glob("*.json"))}
+    for i, (path, runs) in enumerate((path, runs) for path, runs in runs_by_path.items() if runs):
         color, _ = style.GROUP_COLORS[i % len(style.GROUP_COLORS)]
         line = "-" if i < len(style.GROUP_COLORS) else "--"
         steps = [step for step, _ in runs[0]["success_curve"]]
@@ -111,9 +111,9 @@ def plot_goals(panel: Any, title: str, folders: list[Path]) -> None:
 def plot_equal_time(panel: Any, env_id: str, options: str = "") -> None:
     """Plots the returns of the runs of equal time against minutes: a line for each seed, whose end is the last evaluation."""
     style.format_axes(panel)
-    found = figures.equal_time_runs(env_id, options)
+    runs_by_method = figures.equal_time_runs(env_id, options)
     for name, (color, _) in zip(figures.EQUAL_TIME, style.GROUP_COLORS, strict=False):
-        for run in found.get(name, []) if "GPU" not in name else []:
+        for run in runs_by_method.get(name, []) if "GPU" not in name else []:
             points = [*run.get("curve", []), (run["steps"], run["mean_return"])]
             minutes = [step / run["steps"] * run["seconds"] / 60 for step, _ in points]
             panel.plot(minutes, [value for _, value in points], color=color, label=name, marker=".")
@@ -126,9 +126,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("action", choices=("record", "plot"))
     parser.add_argument("algorithm", nargs="?", choices=tuple(ENVIRONMENTS))
-    given = parser.parse_args()
-    if given.action == "record":
-        for name in [given.algorithm] if given.algorithm else ENVIRONMENTS:
+    arguments = parser.parse_args()
+    if arguments.action == "record":
+        for name in [arguments.algorithm] if arguments.algorithm else ENVIRONMENTS:
             record(name)
         return
     published = json.loads((RESULTS / "published.json").read_text(encoding="utf-8"))
@@ -142,10 +142,10 @@ def main() -> None:
     style.save(figure, PICTURES / "goals.png")
     figure = style.make_figure("returns after equal time", height=7.2)
     shown = [("HalfCheetah-v5",), ("Hopper-v5",), ("Walker2d-v5",), ("Ant-v5", "-without-contact-forces")]
-    for panel, one in zip(figure.subplots(2, 2).flat, shown, strict=True):
-        plot_equal_time(panel, *one)
-    named = {name: line for panel in figure.axes for line, name in zip(*panel.get_legend_handles_labels(), strict=True)}
-    figure.legend([*named.values()], [*named], loc="outside lower left", ncols=len(named), frameon=False)
+    for panel, task in zip(figure.subplots(2, 2).flat, shown, strict=True):
+        plot_equal_time(panel, *task)
+    lines = {name: line for panel in figure.axes for line, name in zip(*panel.get_legend_handles_labels(), strict=True)}
+    figure.legend([*lines.values()], [*lines], loc="outside lower left", ncols=len(lines), frameon=False)
     style.save(figure, PICTURES / "equal-time.png")
 
 

@@ -9,7 +9,7 @@
 with random actions in a tenth of the steps; BC, TD3+BC, IQL and ReBRAC learn from each alone. ``imitation``: BC from 10
 episodes of Gymnasium's scripted expert on LunarLander-v3, and DAgger with it, for the same number of gradient steps in each
 round. ``share``: SAC with HER alone, with 20 episodes of an expert in half of each batch, after cloning them, and after the
-critics have also learned from them what the clone is worth. The expert is scripted for FetchPush and FetchPickAndPlace, and
+critics have also learned the value of the clone from them. The expert is scripted for FetchPush and FetchPickAndPlace, and
 elsewhere SAC with the same settings; ``--shown FOLDER`` keeps its episodes for the next call, and ``record`` only writes them.
 All train for as many steps: recorded are the first step (0: before training) at which 90 % of 20 evaluation episodes
 succeeded, all steps if they never did, and the mean success rate of all evaluations. ``--continue`` keeps the runs of the
@@ -37,7 +37,7 @@ from rejeu.demonstrations import Demonstrations, clone, dagger, learn_offline, r
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks.learning import summary
-from trials.provenance import machine, provenance, write as save
+from trials.provenance import machine, provenance, read as read_results, write as save
 
 RESULTS = Path(__file__).parent / "results" / "demonstrations"
 EXPERTS = {"Pendulum-v1": (8_000, 3_000), "LunarLanderContinuous-v3": (60_000, 20_000)}
@@ -46,7 +46,7 @@ WEIGHTS: dict[str, dict[str, Any]] = {
     "medium": {"TD3BC": {"alpha": 5.0}, "ReBRAC": {"actor_bc": 0.01, "critic_bc": 0.1}},
     "expert": {"TD3BC": {"alpha": 1.0}, "ReBRAC": {"actor_bc": 1.0, "critic_bc": 0.01}},
 }
-"""How much recorded actions weigh, for each dataset the best of those tried on seed 100."""
+"""Weights of the recorded actions, for each dataset the best of those tried on seed 100."""
 N_STEPS, EPISODES = 20_000, 50
 
 
@@ -97,17 +97,17 @@ def offline(arguments: argparse.Namespace) -> None:
         for algorithm in ("BC", "TD3BC", "IQL", "ReBRAC"):
             for seed in arguments.seeds:
                 began = time.perf_counter()
-                kind = rejeu.TD3 if algorithm == "BC" else getattr(rejeu, algorithm)
+                agent_class = rejeu.TD3 if algorithm == "BC" else getattr(rejeu, algorithm)
                 more = {"batch_size": 256} if algorithm == "ReBRAC" else {}
                 more |= WEIGHTS[name].get(algorithm, {})
-                learner = kind("MlpPolicy", env_id, seed=seed, **small, **more)
+                learner = agent_class("MlpPolicy", env_id, seed=seed, **small, **more)
                 if algorithm == "BC":
                     clone(learner, data, arguments.updates, batch_size=256, seed=seed)
                 else:
                     learn_offline(learner, data, arguments.updates)
-                found = learner.evaluate(EPISODES, seed=10_000 + seed)
-                one = {"data": name, "algorithm": algorithm, "seed": seed, "mean_return": found.mean_return}
-                results.append({**one, "data_return": data.mean_return, "seconds": time.perf_counter() - began})
+                evaluation = learner.evaluate(EPISODES, seed=10_000 + seed)
+                row = {"data": name, "algorithm": algorithm, "seed": seed, "mean_return": evaluation.mean_return}
+                results.append({**row, "data_return": data.mean_return, "seconds": time.perf_counter() - began})
                 write(arguments, results)
 
 
@@ -122,9 +122,11 @@ def imitation(arguments: argparse.Namespace) -> None:
         agent = rejeu.PPO("MlpPolicy", env_id, seed=seed, **settings)
         rounds: list[dict[str, Any]] = []
 
-        def say(i: int, known: Demonstrations, agent: Any = agent, rounds: Any = rounds, seed: int = seed) -> None:
-            found = agent.evaluate(EPISODES, seed=10_000 + seed)
-            rounds.append({"round": i, "labeled_steps": known.n_steps, "mean_return": found.mean_return})
+        def record_round(
+            i: int, labeled: Demonstrations, agent: Any = agent, rounds: Any = rounds, seed: int = seed
+        ) -> None:
+            evaluation = agent.evaluate(EPISODES, seed=10_000 + seed)
+            rounds.append({"round": i, "labeled_steps": labeled.n_steps, "mean_return": evaluation.mean_return})
 
         dagger(
             agent,
@@ -135,7 +137,7 @@ def imitation(arguments: argparse.Namespace) -> None:
             steps=1000,
             updates=arguments.updates,
             seed=seed,
-            after_round=say,
+            after_round=record_round,
         )
         results.append({"seed": seed, "expert_return": shown.mean_return, "rounds": rounds})
         write(arguments, results)
@@ -169,26 +171,26 @@ SHARE: dict[str, tuple[int, str, dict[str, Any]]] = {
 """Number of environments, backend and hyperparameters of ``share``: those of presets without priorities, which cannot be
 combined with demonstrations."""
 WAYS = {"none": "", "share": "", "clone": "clone", "clone and critics": "clone critics"}
-"""What is done before training, by the name of a way; all but the first have a share of demonstrations in each batch."""
+"""Steps before training, by the name of a way; all but the first have a share of demonstrations in each batch."""
 
 
 class Pusher:
     """Goes behind the object, as seen from the goal, and pushes it there: a scripted expert of FetchPush."""
 
     def predict(self, obs: Any, deterministic: bool = True) -> tuple[Any, None]:
-        gripper, thing, goal = obs["observation"][:3], obs["achieved_goal"], obs["desired_goal"]
-        distance = float(np.linalg.norm(goal[:2] - thing[:2]))
-        way = (goal[:2] - thing[:2]) / max(distance, 1e-6)
-        offset = gripper[:2] - thing[:2]
+        gripper, block, goal = obs["observation"][:3], obs["achieved_goal"], obs["desired_goal"]
+        distance = float(np.linalg.norm(goal[:2] - block[:2]))
+        way = (goal[:2] - block[:2]) / max(distance, 1e-6)
+        offset = gripper[:2] - block[:2]
         aside = offset - (offset @ way) * way
-        is_low, is_near = gripper[2] < thing[2] + 0.03, np.linalg.norm(offset) < 0.12
-        target = np.array([*(thing[:2] - 0.09 * way), thing[2] + 0.1])
+        is_low, is_near = gripper[2] < block[2] + 0.03, np.linalg.norm(offset) < 0.12
+        target = np.array([*(block[:2] - 0.09 * way), block[2] + 0.1])
         if distance < 0.03:
             target = np.array([*gripper[:2], gripper[2] + 0.1])
         elif offset @ way < -0.02 and np.linalg.norm(aside) < (0.025 if is_low else 0.015):
             ahead = min(distance, 0.05) * way - 1.5 * aside if is_low else 0.0
-            target = np.array([*(gripper[:2] + ahead), thing[2]])
-        elif gripper[2] < thing[2] + 0.07 and is_near:
+            target = np.array([*(gripper[:2] + ahead), block[2]])
+        elif gripper[2] < block[2] + 0.07 and is_near:
             target[:2] = gripper[:2]
         return np.array([*np.clip(10 * (target - gripper), -1, 1), 0], np.float32), None
 
@@ -198,12 +200,12 @@ class Picker:
 
     def predict(self, obs: Any, deterministic: bool = True) -> tuple[Any, None]:
         gripper, fingers = obs["observation"][:3], obs["observation"][9:11]
-        thing, goal = obs["achieved_goal"], obs["desired_goal"]
-        offset = thing - gripper
+        block, goal = obs["achieved_goal"], obs["desired_goal"]
+        offset = block - gripper
         is_above = np.linalg.norm(offset[:2]) < 0.01
         is_around = is_above and abs(offset[2]) < 0.01
         if is_around and fingers.sum() < 0.055:
-            way = goal - thing
+            way = goal - block
         elif is_above:
             way = offset
         else:
@@ -237,9 +239,9 @@ def share(arguments: argparse.Namespace) -> None:
     """Compares learning without demonstrations, with a share of them, and with a share after cloning them."""
     folder = arguments.shown or Path(tempfile.mkdtemp()) / "shown"
     shown = shown_by_expert(arguments, folder)
-    results = kept(arguments)
+    results = earlier_results(arguments)
     for seed, way in itertools.product(arguments.seeds, arguments.ways):
-        if any((one["seed"], one["demonstrations"]) == (seed, way) for one in results):
+        if any((row["seed"], row["demonstrations"]) == (seed, way) for row in results):
             continue
         began = time.perf_counter()
         agent = learner(arguments, seed, **({} if way == "none" else {"demonstrations": folder}))
@@ -254,11 +256,11 @@ def share(arguments: argparse.Namespace) -> None:
         agent.learn(arguments.steps, evaluate)
         if agent.interrupted:
             sys.exit("stopped; --continue repeats this run")
-        rates += [(one.step, one.evaluation.success_rate) for one in evaluate.results]
-        one = {"seed": seed, "demonstrations": way, "shown_return": shown.mean_return, "rates": rates}
-        one["steps_to_90"] = next((step for step, rate in rates if rate >= 0.9), arguments.steps)
-        one["mean_success"] = float(np.mean([rate for step, rate in rates]))
-        results.append({**one, "seconds": time.perf_counter() - began})
+        rates += [(evaluated.step, evaluated.evaluation.success_rate) for evaluated in evaluate.results]
+        row = {"seed": seed, "demonstrations": way, "shown_return": shown.mean_return, "rates": rates}
+        row["steps_to_90"] = next((step for step, rate in rates if rate >= 0.9), arguments.steps)
+        row["mean_success"] = float(np.mean([rate for step, rate in rates]))
+        results.append({**row, "seconds": time.perf_counter() - began})
         write(arguments, results)
 
 
@@ -267,10 +269,9 @@ def result_file(arguments: argparse.Namespace) -> Path:
     return arguments.out or RESULTS / f"{arguments.what}-{arguments.env.replace('/', '-')}.json"
 
 
-def kept(arguments: argparse.Namespace) -> list[dict[str, Any]]:
+def earlier_results(arguments: argparse.Namespace) -> list[dict[str, Any]]:
     """Returns the results of the file with ``--continue``, else none."""
-    path = result_file(arguments)
-    return json.loads(path.read_text(encoding="utf-8"))["results"] if arguments.goes_on and path.exists() else []
+    return read_results(result_file(arguments)).get("results", []) if arguments.goes_on else []
 
 
 def write(arguments: argparse.Namespace, results: list[dict[str, Any]]) -> None:
@@ -287,19 +288,21 @@ def write(arguments: argparse.Namespace, results: list[dict[str, Any]]) -> None:
 
 def summarized(results: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Returns the mean over the seeds and its interval, for each algorithm and dataset, round, or way of demonstrations."""
-    rows = [{**one, **part} for one in results for part in one.get("rounds", [{}])]
-    kinds = [name for name in ("data", "algorithm", "round", "demonstrations") if name in rows[0]]
+    rows = [{**result, **measures_of_round} for result in results for measures_of_round in result.get("rounds", [{}])]
+    group_keys = [name for name in ("data", "algorithm", "round", "demonstrations") if name in rows[0]]
     measures = [name for name in ("mean_return", "steps_to_90", "mean_success") if name in rows[0]]
-    found = []
+    summaries = []
     for measure in measures:
         groups: dict[tuple[Any, ...], list[float]] = {}
         for row in rows:
-            groups.setdefault(tuple(row[name] for name in kinds), []).append(row[measure])
+            groups.setdefault(tuple(row[name] for name in group_keys), []).append(row[measure])
         for key, values in groups.items():
-            about: dict[str, Any] = summary(values) or {}
-            low, high = about["interval"] or (None, None)
-            found.append({"measure": measure, **dict(zip(kinds, key, strict=True)), **about, "low": low, "high": high})
-    return found
+            statistics: dict[str, Any] = summary(values) or {}
+            low, high = statistics["interval"] or (None, None)
+            summaries.append(
+                {"measure": measure, **dict(zip(group_keys, key, strict=True)), **statistics, "low": low, "high": high}
+            )
+    return summaries
 
 
 def main() -> None:

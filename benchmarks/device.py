@@ -38,7 +38,7 @@ PARKING = {
 
 
 class Case(NamedTuple):
-    """What is trained."""
+    """The algorithm, environments and hyperparameters of a measurement."""
 
     algorithm: str
     env: str
@@ -79,8 +79,8 @@ SCALED = ("ppo", "parking", "parking, 1 update in 16 steps")
 """Cases that are measured with several numbers of environments."""
 
 
-def child(name: str, kind: str, n_envs: int, n_seeds: int, seconds: float) -> dict[str, Any]:
-    """Returns one measurement; ``kind`` is ``device``, ``host`` (the peer) or ``host jax`` (the host's loop in JAX)."""
+def child(name: str, loop: str, n_envs: int, n_seeds: int, seconds: float) -> dict[str, Any]:
+    """Returns one measurement; ``loop`` is ``device``, ``host`` (the peer) or ``host jax`` (the host's loop in JAX)."""
     import jax
 
     import rejeu
@@ -118,11 +118,11 @@ def child(name: str, kind: str, n_envs: int, n_seeds: int, seconds: float) -> di
     else:
         vector = (
             rejeu.make_vector(case.peer, n_envs, case.backend)
-            if kind == "host"
+            if loop == "host"
             else rejeu.make_vector(case.env, n_envs)
         )
         agent = algorithm(policy, vector, seed=0, **case.settings)
-        agent.on_device = kind == "device"
+        agent.on_device = loop == "device"
         agent.learn(10**9, watch)
     at, step = chunks[-1]
     return {
@@ -134,32 +134,32 @@ def child(name: str, kind: str, n_envs: int, n_seeds: int, seconds: float) -> di
     }
 
 
-def measure(name: str, kind: str, n_envs: int, n_seeds: int, seconds: float) -> dict[str, Any]:
+def measure(name: str, loop: str, n_envs: int, n_seeds: int, seconds: float) -> dict[str, Any]:
     """Returns a measurement made in a process of its own, or its error."""
-    words = [sys.executable, __file__, "--child", json.dumps([name, kind, n_envs, n_seeds, seconds])]
+    words = [sys.executable, __file__, "--child", json.dumps([name, loop, n_envs, n_seeds, seconds])]
     environment = {**os.environ, "JAX_COMPILATION_CACHE_DIR": ""}  # no cache, so that every process compiles
-    found = {"case": name, "kind": kind, "n_envs": n_envs, "n_seeds": n_seeds}
-    return {**found, **in_process(*words, environment=environment)}
+    labels = {"case": name, "kind": loop, "n_envs": n_envs, "n_seeds": n_seeds}
+    return {**labels, **in_process(*words, environment=environment)}
 
 
 def plan(cases: list[str], seeds: list[int], envs: list[int]) -> list[tuple[str, str, int, int]]:
-    """Returns the measurements: case, kind, number of environments and of seeds."""
-    found = []
+    """Returns the measurements: case, loop, number of environments and of seeds."""
+    measurements = []
     for name in cases:
         case = CASES[name]
-        found += [(name, kind, case.n_envs, 1) for kind in ("device", "host", "host jax")]
-        found += [(name, "device", case.n_envs, n) for n in seeds if n > 1 and name in SEEDED]
-        found += [(name, "device", n, 1) for n in envs if n != case.n_envs and name in SCALED]
-    return found
+        measurements += [(name, loop, case.n_envs, 1) for loop in ("device", "host", "host jax")]
+        measurements += [(name, "device", case.n_envs, n) for n in seeds if n > 1 and name in SEEDED]
+        measurements += [(name, "device", n, 1) for n in envs if n != case.n_envs and name in SCALED]
+    return measurements
 
 
 def combined(rounds: list[dict[str, Any]]) -> dict[str, Any]:
-    """Returns the medians of measurements of the same kind."""
-    good = [one for one in rounds if "error" not in one]
+    """Returns the medians over the rounds of a measurement."""
+    good = [result for result in rounds if "error" not in result]
     if not good:
         return rounds[-1]
     numbers = ("steps_per_second", "startup_seconds", "compile_seconds")
-    return {**good[0], **{key: median(one[key] for one in good) for key in numbers}, "rounds": len(good)}
+    return {**good[0], **{key: median(result[key] for result in good) for key in numbers}, "rounds": len(good)}
 
 
 def main() -> None:
@@ -177,16 +177,16 @@ def main() -> None:
         print(json.dumps(child(*json.loads(arguments.child))))
         return
     wanted = plan(arguments.cases, arguments.seeds, arguments.envs)
-    rounds: dict[tuple[str, str, int, int], list[dict[str, Any]]] = {one: [] for one in wanted}
+    rounds: dict[tuple[str, str, int, int], list[dict[str, Any]]] = {measurement: [] for measurement in wanted}
     for _ in range(arguments.rounds):
-        for one in wanted:
-            rounds[one].append(measure(*one, arguments.seconds))
-            print(json.dumps(rounds[one][-1]), flush=True)
-    results = [combined(found) for found in rounds.values()]
+        for measurement in wanted:
+            rounds[measurement].append(measure(*measurement, arguments.seconds))
+            print(json.dumps(rounds[measurement][-1]), flush=True)
+    results = [combined(repetitions) for repetitions in rounds.values()]
     content = {
         **provenance(),
         "machine": {"platform": platform.platform(), **machine()},
-        "device": next((one["device"] for one in results if "device" in one), None),
+        "device": next((result["device"] for result in results if "device" in result), None),
         "seconds": arguments.seconds,
         "results": results,
     }

@@ -11,13 +11,12 @@ setting for the loss: its function is replaced.
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from trials.provenance import provenance, write
+from trials.provenance import provenance, read, write
 
 RESULT = Path(__file__).parent / "results" / "dqn_targets.json"
 STEPS = 120_000
@@ -83,9 +82,9 @@ def main() -> None:
             mean = round(sum(returns) / len(returns), 1)
             row = {"case": case, "loop": loop, "mean_return": mean, "returns": ", ".join(f"{r:.0f}" for r in returns)}
             print(row, flush=True)
-            kept = json.loads(RESULT.read_text(encoding="utf-8"))["summary"] if RESULT.exists() else []
-            rows = [one for one in kept if (one["case"], one["loop"]) != (case, loop)] + [row]
-            rows.sort(key=lambda one: (list(CASES).index(one["case"]), one["loop"]))
+            earlier_rows = read(RESULT).get("summary", [])
+            rows = [earlier for earlier in earlier_rows if (earlier["case"], earlier["loop"]) != (case, loop)] + [row]
+            rows.sort(key=lambda row: (list(CASES).index(row["case"]), row["loop"]))
             write(RESULT, {**provenance(), "common": COMMON, "cases": CASES, "summary": rows}, "summary")
 
 

@@ -118,8 +118,8 @@ def rate_of_vector(env_id: str, n: int, backend: str) -> float:
 
 def medians(contenders: dict[str, Callable[[], float]], rounds: int) -> dict[str, int]:
     """Returns the median rate of each contender; in each round all are measured in turn."""
-    found = [{name: rate() for name, rate in contenders.items()} for _ in range(rounds)]
-    return {name: round(median(one[name] for one in found)) for name in contenders}
+    rates = [{name: rate() for name, rate in contenders.items()} for _ in range(rounds)]
+    return {name: round(median(rates_of_round[name] for rates_of_round in rates)) for name in contenders}
 
 
 def functional(env_id: str, n: int, rounds: int) -> dict[str, Any]:
@@ -152,15 +152,15 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--only", nargs="*", help="environments to measure, instead of all")
     parser.add_argument("--out", type=Path)
-    given = parser.parse_args()
-    cases = dict.fromkeys(PEERS, NUMBERS) if given.what == "functional" else BACKENDS
-    measure, rows = {"functional": functional, "backends": backends}[given.what], []
-    for env_id in given.only or cases:
+    arguments = parser.parse_args()
+    cases = dict.fromkeys(PEERS, NUMBERS) if arguments.what == "functional" else BACKENDS
+    measure, rows = {"functional": functional, "backends": backends}[arguments.what], []
+    for env_id in arguments.only or cases:
         for n in cases[env_id]:
-            rows.append({"env": env_id, "n_envs": n, **measure(env_id, n, given.rounds)})
+            rows.append({"env": env_id, "n_envs": n, **measure(env_id, n, arguments.rounds)})
             print(rows[-1], flush=True)
     here = {**machine(), "device": jax.devices()[0].device_kind}
-    out = given.out or RESULTS / f"{given.what}.json"
+    out = arguments.out or RESULTS / f"{arguments.what}.json"
     write(out, {**provenance(), "machine": here, "versions": versions(), "results": rows})
 
 

@@ -22,13 +22,12 @@ import jax.numpy as jnp
 import numpy as np
 from gymnasium import spaces
 from jax import Array
-from scipy import stats
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import rejeu
 from rejeu.envs.functional import FunctionalEnv
-from trials.provenance import machine, provenance, write
+from trials.provenance import half_interval, machine, provenance, write
 
 RESULT = Path(__file__).parent / "results" / "exploration.json"
 N_CELLS = 16
@@ -89,13 +88,6 @@ def train(algorithm: str, rnd: float | None, seed: int) -> dict[str, Any]:
     return {"seed": seed, "first_reached": first, "reached": float(np.mean(late)), "deterministic": result.mean_return}
 
 
-def interval(values: list[float]) -> list[float]:
-    """Returns the 95 % interval of the mean by Student's t distribution."""
-    mean, error = float(np.mean(values)), float(stats.sem(values))
-    half = error * float(stats.t.ppf(0.975, len(values) - 1))
-    return [round(mean - half, 4), round(mean + half, 4)]
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs="*", choices=AGENTS, default=[*AGENTS])
@@ -106,8 +98,9 @@ def main() -> None:
         for rnd in (None, 1.0):
             runs = [train(algorithm, rnd, seed) for seed in arguments.seeds]
             shares = [run["reached"] for run in runs]
-            row = {"algorithm": algorithm, "rnd": rnd, "steps": STEPS, "reached": round(float(np.mean(shares)), 4)}
-            row |= {"interval": interval(shares), "runs": runs}
+            mean, half = float(np.mean(shares)), half_interval(shares)
+            row = {"algorithm": algorithm, "rnd": rnd, "steps": STEPS, "reached": round(mean, 4)}
+            row |= {"interval": [round(mean - half, 4), round(mean + half, 4)], "runs": runs}
             print({key: row[key] for key in ("algorithm", "rnd", "reached", "interval")}, runs, flush=True)
             results.append(row)
             write(RESULT, {**provenance(), "machine": machine(), "results": results}, rows="results")

@@ -55,22 +55,22 @@ def cases() -> Iterator[tuple[str, str, str, dict[str, Any]]]:
 
 def measure(agent: Agent, folder: Path, is_timed: bool) -> dict[str, dict[str, Any]]:
     """Returns the check of each format, with the size of its file."""
-    one = exporting.policy_for(agent, False, 1)
-    recording, *_ = exporting.record(agent, one, None)
+    single_policy = exporting.policy_for(agent, False, 1)
+    recording, *_ = exporting.record(agent, single_policy, None)
     runs: dict[str, tuple[Run, int]] = {}
-    card = exporting.card_of(agent, one, "c", "", None)
+    card = exporting.card_of(agent, single_policy, "c", "", None)
     for target in ("onnx", "c", "stablehlo"):
-        made = one if target == "c" else exporting.policy_for(agent, False, None)
-        source = Exportable(made, one, card, agent.observation_space, agent.action_space)
+        exported_policy = single_policy if target == "c" else exporting.policy_for(agent, False, None)
+        source = Exportable(exported_policy, single_policy, card, agent.observation_space, agent.action_space)
         contents, run = FORMATS[target].files(source)
         if run is not None:
             runs[target] = run, len(contents[0])
     saved = agent.export(folder / "policy.npz").path
     acting: dict[str, Any] = {"predict": agent} if is_timed else {}
-    if not one.of("state"):  # which predict passes on by itself
+    if not single_policy.of("state"):  # which predict passes on by itself
         acting["numpy"] = load_policy(saved)
     structure = spaces.structure(agent.observation_space)
-    names = [port.name for port in one.of("observation")]
+    names = [port.name for port in single_policy.of("observation")]
     for target, policy in acting.items():
 
         def call(inputs: dict[str, np.ndarray], policy: Any = policy) -> dict[str, Any]:
@@ -78,11 +78,14 @@ def measure(agent: Agent, folder: Path, is_timed: bool) -> dict[str, dict[str, A
             masks = {"action_masks": inputs["action_mask"]} if "action_mask" in inputs else {}
             return {"action": policy.predict(obs, deterministic=True, **masks)[0]}
 
-        runs[target] = check.one_by_one(one, call), saved.stat().st_size
+        runs[target] = check.one_by_one(single_policy, call), saved.stat().st_size
     rounds = 5 if is_timed else 1
     return {
         target: {
-            **min((check.compare(one, recording, run) for _ in range(rounds)), key=lambda found: found.p99)._asdict(),
+            **min(
+                (check.compare(single_policy, recording, run) for _ in range(rounds)),
+                key=lambda comparison: comparison.p99,
+            )._asdict(),
             "bytes": size,
         }
         for target, (run, size) in runs.items()
@@ -109,13 +112,13 @@ def main() -> int:
     origin, rows = provenance(), []
     for name, action, form, settings in cases():
         with tempfile.TemporaryDirectory() as folder:
-            found = measure(agent_of(name, action, **settings), Path(folder), form == "64-64")
+            comparisons = measure(agent_of(name, action, **settings), Path(folder), form == "64-64")
         policy = f"{name}, {action}, {form}"
         rows += [
-            {"policy": policy, "algorithm": name, "form": form, "target": target, **one}
-            for target, one in found.items()
+            {"policy": policy, "algorithm": name, "form": form, "target": target, **comparison}
+            for target, comparison in comparisons.items()
         ]
-        print(policy, {target: one["difference"] for target, one in found.items()}, flush=True)
+        print(policy, {target: comparison["difference"] for target, comparison in comparisons.items()}, flush=True)
     exported = [row for row in rows if row["target"] != "predict"]
     content = {
         **origin,

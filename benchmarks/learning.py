@@ -38,7 +38,6 @@ import gymnasium as gym
 import jax
 import numpy as np
 from gymnasium.wrappers import TransformObservation
-from scipy import stats
 
 import rejeu
 from rejeu.agents import presets
@@ -50,7 +49,7 @@ from rejeu.envs.base import Step
 from rejeu.envs.make import VectorEnv, make_vector
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from trials.provenance import machine, provenance
+from trials.provenance import half_interval, machine, provenance, read, write
 
 ZOO = Path(__file__).parent / "zoo.toml"
 RESULTS = Path(__file__).parent / "results" / "learning"
@@ -76,8 +75,8 @@ def train_one(preset: presets.Preset, seed: int, arguments: argparse.Namespace) 
         every = arguments.curve or preset.evaluate_every
         callback = Evaluate(test_env, every, preset.evaluate_episodes, report=partial(print_evaluation, seed))
     steps, minutes = arguments.steps or (None if arguments.minutes else preset.total_steps), arguments.minutes
-    left = minutes and minutes - (time.perf_counter() - began) / 60
-    agent.learn(steps, callback=callback, minutes=left)
+    remaining_minutes = minutes and minutes - (time.perf_counter() - began) / 60
+    agent.learn(steps, callback=callback, minutes=remaining_minutes)
     seconds = time.perf_counter() - began
     if max(agent.num_timesteps / (steps or math.inf), seconds / (60 * (minutes or math.inf))) < 0.99:
         raise SystemExit(
@@ -124,18 +123,18 @@ def record_reached(env: VectorEnv) -> list[list[bool]]:
     return episodes
 
 
-def print_evaluation(seed: int, one: Evaluated, is_best: bool) -> None:
+def print_evaluation(seed: int, evaluated: Evaluated, is_best: bool) -> None:
     """Prints an evaluation on the way, so that a long run can be followed."""
-    result = one.evaluation
+    result = evaluated.evaluation
     print(
-        f"seed {seed}, step {one.step:,}: return {result.mean_return:.1f}, success {result.success_rate:.2f}",
+        f"seed {seed}, step {evaluated.step:,}: return {result.mean_return:.1f}, success {result.success_rate:.2f}",
         flush=True,
     )
 
 
 def curves_of(callback: Evaluate) -> dict[str, list]:
     """Returns the mean return at each evaluation, and for goals the share of episodes that succeeded."""
-    points = [(one.step, one.evaluation) for one in callback.results]
+    points = [(evaluated.step, evaluated.evaluation) for evaluated in callback.results]
     success = [
         [step, evaluation.success_rate] for step, evaluation in points if not math.isnan(evaluation.success_rate)
     ]
@@ -153,14 +152,14 @@ def partly_shown(env_id: str, shown: list[int]) -> gym.Env:
 
 
 def settings_of(preset: presets.Preset, arguments: argparse.Namespace) -> dict[str, Any]:
-    """Returns the hyperparameters of a preset with others set; of those that are dicts, only the given parts change.
+    """Returns the hyperparameters of a preset with the overrides of ``--set``, into which dicts are merged.
 
-    None leaves out what the preset has for another algorithm and this one does not know.
+    None removes a hyperparameter of the preset that this algorithm does not have.
     """
     before = preset.hyperparameters
-    given = {k: {**before.get(k, {}), **v} if isinstance(v, dict) else v for k, v in arguments.set.items()}
-    known = {field.name for field in dataclasses.fields(rejeu.AGENTS[arguments.algorithm].algorithm.Config)}
-    return {name: value for name, value in {**before, **given}.items() if value is not None or name in known}
+    overrides = {k: {**before.get(k, {}), **v} if isinstance(v, dict) else v for k, v in arguments.set.items()}
+    field_names = {field.name for field in dataclasses.fields(rejeu.AGENTS[arguments.algorithm].algorithm.Config)}
+    return {name: value for name, value in {**before, **overrides}.items() if value is not None or name in field_names}
 
 
 def main() -> None:
@@ -203,21 +202,19 @@ def main() -> None:
     preset = dataclasses.replace(preset, env_id=arguments.env_id)
     name = arguments.name or f"{arguments.env_id.replace('/', '-')}-{arguments.algorithm}"
     path = arguments.out / ("zoo" if arguments.zoo else "") / f"{name}.json"
-    runs: list[dict] = []
-    if arguments.goes_on and path.exists():
-        runs = json.loads(path.read_text(encoding="utf-8"))["runs"]
-    path.parent.mkdir(parents=True, exist_ok=True)
+    runs: list[dict] = read(path).get("runs", []) if arguments.goes_on else []
     for seed in sorted({*arguments.seeds} - {run["seed"] for run in runs}):
         runs.append(train_one(preset, seed, arguments))
         print(json.dumps(runs[-1]), flush=True)
-        path.write_text(json.dumps(described(preset, arguments, runs), indent=1) + "\n", encoding="utf-8")
+        write(path, described(preset, arguments, runs))
     print(json.dumps(described(preset, arguments, runs)["summary"]), "->", path)
 
 
 def zoo(env_id: str, algorithm: str) -> presets.Preset | None:
     """Returns the hyperparameters of RL Zoo as a preset, None if they are not in ``benchmarks/zoo.toml``."""
-    known = [convert(one, presets.Preset) for one in tomllib.loads(ZOO.read_text(encoding="utf-8"))["preset"]]
-    return next((one for one in known if (one.env_id, one.algorithm) == (env_id, algorithm)), None)
+    entries = tomllib.loads(ZOO.read_text(encoding="utf-8"))["preset"]
+    zoo_presets = [convert(entry, presets.Preset) for entry in entries]
+    return next((preset for preset in zoo_presets if (preset.env_id, preset.algorithm) == (env_id, algorithm)), None)
 
 
 def described(preset: presets.Preset, arguments: argparse.Namespace, runs: list[dict]) -> dict[str, Any]:
@@ -243,7 +240,7 @@ def summary(values: list) -> dict | None:
     if any(value is None for value in values):
         return None
     mean, n = float(np.mean(values)), len(values)
-    half = float(stats.t.ppf(0.975, n - 1) * np.std(values, ddof=1) / math.sqrt(n)) if n > 1 else math.nan
+    half = half_interval(values)
     interval = [mean - half, mean + half] if n > 1 else None
     return {"mean": mean, "interval": interval, "least": min(values), "largest": max(values), "seeds": n}
 

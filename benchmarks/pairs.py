@@ -11,7 +11,6 @@ median over the pairs. Results go to ``benchmarks/results/pairs.json``.
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import statistics
 import subprocess
@@ -22,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from trials.provenance import commit, write
+from trials.provenance import commit, read, write
 
 RESULT = Path(__file__).parent / "results" / "pairs.json"
 STEPS = {"SAC": 1000, "DDPG": 800, "TD3": 800, "DQN": 1000, "PPO": 8192, "parking": 1600}
@@ -117,18 +116,18 @@ def main() -> None:
     arguments = parser.parse_args()
     if arguments.work:
         return work(arguments.work)
-    found = json.loads(RESULT.read_text(encoding="utf-8")) if RESULT.exists() else {}
+    results = read(RESULT)
     for case in arguments.only:
         pairs = [pair(case, arguments.base, arguments.new, bool(i % 2)) for i in range(arguments.pairs)]
-        found[case] = {
+        results[case] = {
             **{name: commit(getattr(arguments, name)) for name in ("base", "new")},
             "date": time.strftime("%Y-%m-%d"),
-            "ratio": round(statistics.median(one["ratio"] for one in pairs), 3),
-            "processor_ratio": round(statistics.median(one["processor_ratio"] for one in pairs), 3),
+            "ratio": round(statistics.median(speeds["ratio"] for speeds in pairs), 3),
+            "processor_ratio": round(statistics.median(speeds["processor_ratio"] for speeds in pairs), 3),
             "pairs": pairs,
         }
-        print(case, found[case]["ratio"], found[case]["processor_ratio"], flush=True)
-        write(RESULT, found)
+        print(case, results[case]["ratio"], results[case]["processor_ratio"], flush=True)
+        write(RESULT, results)
     return None
 
 

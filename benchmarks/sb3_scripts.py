@@ -1,4 +1,4 @@
-"""Trains by one script with rejeu or with Stable-Baselines3, and records what the trained policies reach.
+"""Trains by one script with rejeu or with Stable-Baselines3, and records the returns of the trained policies.
 
     python benchmarks/sb3_scripts.py rejeu
     python benchmarks/sb3_scripts.py original        # in an environment that has stable-baselines3
@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import importlib
-import json
 import sys
 import time
 from importlib import metadata
@@ -22,7 +21,7 @@ from typing import Any
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from trials.provenance import provenance, write
+from trials.provenance import provenance, read, write
 
 RESULTS = Path(__file__).parent / "results" / "sb3_scripts"
 LIBRARIES = {"rejeu": ("rejeu.sb3", "rejeu"), "original": ("stable_baselines3", "stable-baselines3")}
@@ -65,7 +64,7 @@ EPISODES = 100
 
 
 def train(module: str, name: str, seed: int) -> dict[str, Any]:
-    """Returns the mean return of a trained policy, and what its training took."""
+    """Returns the mean return of a trained policy, and the seconds of its training."""
     library = importlib.import_module(module)
     make_vec_env = importlib.import_module(f"{module}.common.env_util").make_vec_env
     evaluate_policy = importlib.import_module(f"{module}.common.evaluation").evaluate_policy
@@ -103,8 +102,8 @@ def main() -> None:
         for seed in arguments.seeds:
             row = train(module, name, seed)
             print(row, flush=True)
-            rows = json.loads(path.read_text(encoding="utf-8"))["runs"] if path.is_file() else []
-            rows = [one for one in rows if (one["algorithm"], one["seed"]) != (name, seed)] + [row]
+            rows = read(path).get("runs", [])
+            rows = [earlier for earlier in rows if (earlier["algorithm"], earlier["seed"]) != (name, seed)] + [row]
             origin = {**provenance(), "version": metadata.version(distribution), "episodes": EPISODES}
             write(path, {**origin, "runs": rows}, rows="runs")
 

@@ -1,4 +1,4 @@
-"""What the studio costs: watching an agent, a table of many runs, a server that is killed while runs train, keys of games.
+"""Measures the studio: watching an agent, a table of many runs, a server that is killed while runs train, keys of games.
 
     python benchmarks/studio.py watching CartPole-v1 5
     python benchmarks/studio.py table 2000
@@ -135,7 +135,7 @@ def speed(run: Path, page: Page, pids: tuple[int, int]) -> tuple[float, float, f
 
 def watching(env: str, pairs: int, priority: int) -> None:
     """Prints steps a second with and without somebody who watches, in turns of one run, and the frames a second."""
-    ratios, own, shares, frames = [], [], [], []
+    ratios, processor_ratios, shares, frames = [], [], [], []
     with tempfile.TemporaryDirectory() as folder, served(Path(folder)) as (server, address):
         process = train(Path(folder), "run", env, 100_000_000)
         run, times = Path(folder) / "run", []  # type: Path, list[float]
@@ -145,21 +145,26 @@ def watching(env: str, pairs: int, priority: int) -> None:
             page.on("websocket", lambda socket: socket.on("framereceived", partial(counted, times)))
             shown = page.url
             for i in range(pairs):
-                found = {}
-                for kind in ("alone", "watched") if i % 2 else ("watched", "alone"):
-                    page.goto(shown if kind == "watched" else "about:blank")
+                speeds = {}
+                for condition in ("alone", "watched") if i % 2 else ("watched", "alone"):
+                    page.goto(shown if condition == "watched" else "about:blank")
                     times.clear()
-                    found[kind] = speed(run, page, (process.pid, server.pid))
+                    speeds[condition] = speed(run, page, (process.pid, server.pid))
                     frames += [len(times[len(times) // 2 :]) / (times[-1] - times[len(times) // 2])] if times else []
-                ratios.append(found["watched"][0] / found["alone"][0])
-                own.append(found["watched"][1] / found["alone"][1])
-                shares.append(found["watched"][2])
-                print(f"{ratios[-1]:.3f} of the speed, {own[-1]:.3f} a second of processor time,", end=" ")
+                ratios.append(speeds["watched"][0] / speeds["alone"][0])
+                processor_ratios.append(speeds["watched"][1] / speeds["alone"][1])
+                shares.append(speeds["watched"][2])
+                print(f"{ratios[-1]:.3f} of the speed, {processor_ratios[-1]:.3f} a second of processor time,", end=" ")
                 print(f"the server takes {shares[-1]:.2f} cores, {frames[-1]:.1f} frames/s", flush=True)
         process.terminate()
         process.wait()
-    for what, values in (("speed", ratios), ("of processor time", own), ("cores", shares), ("frames/s", frames)):
-        print(f"{what}: median {statistics.median(values):.3f}, {min(values):.3f} to {max(values):.3f}")
+    for label, values in (
+        ("speed", ratios),
+        ("of processor time", processor_ratios),
+        ("cores", shares),
+        ("frames/s", frames),
+    ):
+        print(f"{label}: median {statistics.median(values):.3f}, {min(values):.3f} to {max(values):.3f}")
 
 
 def table(n: int, priority: int) -> None:
@@ -260,7 +265,7 @@ def kills(n: int) -> None:
     """Kills the server at other times while three runs train that it watches; compares their models with undisturbed ones."""
     with tempfile.TemporaryDirectory() as folder:
         alone, watched = Path(folder) / "alone", Path(folder) / "watched"
-        found = {}
+        digests = {}
         for room in (alone, watched):
             room.mkdir()
             runs = [
@@ -273,16 +278,16 @@ def kills(n: int) -> None:
                     process.send_signal(signal.SIGKILL)
                 deaths += 1
             statuses = [run.wait() for run in runs]
-            found[room] = {
+            digests[room] = {
                 path.relative_to(room).as_posix(): digest(path) for path in sorted(room.glob("*/*.safetensors"))
             }
             print(f"{room.name}: exit statuses {statuses}, {deaths} kills", flush=True)
-        same = found[alone] == found[watched]
-        print(f"{len(found[alone])} model files, {'all equal' if same else 'DIFFERENT'}")
+        same = digests[alone] == digests[watched]
+        print(f"{len(digests[alone])} model files, {'all equal' if same else 'DIFFERENT'}")
 
 
 def digest(path: Path) -> str:
-    """Returns what identifies the content of a model: its arrays, without the times in its header."""
+    """Returns a digest of the arrays of a model, without the times in its header."""
     import rejeu
 
     agent = rejeu.load(path)
@@ -309,22 +314,22 @@ def main() -> None:
     parser.add_argument("what", choices=["watching", "table", "busy", "kills", "memory", "keys"])
     parser.add_argument("values", nargs="*")
     parser.add_argument("--browser-priority", type=int, default=19)
-    given = parser.parse_args()
-    values: list[Any] = given.values
-    if given.what == "watching":
-        watching(values[0], int(values[1]), given.browser_priority)
-    elif given.what == "table":
-        table(int(values[0]), given.browser_priority)
-    elif given.what == "busy":
-        busy(int(values[0]), int(values[1]), given.browser_priority)
-    elif given.what == "kills":
+    arguments = parser.parse_args()
+    values: list[Any] = arguments.values
+    if arguments.what == "watching":
+        watching(values[0], int(values[1]), arguments.browser_priority)
+    elif arguments.what == "table":
+        table(int(values[0]), arguments.browser_priority)
+    elif arguments.what == "busy":
+        busy(int(values[0]), int(values[1]), arguments.browser_priority)
+    elif arguments.what == "kills":
         kills(int(values[0]))
-    elif given.what == "keys":
+    elif arguments.what == "keys":
         for env in values:
             for n_agents in (0, 2) if env == values[0] else (0,):
-                keys(env, n_agents, given.browser_priority)
+                keys(env, n_agents, arguments.browser_priority)
     else:
-        grows(float(values[0]), given.browser_priority)
+        grows(float(values[0]), arguments.browser_priority)
 
 
 if __name__ == "__main__":

@@ -43,7 +43,7 @@ def train(preset: dict[str, Any], seed: int) -> Any:
     is_normalized = settings.pop("normalize", False)
     if isinstance(rate := settings.get("learning_rate"), str):
         start = float(rate.removeprefix("lin_"))
-        settings["learning_rate"] = lambda left: left * start
+        settings["learning_rate"] = lambda progress_remaining: progress_remaining * start
     if "activation_fn" in (policy := dict(settings.get("policy_kwargs", {}))):
         policy["activation_fn"] = {"relu": torch.nn.ReLU, "tanh": torch.nn.Tanh}[policy["activation_fn"]]
     env, test = (make_vec_env(preset["env_id"], n, seed=s) for n, s in ((preset["n_envs"], seed), (10, 10_000 + seed)))
@@ -58,8 +58,8 @@ def train(preset: dict[str, Any], seed: int) -> Any:
         length = env.get_attr("spec")[0].max_episode_steps or 0  # it samples from finished episodes only
         settings["learning_starts"] = max(settings["learning_starts"], (length + 1) * preset["n_envs"])
         settings |= {"replay_buffer_class": stable_baselines3.HerReplayBuffer, "gradient_steps": -1}
-    kind = "MultiInputPolicy" if has_goals else "MlpPolicy"
-    model = algorithm(kind, env, seed=seed, device="cpu", **{**settings, "policy_kwargs": policy})
+    policy_name = "MultiInputPolicy" if has_goals else "MlpPolicy"
+    model = algorithm(policy_name, env, seed=seed, device="cpu", **{**settings, "policy_kwargs": policy})
     if not has_goals:
         model.learn(preset["total_steps"])
         return float(evaluate_policy(model, test, 100)[0])
@@ -112,14 +112,14 @@ def main() -> None:
 
         gym.register_envs(gymnasium_robotics)
         gym.register_envs(highway_env)
-    known = tomllib.loads(source.read_text(encoding="utf-8"))["preset"]
+    presets = tomllib.loads(source.read_text(encoding="utf-8"))["preset"]
     ours = (arguments.env_id, arguments.algorithm)
-    preset = next(one for one in known if (one["env_id"], one["algorithm"]) == ours)
+    preset = next(candidate for candidate in presets if (candidate["env_id"], candidate["algorithm"]) == ours)
     for seed in arguments.seeds:
-        found = json.loads(results.read_text(encoding="utf-8")) if results.exists() else {}
-        found["version"] = stable_baselines3.__version__
-        found.setdefault("-".join(ours), {})[str(seed)] = train(preset, seed)
-        results.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+        recorded = json.loads(results.read_text(encoding="utf-8")) if results.exists() else {}
+        recorded["version"] = stable_baselines3.__version__
+        recorded.setdefault("-".join(ours), {})[str(seed)] = train(preset, seed)
+        results.write_text(json.dumps(recorded, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -110,7 +110,7 @@ def test_later_rounds_measure_the_variant_that_was_the_fastest_in_the_first(resu
             7,
             {"while_runs": 7},
         ),
-        (lambda a: jax.lax.cond(a[0, 0] > 0, lambda a: a @ X @ X, lambda a: a @ X, a), 1.25, {"taken": 0.25}),
+        (lambda a: jax.lax.cond(a[0, 0] > 0, lambda a: a @ X @ X, lambda a: a @ X, a), 1.25, {"expensive_share": 0.25}),
         (jax.jit(lambda a: jax.lax.scan(lambda c, _: (c @ X, None), a, None, length=4)[0]), 4, {}),
     ],
     ids=["product", "scan", "scan in scan", "while", "cond", "scan in jit"],

@@ -1,14 +1,16 @@
-"""What scripts of trials and benchmarks share: origin of results, their files, and measurements in other processes."""
+"""Shared by trials and benchmarks: the origin of results, their files and intervals, and measurements in other processes."""
 
 from __future__ import annotations
 
 import json
+import math
 import os
 import platform
 import shlex
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +52,11 @@ def git(root: Path, *arguments: str) -> str:
     return subprocess.run(["git", *arguments], cwd=root, capture_output=True, text=True, check=True).stdout.strip()
 
 
+def read(path: Path) -> dict[str, Any]:
+    """Returns the content of a file of results, which is empty if there is no file."""
+    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+
+
 def write(path: Path, content: dict[str, Any], rows: str = "") -> None:
     """Writes results as JSON; ``rows`` names a list of which each element is on one line."""
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -60,6 +67,15 @@ def write(path: Path, content: dict[str, Any], rows: str = "") -> None:
     path.write_text(text + "\n", encoding="utf-8")
 
 
+def half_interval(values: Sequence[float]) -> float:
+    """Returns half the width of the 95 % confidence interval of the mean (Student's t), NaN for fewer than two values."""
+    import numpy as np
+    from scipy import stats
+
+    n = len(values)
+    return float(stats.t.ppf(0.975, n - 1) * np.std(values, ddof=1) / math.sqrt(n)) if n > 1 else math.nan
+
+
 def in_process(*command: str, environment: dict[str, str] | None = None) -> dict[str, Any]:
     """Runs a command in a process of its own and returns the last line that it printed, which is JSON.
 
@@ -68,5 +84,5 @@ def in_process(*command: str, environment: dict[str, str] | None = None) -> dict
     done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
     if done.returncode:
         return {"error": (done.stderr.strip().splitlines() or ["no message"])[-1]}
-    found: dict[str, Any] = json.loads(done.stdout.strip().splitlines()[-1])
-    return found
+    result: dict[str, Any] = json.loads(done.stdout.strip().splitlines()[-1])
+    return result

@@ -33,11 +33,11 @@ TAKES_PATHS = ("--sb3-python", "--sbx-python", "--peers", "--out", "--page")
 
 
 def parser() -> argparse.ArgumentParser:
-    """Parses the command line."""
-    found = argparse.ArgumentParser(
+    """Returns the parser of the command line."""
+    parser = argparse.ArgumentParser(
         "scripts/bench", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    add = found.add_argument
+    add = parser.add_argument
     add("--cases", nargs="+", choices=plan.CASES, default=list(plan.CASES), help="what to measure; default: everything")
     add("--libraries", nargs="+", choices=plan.LIBRARIES, default=list(plan.LIBRARIES), help="whom; default: all")
     add("--rounds", type=int, default=3, help="turns of every measurement")
@@ -56,7 +56,7 @@ def parser() -> argparse.ArgumentParser:
     )
     add("--out", type=Path, default=RESULT, help="the file of results")
     add("--page", type=Path, default=PAGE, help="the page")
-    return found
+    return parser
 
 
 def shown_command(arguments: Sequence[str]) -> str:
@@ -80,15 +80,15 @@ def interpreters(arguments: argparse.Namespace) -> dict[str, str]:
         SystemExit: if an environment lacks a required module.
     """
     root = arguments.peers or Path(platformdirs.user_cache_dir("rejeu", appauthor=False)) / "bench-peers"
-    found = {"rejeu": sys.executable}
+    pythons = {"rejeu": sys.executable}
     for library in ("sb3", "sbx"):
         if library in arguments.libraries:
-            found[library] = getattr(arguments, f"{library}_python") or peers.make(library, root)
+            pythons[library] = getattr(arguments, f"{library}_python") or peers.make(library, root)
     for library in arguments.libraries:
-        lacking = peers.missing(found[library], library)
+        lacking = peers.missing(pythons[library], library)
         if lacking:
-            raise SystemExit(f"{found[library]} lacks {', '.join(lacking)}, which the measurements of {library} need")
-    return found
+            raise SystemExit(f"{pythons[library]} lacks {', '.join(lacking)}, which the measurements of {library} need")
+    return pythons
 
 
 def header_of(arguments: argparse.Namespace, pythons: dict[str, str], command: str) -> dict[str, Any]:
@@ -104,18 +104,18 @@ def header_of(arguments: argparse.Namespace, pythons: dict[str, str], command: s
     }
 
 
-def write_results(path: Path, kept: runner.Samples) -> dict[str, Any]:
+def write_results(path: Path, samples: runner.Samples) -> dict[str, Any]:
     """Writes all samples and the metadata to the results file, one sample per line, and returns them."""
-    head = json.dumps(kept.header, indent=1)[:-2]
-    rows = ",\n".join("  " + json.dumps(sample) for sample in kept.samples)
+    head = json.dumps(samples.header, indent=1)[:-2]
+    rows = ",\n".join("  " + json.dumps(sample) for sample in samples.samples)
     path.write_text(f'{head},\n "samples": [\n{rows}\n ]\n}}\n', encoding="utf-8")
-    return {**kept.header, "samples": kept.samples}
+    return {**samples.header, "samples": samples.samples}
 
 
-def main(given: Sequence[str] | None = None) -> int:
+def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command and returns its exit status."""
-    given = sys.argv[1:] if given is None else given
-    arguments = parser().parse_args(given)
+    argv = sys.argv[1:] if argv is None else argv
+    arguments = parser().parse_args(argv)
     if arguments.report:
         report.write(json.loads(arguments.out.read_text(encoding="utf-8")), arguments.page)
         return 0
@@ -132,19 +132,19 @@ def main(given: Sequence[str] | None = None) -> int:
     elif (machine.load() or 0.0) > machine.BUSY:
         print(f"WARNING: the load average is {machine.load()}: something ran until just now.", file=sys.stderr)
     pythons = interpreters(arguments)
-    chosen = [
+    measurements = [
         m for m in plan.everything(arguments.quick) if m.case in arguments.cases and m.library in arguments.libraries
     ]
-    samples = arguments.out.with_suffix(".jsonl")
-    kept = runner.Samples(samples, header_of(arguments, pythons, shown_command(given)), arguments.resume)
+    sample_file = arguments.out.with_suffix(".jsonl")
+    samples = runner.Samples(sample_file, header_of(arguments, pythons, shown_command(argv)), arguments.resume)
     try:
         with tempfile.TemporaryDirectory() as cache:
-            runner.run_all(chosen, arguments.rounds, pythons, kept, Path(cache))
+            runner.run_all(measurements, arguments.rounds, pythons, samples, Path(cache))
     except KeyboardInterrupt:
-        print(f"\nstopped; what was measured is in {samples}, and --resume goes on", file=sys.stderr)
+        print(f"\nstopped; what was measured is in {sample_file}, and --resume goes on", file=sys.stderr)
         return 130
-    report.write(write_results(arguments.out, kept), arguments.page)
-    failed = [sample["key"] for sample in kept.samples if "error" in sample]
+    report.write(write_results(arguments.out, samples), arguments.page)
+    failed = [sample["key"] for sample in samples.samples if "error" in sample]
     print(f"samples: {arguments.out}\npage: {arguments.page}")
     if failed:
         print(f"FAILED: {', '.join(failed)}; see the samples, and run again with --resume", file=sys.stderr)

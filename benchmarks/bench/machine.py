@@ -25,13 +25,13 @@ CALIBRATION_SIZE, CALIBRATION_ROUNDS = 384, 40
 VERSIONS = """
 import json, platform, sys
 from importlib import metadata
-found = {"python": platform.python_version()}
+versions = {"python": platform.python_version()}
 for name in sys.argv[1:]:
     try:
-        found[name] = metadata.version(name)
+        versions[name] = metadata.version(name)
     except metadata.PackageNotFoundError:
-        found[name] = None
-print(json.dumps(found))
+        versions[name] = None
+print(json.dumps(versions))
 """
 
 
@@ -108,12 +108,12 @@ def calibrate() -> float:
     True
     """
     a = np.random.default_rng(0).standard_normal((CALIBRATION_SIZE, CALIBRATION_SIZE)).astype(np.float32)
-    out, found = np.empty_like(a), []
+    out, durations = np.empty_like(a), []
     for _ in range(CALIBRATION_ROUNDS):
         began = time.perf_counter()
         np.matmul(a, a, out=out)
-        found.append(time.perf_counter() - began)
-    return 1000.0 * median(found)
+        durations.append(time.perf_counter() - began)
+    return 1000.0 * median(durations)
 
 
 def load() -> float | None:

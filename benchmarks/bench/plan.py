@@ -87,7 +87,7 @@ def everything(quick: bool = False) -> list[Measurement]:
     ``quick`` omits cases that run the same code as others and shortens the rest. Its timings are meaningless.
     """
     seconds = 0.1 if quick else 1.2
-    found = [
+    measurements = [
         *limits(seconds),
         *parking(quick),
         *steps(seconds),
@@ -99,9 +99,11 @@ def everything(quick: bool = False) -> list[Measurement]:
         ),
     ]
     if not quick:
-        return found
+        return measurements
     return [
-        replace(m, variants=m.variants[:1]) for m in found if m.arguments.get("n_envs", 8) in (1, 4, 8) and is_first(m)
+        replace(m, variants=m.variants[:1])
+        for m in measurements
+        if m.arguments.get("n_envs", 8) in (1, 4, 8) and is_first(m)
     ]
 
 
@@ -120,7 +122,9 @@ def limits(seconds: float) -> list[Measurement]:
     envs = [("Pendulum-v1", 1, "gymnasium"), ("MountainCar-v0", 1, "gymnasium"), ("Pendulum-v1", 8, "envpool")]
     envs += [(LANDER, n, backend) for n in N_ENVS for backend in BACKENDS]
     peaks = [
-        Measurement("limits", f"peak, {variant}", "rejeu", "limits", {"what": "peak", "seconds": seconds}, (variant,))
+        Measurement(
+            "limits", f"peak, {variant}", "rejeu", "limits", {"quantity": "peak", "seconds": seconds}, (variant,)
+        )
         for variant in (ONE, ALL)
     ]
     return peaks + [
@@ -129,7 +133,7 @@ def limits(seconds: float) -> list[Measurement]:
             env_name(env, n, backend),
             "rejeu",
             "limits",
-            {"what": "env", "env": env, "n_envs": n, "backend": backend, "seconds": seconds / 3},
+            {"quantity": "env", "env": env, "n_envs": n, "backend": backend, "seconds": seconds / 3},
         )
         for env, n, backend in envs
     ]
@@ -152,7 +156,7 @@ def parking(quick: bool) -> list[Measurement]:
 
 
 def steps(seconds: float) -> list[Measurement]:
-    found = []
+    measurements = []
     for name, (algorithm, env, settings) in STEPS.items():
         for library in LIBRARIES:
             if library == "sbx" and algorithm == "QRDQN":
@@ -165,11 +169,13 @@ def steps(seconds: float) -> list[Measurement]:
                 "seconds": seconds,
             }
             variants = ("",) if library == "rejeu" else (ONE, ALL)
-            found.append(Measurement("steps", name, library, "steps", arguments, variants, counts=library == "rejeu"))
+            measurements.append(
+                Measurement("steps", name, library, "steps", arguments, variants, counts=library == "rejeu")
+            )
     algorithm, env, settings = STEPS["SAC"]
     arguments = {"library": "rejeu", "algorithm": algorithm, "env": env, "settings": settings, "seconds": seconds}
     arguments |= {"n_envs": 8, "backend": "envpool"}
-    return [*found, Measurement("steps", POOL, "rejeu", "steps", arguments, counts=True)]
+    return [*measurements, Measurement("steps", POOL, "rejeu", "steps", arguments, counts=True)]
 
 
 def rollout_settings(algorithm: str, n_envs: int) -> dict[str, Any]:
@@ -181,7 +187,7 @@ def rollout_settings(algorithm: str, n_envs: int) -> dict[str, Any]:
 
 
 def rollouts(seconds: float) -> list[Measurement]:
-    found = []
+    measurements = []
     for algorithm in ("PPO", "A2C"):
         for n in N_ENVS:
             shared = {"algorithm": algorithm, "env": LANDER, "n_envs": n, "seconds": seconds}
@@ -190,20 +196,23 @@ def rollouts(seconds: float) -> list[Measurement]:
                 arguments = {"library": "rejeu", "backend": backend, **shared}
                 name = f"{algorithm}, {n} on {backend}"
                 counts = backend == "gymnasium"  # the number of operations does not depend on the backend
-                found.append(Measurement("rollouts", name, "rejeu", "rollouts", arguments, counts=counts))
+                measurements.append(Measurement("rollouts", name, "rejeu", "rollouts", arguments, counts=counts))
             for library in ("sb3", "sbx") if algorithm == "PPO" else ("sb3",):
                 arguments = {"library": library, **shared}
                 name = f"{algorithm}, {n} on gymnasium"
-                found.append(Measurement("rollouts", name, library, "rollouts", arguments, (ONE, ALL)))
-    return found
+                measurements.append(Measurement("rollouts", name, library, "rollouts", arguments, (ONE, ALL)))
+    return measurements
 
 
 def memory(quick: bool) -> list[Measurement]:
     n = 10_000 if quick else 1_000_000
-    found = []
-    for kind in ("parking", "pendulum"):
+    measurements = []
+    for task in ("parking", "pendulum"):
         for library in ("rejeu", "sb3"):
-            arguments = {"library": library, "kind": kind, "n": n}
-            found.append(Measurement("memory", kind, library, "memory", arguments, rounds=1))
-    arguments = {"library": "sb3", "kind": "pendulum", "n": n, "compact": True}
-    return [*found, Measurement("memory", "pendulum, optimize_memory_usage", "sb3", "memory", arguments, rounds=1)]
+            arguments = {"library": library, "task": task, "n": n}
+            measurements.append(Measurement("memory", task, library, "memory", arguments, rounds=1))
+    arguments = {"library": "sb3", "task": "pendulum", "n": n, "compact": True}
+    return [
+        *measurements,
+        Measurement("memory", "pendulum, optimize_memory_usage", "sb3", "memory", arguments, rounds=1),
+    ]

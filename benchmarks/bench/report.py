@@ -60,8 +60,8 @@ This page is the result of
 
 def how_to_read(results: Mapping[str, Any]) -> str:
     versions = []
-    for library, found in results["versions"].items():
-        listed = ", ".join(f"{name} {version}" for name, version in found.items() if version is not None)
+    for library, packages in results["versions"].items():
+        listed = ", ".join(f"{name} {version}" for name, version in packages.items() if version is not None)
         versions.append(f"- {NAMES[library]}: {listed}")
     return f"""## Method
 
@@ -94,7 +94,7 @@ def machine_limits(samples: Sequence[Sample]) -> str:
         if rate is not None:
             rows.append((f"fastest float32 matrix product, {label}", f"{rate / 1e9:,.0f} GFLOP/s"))
     for measurement in plan.limits(1.0):
-        if measurement.arguments["what"] == "env":
+        if measurement.arguments["quantity"] == "env":
             numbers = step_seconds(samples, "limits", measurement.name, "rejeu")
             if numbers:
                 rows.append((f"bare step: {measurement.name}", f"{with_spread(numbers, 1e6)} us"))

@@ -34,13 +34,14 @@ class Samples:
         self.samples: list[Sample] = []
         if resume and path.exists():
             lines = [line for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
-            kept = json.loads(lines[0])
+            recorded = json.loads(lines[0])
             for name in ("settings", "versions"):
-                if kept[name] != self.header[name]:
+                if recorded[name] != self.header[name]:
                     raise SystemExit(
-                        f"{path} is of a run with other {name}: {kept[name]}, now {self.header[name]}; run without --resume"
+                        f"{path} is of a run with other {name}: {recorded[name]}, now {self.header[name]}; "
+                        "run without --resume"
                     )
-            self.header = kept
+            self.header = recorded
             self.samples = [json.loads(line) for line in lines[1:]]
             self.samples = [sample for sample in self.samples if "error" not in sample]
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -66,7 +67,9 @@ def variants_of(measurement: Measurement, turn: int, samples: Sequence[Sample]) 
     return (min(first, key=cost)["variant"],) if first else measurement.variants
 
 
-def run_all(plan: Sequence[Measurement], rounds: int, pythons: Mapping[str, str], kept: Samples, cache: Path) -> None:
+def run_all(
+    plan: Sequence[Measurement], rounds: int, pythons: Mapping[str, str], samples: Samples, cache: Path
+) -> None:
     """Runs all measurements ``rounds`` times, except those whose samples exist."""
     began = time.perf_counter()
     before = machine.calibrate()
@@ -74,8 +77,8 @@ def run_all(plan: Sequence[Measurement], rounds: int, pythons: Mapping[str, str]
         for measurement in plan:
             if measurement.rounds is not None and turn >= measurement.rounds:
                 continue
-            for variant in variants_of(measurement, turn, kept.samples):
-                if kept.has(measurement.key, variant, turn):
+            for variant in variants_of(measurement, turn, samples.samples):
+                if samples.has(measurement.key, variant, turn):
                     continue
                 busy = machine.others_busy()
                 sample = {
@@ -91,20 +94,20 @@ def run_all(plan: Sequence[Measurement], rounds: int, pythons: Mapping[str, str]
                 after = machine.calibrate()
                 sample["calibration_ms"] = [before, after]
                 before = after
-                kept.add(sample)
+                samples.add(sample)
                 print(line(sample, turn, rounds, time.perf_counter() - began), flush=True)
 
 
 def line(sample: Sample, turn: int, rounds: int, elapsed: float) -> str:
     """Returns a one-line description of a sample."""
-    what = f"{sample['key']}{', ' + sample['variant'] if sample['variant'] else ''}"
+    label = f"{sample['key']}{', ' + sample['variant'] if sample['variant'] else ''}"
     told = "FAILED: " + sample["error"].splitlines()[-1][:120] if "error" in sample else f"{cost(sample):.4g} s"
     if sample["case"] in ("steps", "rollouts") and "error" not in sample:
         told = f"{1e6 * cost(sample):,.0f} us a step"
     busy = sample["others_busy"]
     warning = f"   BUSY: others use {busy} cores" if busy is not None and busy > machine.BUSY else ""
     clock = f"{int(elapsed) // 60:3d}:{int(elapsed) % 60:02d}"
-    return f"{clock}  round {turn + 1}/{rounds}  {what:<60} {told:<22} took {sample['wall_seconds']:.1f} s{warning}"
+    return f"{clock}  round {turn + 1}/{rounds}  {label:<60} {told:<22} took {sample['wall_seconds']:.1f} s{warning}"
 
 
 def measure(measurement: Measurement, turn: int, python: str, variant: str, cache: Path) -> Sample:

@@ -28,9 +28,9 @@ def parking(samples: Sequence[Sample]) -> str:
     rows = []
     peer = best(samples, "parking", "highway-env", "sb3")
     for job in jobs:
-        found = best(samples, "parking", job.name, job.library)
-        get = lambda key, found=found: by_round(found, lambda s: s["result"][key])  # noqa: E731
-        whole = by_round(found, lambda s: s["wall_seconds"])
+        job_samples = best(samples, "parking", job.name, job.library)
+        get = lambda key, job_samples=job_samples: by_round(job_samples, lambda s: s["result"][key])  # noqa: E731
+        whole = by_round(job_samples, lambda s: s["wall_seconds"])
         versus = [times(ratio(by_round(peer, lambda s: s["wall_seconds"]), whole)) if peer else ""]
         speed = ratio(
             get("training_steps_per_second"), by_round(peer, lambda s: s["result"]["training_steps_per_second"])
@@ -39,7 +39,7 @@ def parking(samples: Sequence[Sample]) -> str:
         is_peer = job.library == "sb3"
         rows.append(
             (
-                f"{NAMES[job.library]}, {job.name}" + (f" ({variant_of(found)})" if is_peer else ""),
+                f"{NAMES[job.library]}, {job.name}" + (f" ({variant_of(job_samples)})" if is_peer else ""),
                 with_spread(whole),
                 "" if is_peer else versus[0],
                 with_spread(get("training_steps_per_second")),
@@ -76,10 +76,10 @@ def share_table(cases: Sequence[tuple[str, Sequence[Sample], Mapping[str, float]
     """Returns rejeu's time by part, and the difference from the limit if there is one."""
     rows = []
     beyond = any(gaps is not None for *_, gaps in cases)
-    for name, found, gaps in cases:
-        parts = shares(found)
+    for name, rejeu_samples, gaps in cases:
+        parts = shares(rejeu_samples)
         if parts is not None:
-            cells = [number(1e6 * gaps[part]) if gaps else "" for part in parts] if beyond else []
+            cells = [number(1e6 * gaps[part_name]) if gaps else "" for part_name in parts] if beyond else []
             rows.append((name, *(percent(share) for share in parts.values()), *cells))
     if not rows:
         return ""
@@ -128,27 +128,29 @@ environments on EnvPool and eight updates at once. {settings}.
 LIMIT_HEADER = ("limit", "environment part", "arithmetic part", "of the limit")
 
 
-def compared(samples: Sequence[Sample], name: str, by: Mapping[str, ByRound], found: Limit | None) -> tuple[str, ...]:
+def compared(
+    samples: Sequence[Sample], name: str, by: Mapping[str, ByRound], case_limit: Limit | None
+) -> tuple[str, ...]:
     """Returns a row of :func:`per_step`: rejeu's time, then time, setting and ratio of each other library."""
     cells = [with_spread(by["rejeu"], 1e3)]
     for library in ("sb3", "sbx"):
         setting = variant_of(best(samples, "steps", name, library))
         cells.append(with_spread(by[library], 1e3) + (f", {setting}" if setting else ""))
-        cells.append(times_of_most(by[library], by["rejeu"], found))
+        cells.append(times_of_most(by[library], by["rejeu"], case_limit))
     return tuple(cells)
 
 
-def limit_cells(found: Limit | None, scale: float) -> tuple[str, ...]:
+def limit_cells(case_limit: Limit | None, scale: float) -> tuple[str, ...]:
     """Returns the cells that describe a limit."""
-    if found is None:
+    if case_limit is None:
         return ("",) * len(LIMIT_HEADER)
-    numbers = (number(scale * value) for value in (found.seconds, found.env, found.arithmetic))
-    return (*numbers, percent(found.share_reached))
+    numbers = (number(scale * value) for value in (case_limit.seconds, case_limit.env, case_limit.arithmetic))
+    return (*numbers, percent(case_limit.share_reached))
 
 
-def gap_to(samples: Sequence[Sample], case: str, name: str, found: Limit | None) -> dict[str, float] | None:
+def gap_to(samples: Sequence[Sample], case: str, name: str, case_limit: Limit | None) -> dict[str, float] | None:
     """Returns the time per step in excess of a limit, or None without a limit."""
-    return None if found is None else gap(samples, case, name, found)
+    return None if case_limit is None else gap(samples, case, name, case_limit)
 
 
 def env_of(name: str) -> str:
@@ -165,22 +167,22 @@ def rollouts(samples: Sequence[Sample]) -> str:
         for n in plan.N_ENVS:
             for backend in plan.BACKENDS:
                 name, home = f"{algorithm}, {n} on {backend}", f"{algorithm}, {n} on gymnasium"
-                own = step_seconds(samples, "rollouts", name, "rejeu")
-                if not own:
+                rejeu_seconds = step_seconds(samples, "rollouts", name, "rejeu")
+                if not rejeu_seconds:
                     continue
                 peers = {library: step_seconds(samples, "rollouts", home, library) for library in ("sb3", "sbx")}
-                found = limit(samples, "rollouts", name, plan.env_name(plan.LANDER, n, backend), counted_as=home)
+                case_limit = limit(samples, "rollouts", name, plan.env_name(plan.LANDER, n, backend), counted_as=home)
                 measured.append(
-                    (name, best(samples, "rollouts", name, "rejeu"), gap_to(samples, "rollouts", name, found))
+                    (name, best(samples, "rollouts", name, "rejeu"), gap_to(samples, "rollouts", name, case_limit))
                 )
-                cells = [str(n), {"gymnasium": "Gymnasium", "envpool": "EnvPool"}[backend], rate_text(own)]
+                cells = [str(n), {"gymnasium": "Gymnasium", "envpool": "EnvPool"}[backend], rate_text(rejeu_seconds)]
                 for library, numbers in peers.items():
                     if library == "sbx" and algorithm == "A2C":
                         continue
                     setting = variant_of(best(samples, "rollouts", home, library))
                     cells += [rate_text(numbers) + (f", {setting}" if setting else "")]
-                    cells.append(times_of_most(numbers, own, found))
-                rows.append((*cells, *limit_cells(found, 1e6)))
+                    cells.append(times_of_most(numbers, rejeu_seconds, case_limit))
+                rows.append((*cells, *limit_cells(case_limit, 1e6)))
         if rows:
             header = ["environments", "rejeu on", "rejeu", "Stable-Baselines3", "ratio"]
             header += ["SBX", "ratio"] if algorithm == "PPO" else []
@@ -206,22 +208,22 @@ def rate_text(seconds: ByRound) -> str:
 
 def memory(samples: Sequence[Sample]) -> str:
     rows = []
-    for kind, text in (("parking", "parking-v0: Dict of 3 times 6"), ("pendulum", "Pendulum-v1: Box of 3")):
-        for library, name in (("rejeu", kind), ("sb3", kind), ("sb3", f"{kind}, optimize_memory_usage")):
+    for task, text in (("parking", "parking-v0: Dict of 3 times 6"), ("pendulum", "Pendulum-v1: Box of 3")):
+        for library, name in (("rejeu", task), ("sb3", task), ("sb3", f"{task}, optimize_memory_usage")):
             for row in best(samples, "memory", name, library)[:1]:
-                found = row["result"]
+                measured = row["result"]
                 label = NAMES[library] + (" with `optimize_memory_usage`" if "," in name else "")
-                per = lambda value, n=found["n"]: "" if value is None else number(value / n)  # noqa: E731
-                resident = found["resident"]
+                per = lambda value, n=measured["n"]: "" if value is None else number(value / n)  # noqa: E731
+                resident = measured["resident"]
                 rows.append(
                     (
                         text,
                         label,
-                        per(found["necessary"]),
-                        per(found["nbytes"]),
-                        f"{found['nbytes'] / found['necessary']:.2f}",
+                        per(measured["necessary"]),
+                        per(measured["nbytes"]),
+                        f"{measured['nbytes'] / measured['necessary']:.2f}",
                         per(resident),
-                        "" if resident is None else f"{resident / found['necessary']:.2f}",
+                        "" if resident is None else f"{resident / measured['necessary']:.2f}",
                     )
                 )
     if not rows:
@@ -238,11 +240,11 @@ observations, which rejeu stores as float32.
 
 
 def startup(samples: Sequence[Sample]) -> str:
-    found = {library: best(samples, "startup", "processes", library) for library in plan.LIBRARIES}
-    found = {library: rows for library, rows in found.items() if rows}
-    if not found:
+    samples_by_library = {library: best(samples, "startup", "processes", library) for library in plan.LIBRARIES}
+    samples_by_library = {library: rows for library, rows in samples_by_library.items() if rows}
+    if not samples_by_library:
         return ""
-    names = list(dict.fromkeys(name for rows in found.values() for name in rows[0]["result"]["seconds"]))
+    names = list(dict.fromkeys(name for rows in samples_by_library.values() for name in rows[0]["result"]["seconds"]))
     labels = {
         "python": "`python -c pass`",
         "import": "import",
@@ -256,10 +258,10 @@ def startup(samples: Sequence[Sample]) -> str:
             by_round([r for r in rows if name in r["result"]["seconds"]], lambda s: s["result"]["seconds"][name])
         )
 
-    rows = [(labels[name], *(cell(of, name) for of in found.values())) for name in names]
+    rows = [(labels[name], *(cell(of, name) for of in samples_by_library.values())) for name in names]
     return f"""## Startup
 
 Seconds of whole processes. SBX has a compilation cache too, which it does not enable by itself; Stable-Baselines3 does
 not compile.
 
-{table(("", *(NAMES[library] for library in found)), rows)}"""
+{table(("", *(NAMES[library] for library in samples_by_library)), rows)}"""

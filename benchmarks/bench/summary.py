@@ -56,8 +56,8 @@ def best(samples: Iterable[Sample], case: str, name: str, library: str) -> list[
             by_variant.setdefault(sample["variant"], []).append(sample)
     if not by_variant:
         return []
-    chosen = min(by_variant.values(), key=lambda rows: (-len(rows), median(map(cost, rows))))
-    return sorted(chosen, key=lambda sample: sample["round"])
+    fastest = min(by_variant.values(), key=lambda rows: (-len(rows), median(map(cost, rows))))
+    return sorted(fastest, key=lambda sample: sample["round"])
 
 
 def by_round(rows: Iterable[Sample], get: Callable[[Sample], float]) -> ByRound:
@@ -117,32 +117,33 @@ def shares(rows: Sequence[Sample]) -> dict[str, float] | None:
     """Returns the fraction of a step spent on each part, medians over the rounds; None if there are no rows."""
     if not rows:
         return None
-    found = {}
-    for part in PARTS:
+    fractions = {}
+    for part_name in PARTS:
         each = (row["result"]["seconds_by_part"] for row in rows)
-        found[part] = median(seconds[part] / sum(seconds.values()) for seconds in each)
-    return found
+        fractions[part_name] = median(seconds[part_name] / sum(seconds.values()) for seconds in each)
+    return fractions
 
 
-def gap(samples: Sequence[Sample], case: str, name: str, found: Limit) -> dict[str, float]:
+def gap(samples: Sequence[Sample], case: str, name: str, case_limit: Limit) -> dict[str, float]:
     """Returns the time per step in excess of its limit, in seconds by part, medians over the rounds.
 
     The part of the environment is its time in excess of steps without an agent. The part of the update is the waiting
     time in excess of the arithmetic. It is negative where environment and update run at the same time.
     """
-    floor = {"env": found.env, "update": found.arithmetic}
+    floor = {"env": case_limit.env, "update": case_limit.arithmetic}
     rows = best(samples, case, name, "rejeu")
     return {
-        part: median(row["result"]["seconds_by_part"][part] for row in rows) - floor.get(part, 0.0) for part in PARTS
+        part_name: median(row["result"]["seconds_by_part"][part_name] for row in rows) - floor.get(part_name, 0.0)
+        for part_name in PARTS
     }
 
 
 def drift(samples: Sequence[Sample]) -> Spread | None:
     """Returns the duration of the calibration in milliseconds over the run; None without samples."""
-    found = [ms for sample in samples for ms in sample["calibration_ms"]]
-    return spread(dict(enumerate(found))) if found else None
+    durations = [ms for sample in samples for ms in sample["calibration_ms"]]
+    return spread(dict(enumerate(durations))) if durations else None
 
 
-def disturbed(samples: Sequence[Sample], most: float) -> list[Sample]:
-    """Returns the samples before which other programs used more than ``most`` cores."""
-    return [sample for sample in samples if sample["others_busy"] is not None and sample["others_busy"] > most]
+def disturbed(samples: Sequence[Sample], max_cores: float) -> list[Sample]:
+    """Returns the samples before which other programs used more than ``max_cores`` cores."""
+    return [sample for sample in samples if sample["others_busy"] is not None and sample["others_busy"] > max_cores]

@@ -41,24 +41,26 @@ def with_spread(numbers: ByRound, scale: float = 1.0) -> str:
     """
     if not numbers:
         return ""
-    found = spread(numbers)
+    statistics = spread(numbers)
     if len(numbers) == 1:
-        return number(scale * found.median)
-    return f"{number(scale * found.median)} ({number(scale * found.low)} to {number(scale * found.high)})"
+        return number(scale * statistics.median)
+    return (
+        f"{number(scale * statistics.median)} ({number(scale * statistics.low)} to {number(scale * statistics.high)})"
+    )
 
 
-def times(found: Spread | None) -> str:
+def times(speedup: Spread | None) -> str:
     """Returns the speedup as text, empty if unknown."""
-    return "" if found is None else f"{found.median:.2f}" if found.median < 10 else f"{found.median:.1f}"
+    return "" if speedup is None else f"{speedup.median:.2f}" if speedup.median < 10 else f"{speedup.median:.1f}"
 
 
-def times_of_most(peer: ByRound, own: ByRound, limit: Limit | None) -> str:
+def times_of_most(peer: ByRound, rejeu: ByRound, limit: Limit | None) -> str:
     """Returns the speedup over another library, and the speedup that a program at the limit would have.
 
     >>> times_of_most({0: 8.0, 1: 12.0}, {0: 2.0, 1: 3.0}, Limit(env=0.5, arithmetic=0.5, flops=1.0, share_reached=0.4))
     '4.00 of 10.0'
     """
-    reached = ratio(peer, own)
+    reached = ratio(peer, rejeu)
     if reached is None or limit is None:
         return times(reached)
     return f"{times(reached)} of {times(spread({turn: value / limit.seconds for turn, value in peer.items()}))}"

@@ -15,41 +15,49 @@ EPISODE = 100
 ACTION = {"parking": 2, "pendulum": 1}
 
 
-def observation_space(kind: str) -> spaces.Space:
+def observation_space(task: str) -> spaces.Space:
     """Returns observations of ``"pendulum"`` or of ``"parking"`` (three vectors of six float64, as in highway-env)."""
-    if kind == "pendulum":
+    if task == "pendulum":
         return spaces.Box(-8.0, 8.0, (3,), np.float32)
     box = spaces.Box(-np.inf, np.inf, (6,), np.float64)
     return spaces.Dict({"observation": box, "achieved_goal": box, "desired_goal": box})
 
 
-def action_space(kind: str) -> spaces.Box:
+def action_space(task: str) -> spaces.Box:
     """Returns actions of ``"pendulum"`` or ``"parking"``."""
-    return spaces.Box(-1.0, 1.0, (ACTION[kind],), np.float32)
+    return spaces.Box(-1.0, 1.0, (ACTION[task],), np.float32)
 
 
-def necessary_bytes(kind: str) -> int:
+def necessary_bytes(task: str) -> int:
     """Returns the minimum size of a transition in bytes: one observation, the action, the reward and a done flag.
 
     Numbers have four bytes and the flag has one: ``4 * (observation + action + 1) + 1``. The next observation is stored
     with the next transition.
     """
-    observation = {"parking": 18, "pendulum": 3}[kind]
-    return 4 * (observation + ACTION[kind] + 1) + 1
+    observation = {"parking": 18, "pendulum": 3}[task]
+    return 4 * (observation + ACTION[task] + 1) + 1
 
 
-def rejeu_ring(kind: str, rows: int) -> Any:
+def rejeu_ring(task: str, rows: int) -> Any:
     """Returns a full replay buffer of rejeu with this many rows. Every 101st row is the last observation of an episode.
 
     The buffer of parking includes the data for the hindsight strategy ``future``.
     """
-    from rejeu.core import spaces as own
+    from rejeu.core import spaces as rejeu_spaces
     from rejeu.replay.hindsight import HindsightConfig, counters
     from rejeu.replay.ring import LAST, STEP, Ring
 
-    space = observation_space(kind)
-    kept = counters(HindsightConfig() if kind == "parking" else None)
-    ring = Ring(rows, 1, own.leaves(space), own.structure(space), (ACTION[kind],), np.float32, counters=kept)
+    space = observation_space(task)
+    hindsight_counters = counters(HindsightConfig() if task == "parking" else None)
+    ring = Ring(
+        rows,
+        1,
+        rejeu_spaces.leaves(space),
+        rejeu_spaces.structure(space),
+        (ACTION[task],),
+        np.float32,
+        counters=hindsight_counters,
+    )
     period = EPISODE + 1
     used = ring.rows // period * period
     at = np.arange(used) % period
@@ -91,10 +99,10 @@ def fill_sb3(buffer: Any) -> Any:
     return buffer
 
 
-def nbytes(thing: Any) -> int:
+def nbytes(buffer: Any) -> int:
     """Returns the size in bytes of all arrays that an object holds directly or in dictionaries."""
-    found = 0
-    for value in vars(thing).values():
+    total = 0
+    for value in vars(buffer).values():
         for array in value.values() if isinstance(value, dict) else [value]:
-            found += array.nbytes if isinstance(array, np.ndarray) else 0
-    return found
+            total += array.nbytes if isinstance(array, np.ndarray) else 0
+    return total

@@ -42,13 +42,13 @@ def seconds_of(act: Callable[[], Any], seconds: float, warm_up: int = 3, chunks:
     began = time.perf_counter()
     act()
     n = max(1, int(seconds / chunks / max(time.perf_counter() - began, 1e-9)))
-    found = []
+    durations = []
     for _ in range(chunks):
         began = time.perf_counter()
         for _ in range(n):
             act()
-        found.append((time.perf_counter() - began) / n)
-    return median(found)
+        durations.append((time.perf_counter() - began) / n)
+    return median(durations)
 
 
 def algorithm_of(library: str, name: str) -> Any:
@@ -116,14 +116,14 @@ def time_learning(agent: Any, library: str, warm_up: int, unit: int, seconds: fl
 
     steps = max(1, round(seconds / run(unit))) * unit
     before = dict(agent.seconds) if library == "rejeu" else {}
-    taken = run(steps)
-    result: dict[str, Any] = {"seconds_per_step": taken / steps, "steps": steps, "seconds": taken}
+    elapsed = run(steps)
+    result: dict[str, Any] = {"seconds_per_step": elapsed / steps, "steps": steps, "seconds": elapsed}
     if library == "rejeu":
         from rejeu.core import xla
 
-        spent = {part: value - before[part] for part, value in agent.seconds.items()}
-        parts = {part: spent[part] / steps for part in ("env", "replay", "update")}
-        result["seconds_by_part"] = parts | {"rest": taken / steps - sum(parts.values())}
+        spent = {part_name: value - before[part_name] for part_name, value in agent.seconds.items()}
+        parts = {part_name: spent[part_name] / steps for part_name in ("env", "replay", "update")}
+        result["seconds_by_part"] = parts | {"rest": elapsed / steps - sum(parts.values())}
         result["compile_seconds"] = xla.seconds()
     return result
 

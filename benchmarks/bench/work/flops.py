@@ -15,41 +15,41 @@ import jax
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
 
-def flops(function: Callable[..., Any], *args: Any, while_runs: int = 1, taken: float = 1.0) -> float:
+def flops(function: Callable[..., Any], *args: Any, while_runs: int = 1, expensive_share: float = 1.0) -> float:
     """Returns the floating-point operations of one call of ``function``, including elementwise operations.
 
     Args:
         function: a function that JAX can trace.
         args: arrays, or shapes of arrays.
         while_runs: number of iterations of a ``while_loop``, which the program does not contain.
-        taken: fraction of the calls in which a conditional takes its more expensive branch.
+        expensive_share: fraction of the calls in which a conditional takes its more expensive branch.
 
     >>> import jax, jax.numpy as jnp
     >>> flops(jnp.matmul, jnp.ones((4, 5), jnp.float32), jnp.ones((5, 6), jnp.float32))
     240.0
     """
-    return _flops(jax.make_jaxpr(function)(*args), while_runs, taken)
+    return _flops(jax.make_jaxpr(function)(*args), while_runs, expensive_share)
 
 
-def _flops(program: ClosedJaxpr, while_runs: int, taken: float) -> float:
+def _flops(program: ClosedJaxpr, while_runs: int, expensive_share: float) -> float:
     total = _by_xla(program)
     for equation in _equations(program.jaxpr):
         name, params = equation.primitive.name, equation.params
         if name == "scan":
-            total += (params["length"] - 1) * _flops(params["jaxpr"], while_runs, taken)
-            total += _inner(params["jaxpr"], while_runs, taken)
+            total += (params["length"] - 1) * _flops(params["jaxpr"], while_runs, expensive_share)
+            total += _inner(params["jaxpr"], while_runs, expensive_share)
         elif name == "while":
-            total += (while_runs - 1) * _flops(params["body_jaxpr"], while_runs, taken)
-            total += _inner(params["body_jaxpr"], while_runs, taken)
+            total += (while_runs - 1) * _flops(params["body_jaxpr"], while_runs, expensive_share)
+            total += _inner(params["body_jaxpr"], while_runs, expensive_share)
         elif name == "cond":
-            branches = sorted(_flops(branch, while_runs, taken) for branch in params["branches"])
-            total -= (1.0 - taken) * (branches[-1] - branches[0])
+            branches = sorted(_flops(branch, while_runs, expensive_share) for branch in params["branches"])
+            total -= (1.0 - expensive_share) * (branches[-1] - branches[0])
     return total
 
 
-def _inner(program: ClosedJaxpr, while_runs: int, taken: float) -> float:
+def _inner(program: ClosedJaxpr, while_runs: int, expensive_share: float) -> float:
     """Returns the operations inside loops that the cost analysis of the whole program does not count."""
-    return _flops(program, while_runs, taken) - _by_xla(program)
+    return _flops(program, while_runs, expensive_share) - _by_xla(program)
 
 
 def _equations(jaxpr: Any) -> Iterator[Any]:
@@ -94,7 +94,7 @@ def off_policy(agent: Any, n_envs: int) -> dict[str, float]:
     config, algorithm, shapes = agent.config, agent.learner.algorithm, agent.learner.shapes
     batch = agent.replay_buffer.sample(np.random.default_rng(0), (config.batch_size,))
     clock = Clock(np.uint32(0), np.uint32(0), np.float32(0.0))
-    update = flops(algorithm.update, shapes, batch, clock, taken=1.0 / getattr(config, "policy_delay", 1))
+    update = flops(algorithm.update, shapes, batch, clock, expensive_share=1.0 / getattr(config, "policy_delay", 1))
     return {"update_flops": update, "act_flops": _act(agent, jax.tree.map(lambda x: x[:n_envs], batch.obs), clock)}
 
 

@@ -12,9 +12,9 @@ from benchmarks.bench.work import common
 SIZES = (128, 256, 512, 1024, 2048)
 
 
-def measure(what: str, **arguments: Any) -> dict[str, Any]:
+def measure(quantity: str, **arguments: Any) -> dict[str, Any]:
     """Measures ``"peak"`` or ``"env"``."""
-    return peak(**arguments) if what == "peak" else env_steps(**arguments)
+    return peak(**arguments) if quantity == "peak" else env_steps(**arguments)
 
 
 def env_steps(env: str, n_envs: int, backend: str, seconds: float) -> dict[str, Any]:
@@ -30,12 +30,12 @@ def env_steps(env: str, n_envs: int, backend: str, seconds: float) -> dict[str, 
     space.seed(0)
     actions = [space.sample() for _ in range(64)]
     vector.reset()
-    taken = 0
+    n_steps = 0
 
     def step() -> None:
-        nonlocal taken
-        result = vector.step(actions[taken % len(actions)])
-        taken += 1
+        nonlocal n_steps
+        result = vector.step(actions[n_steps % len(actions)])
+        n_steps += 1
         done = result.terminated | result.truncated
         if done.any():
             vector.reset_done(done)
@@ -67,12 +67,12 @@ def peak(seconds: float) -> dict[str, Any]:
 def shortest(act: Any, seconds: float) -> float:
     """Returns the minimum duration of ``act()`` over at least three calls, in seconds."""
     act()
-    found, began = [], time.perf_counter()
-    while len(found) < 3 or time.perf_counter() - began < seconds:
+    durations, began = [], time.perf_counter()
+    while len(durations) < 3 or time.perf_counter() - began < seconds:
         start = time.perf_counter()
         act()
-        found.append(time.perf_counter() - start)
-    return min(found)
+        durations.append(time.perf_counter() - start)
+    return min(durations)
 
 
 if __name__ == "__main__":

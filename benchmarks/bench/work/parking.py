@@ -63,9 +63,9 @@ def rejeu_job(folder: Path, backend: str, n_envs: int, settings: dict[str, Any],
     evaluation = agent.evaluate(episodes, env=env)
     done = time.perf_counter()
     times = training_times(marks)
-    spent = {part: parts[-1][part] - parts[0][part] for part in parts[0]}
+    spent = {part_name: parts[-1][part_name] - parts[0][part_name] for part_name in parts[0]}
     total = spent.pop("total")
-    by_part = {part: value / times["timed_steps"] for part, value in spent.items()}
+    by_part = {part_name: value / times["timed_steps"] for part_name, value in spent.items()}
     by_part["rest"] = (total - sum(spent.values())) / times["timed_steps"]
     return times | {
         "import_seconds": imported - BEGAN,

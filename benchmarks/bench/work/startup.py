@@ -33,12 +33,12 @@ def measure(library: str) -> dict[str, Any]:
     )
     result = {"python": run("pass"), "import": run(f"import {module}")}
     with tempfile.TemporaryDirectory() as folder:
-        kept = {
+        cache_settings = {
             "JAX_COMPILATION_CACHE_DIR": str(Path(folder) / "jax"),
             "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
         }
-        result["first update, cold"] = run(first_update, **kept)
-        result["first update, warm"] = run(first_update, **kept)
+        result["first update, cold"] = run(first_update, **cache_settings)
+        result["first update, warm"] = run(first_update, **cache_settings)
     if library == "rejeu":
         result["command line, --help"] = run(
             "import sys; sys.argv = ['rejeu', '--help']; from rejeu.lab.cli import main; main"

@@ -24,14 +24,14 @@ def measure(
     import gymnasium as gym
 
     settings = {**settings, "learning_starts": 100, "buffer_size": 100_000, "train_freq": 1, "gradient_steps": 1}
-    given: Any = gym.make(env)
+    agent_env: Any = gym.make(env)
     if library == "rejeu" and (n_envs > 1 or backend != "gymnasium"):
         import rejeu
 
-        given = rejeu.make_vector(env, n_envs, backend, seed=0)
+        agent_env = rejeu.make_vector(env, n_envs, backend, seed=0)
     if library == "sb3":
         settings["device"] = "cpu"
-    agent = common.algorithm_of(library, algorithm)("MlpPolicy", given, seed=0, **settings)
+    agent = common.algorithm_of(library, algorithm)("MlpPolicy", agent_env, seed=0, **settings)
     result = common.time_learning(agent, library, warm_up=WARM_UP, unit=UNIT, seconds=seconds)
     result |= common.threads_used(agent, library, n_envs)
     if count:
