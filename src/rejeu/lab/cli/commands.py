@@ -65,7 +65,8 @@ class Clone(RunOptions):
     """Folder of a Minari dataset, such as rejeu play --record writes."""
     env: Annotated[str | None, Shown("ENV"), Topic.ENVIRONMENT] = None
     """Environment, as for rejeu train; by default the dataset's. One that is imported must be named."""
-    algo: Algorithm = None
+    algo: Name = None
+    """Algorithm; by default the preset's, else one that fits the actions."""
     hyperparameters: Annotated[Settings, Shown("NAME=VALUE ...", "set")] = field(default_factory=dict)
     """Hyperparameters of the agent, as for rejeu train."""
     updates: Annotated[Positive, Shown("N")] = 2000

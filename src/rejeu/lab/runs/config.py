@@ -228,8 +228,8 @@ class RunConfig(EnvironmentOptions):
     """Id of an environment, such as parking-v0; or my_env:MyEnv-v0 or my_env.py, which is imported."""
     algorithm: Annotated[str | None, Shown("NAME", "algo")] = None
     """Algorithm; by default the preset's, else one that fits the actions and the length of the run."""
-    preset: Annotated[str | bool | None, Shown("FILE"), Topic.TRAINING] = None
-    """Use the preset in this file, such as the preset.json of rejeu tune, in the place of rejeu's own."""
+    preset: Annotated[str | bool | None, Shown("NAME"), Topic.TRAINING] = None
+    """Use this preset, small or another name, or a file such as the preset.json of rejeu tune, in the place of rejeu's own."""
     steps: Annotated[Positive | None, Shown("N")] = None
     """Environment steps to take, over all environments; by default the preset's, else 100000."""
     minutes: Annotated[Duration | None, Shown("M")] = None
