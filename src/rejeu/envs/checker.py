@@ -169,7 +169,7 @@ def _played(env: gym.Env, effort: Effort) -> Problems:
         is_nested = isinstance(env.observation_space, spaces.Dict | spaces.Tuple)
         check_policy("MultiInputPolicy" if is_nested else "MlpPolicy", env.observation_space)
         random_action(env.action_space, 1, np.random.default_rng(SEED))
-        # Whole numbers of a Box are taken by SAC alone.
+        # Whole numbers of a Box are taken by off-policy algorithms alone.
         if not isinstance(env.action_space, spaces.Box) or env.action_space.dtype.kind == "f":
             check_action(env.action_space, "every algorithm")
     except (TypeError, ValueError) as error:

@@ -149,7 +149,8 @@ class History:
         Args:
             path: file to write, in the format of its suffix; None for none.
             against: ``"step"`` or ``"seconds"``.
-            window: episodes in the moving average; None for a fifth of the run, at least 3 and at most 50.
+            window: episodes in the moving average; None for a fifth of the run, at least 3 and at most 50, or more in a run of
+                more than 20,000 episodes.
 
         Raises:
             MissingExtra: if matplotlib is not installed.
