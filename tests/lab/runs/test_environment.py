@@ -240,6 +240,23 @@ def test_plain_keyword_arguments_of_a_registered_environment_are_read_from_the_r
     assert "Pendulum-v1 (g=1) on gymnasium" in capsys.readouterr().out
 
 
+def test_plain_keyword_arguments_are_read_from_a_model_outside_of_a_run(registered_run, tmp_path, capsys):
+    shutil.copy(registered_run / "agent.safetensors", tmp_path / "copy.safetensors")
+    assert main(["evaluate", str(tmp_path / "copy"), "--episodes", "1"]) == 0
+    assert "Pendulum-v1 (g=2) on gymnasium" in capsys.readouterr().out
+
+
+def test_a_model_of_the_course_of_training_is_that_of_its_run(registered_run, tmp_path, capsys):
+    run = shutil.copytree(registered_run, tmp_path / "run")
+    config = json.loads((run / "config.json").read_text("utf-8"))
+    config["wrappers"] = ["gymnasium.wrappers:ClipReward"]
+    (run / "config.json").write_text(json.dumps(config), "utf-8")
+    (run / "models").mkdir(exist_ok=True)
+    shutil.copy(run / "agent.safetensors", run / "models" / "step_000000000060.safetensors")
+    assert main(["evaluate", str(run / "models" / "step_000000000060.safetensors"), "--episodes", "1"]) == 2
+    assert "--wrapper gymnasium.wrappers:ClipReward" in capsys.readouterr().err
+
+
 EVIL = [
     {"env": "evil_env:Pendulum-v1"},
     {"env": "evil_env.py"},

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any
 from rejeu.agents import Agent, load
 from rejeu.agents.exporting import export
 from rejeu.checkpoints.run_folder import RunFolder, find_model
-from rejeu.core import devices
+from rejeu.core import checkpoint, devices
 from rejeu.core.errors import CheckpointError
 from rejeu.core.types import Action, JsonObject
 from rejeu.export import FORMATS, target_of
 from rejeu.lab.cli.commands import Evaluate, Export, Import, Play, Pull, Push, Record, Watch, Which
 from rejeu.lab.runs.config import value
-from rejeu.lab.runs.environment import Environment, environment_of, from_arguments, recorded_id
+from rejeu.lab.runs.environment import Environment, environment_of, from_arguments
 from rejeu.lab.runs.output import echo
 from rejeu.logs.formatting import counted, quoted
 from rejeu.logs.video import record_video
@@ -138,7 +138,7 @@ def agent_of(option: str, run: Path, best_or_last: Which, environment: Environme
         ValueError: if it was trained on another environment.
     """
     model = find_model(run, best_or_last)
-    if (trained_on := recorded_id(model)) != environment.env_id:
+    if (trained_on := checkpoint.read_header(model, "agent").get("env_id")) != environment.env_id:
         raise ValueError(f"{option} {run}: that agent plays {trained_on}, not {environment.env_id}")
     return load(model, device=device)
 

@@ -18,6 +18,7 @@ from typing import Any
 
 import gymnasium as gym
 
+from rejeu.checkpoints.model_files import trained_on
 from rejeu.checkpoints.run_folder import RunFolder
 from rejeu.core import checkpoint
 from rejeu.core.errors import CheckpointError
@@ -263,18 +264,10 @@ def environment_of(model: Path, options: RunOptions) -> Environment:
     """
     if options.env is not None:
         return from_arguments(options.env, options)
-    env_id, folder = recorded_id(model), RunFolder(model.parent)
-    if model in (folder.best, folder.agent) and folder.config.is_file():
-        config = read_folder(folder)
-        if config.env == env_id:
+    header = checkpoint.read_header(model, "agent")
+    for folder in map(RunFolder, (model.parent, model.parent.parent)):
+        is_of_run = folder.config.is_file() and (model in (folder.best, folder.agent) or model.parent == folder.models)
+        if is_of_run and (config := read_folder(folder)).env == header.get("env_id"):
             return from_run(config, folder.path, options)
-    return from_run(RunConfig(env=env_id), model, options)
-
-
-def recorded_id(model: Path) -> Any:
-    """Returns the id of the environment of a model file, unchecked; None if it has none.
-
-    Raises:
-        CheckpointError: if the file is not a model.
-    """
-    return checkpoint.read_header(model, "agent").get("env_id")
+    env_id, env_kwargs = trained_on(header) or (header.get("env_id"), {})
+    return from_run(RunConfig(env=env_id, env_kwargs=env_kwargs), model, options)
