@@ -108,6 +108,13 @@ def test_a_sequence_of_seeds_gives_each_environment_the_episodes_of_a_single_one
         np.testing.assert_array_equal(rejeu.make_vector("jax/Pendulum-v1", 1, seed=seed).reset()[0], row)
 
 
+def test_seeds_that_differ_beyond_32_bits_give_different_episodes():
+    seeds = (5, 2**32 + 5, 2**33 + 5)
+    first, *others = (rejeu.make_vector("jax/Pendulum-v1", 2, seed=seed).reset() for seed in seeds)
+    assert all((other != first).any() for other in others)
+    np.testing.assert_array_equal(rejeu.make_vector("jax/Pendulum-v1", 2, seed=seeds[1]).reset(), others[0])
+
+
 def test_resetting_without_a_seed_continues_the_streams():
     env = rejeu.make_vector("jax/Pendulum-v1", 2, seed=5)
     first = env.reset().copy()

@@ -142,8 +142,8 @@ class JaxVector(VectorEnv):
     Args:
         env: the environment.
         n_envs: how many.
-        seed: of the first reset. A number ``seed`` stands for ``reset_all(env, jax.random.key(seed), n_envs)``. With a
-            sequence, environment i behaves as a single one with the i-th seed. None draws one.
+        seed: of the first reset. A number ``seed`` below 2**32 stands for ``reset_all(env, jax.random.key(seed), n_envs)``.
+            With a sequence, environment i behaves as a single one with the i-th seed. None draws one.
         env_id: the id, by default the name of the class.
         reward_threshold: the return at which the environment counts as solved, None if there is none.
 
@@ -217,14 +217,12 @@ class JaxVector(VectorEnv):
             return None
         return [np.asarray(leaf) for leaf in arrays]
 
-    def restore(self, saved: object, obs: Observation) -> list[int]:
+    def restore(self, saved: Any, obs: Observation) -> list[int]:
         template = jax.eval_shape(lambda: reset_all(self.env, jax.random.key(0), self.n_envs))
         expected, tree = jax.tree.flatten(template)
-        if not isinstance(saved, list) or len(saved) != len(expected):
+        are_arrays = isinstance(saved, list) and all(isinstance(array, np.ndarray) for array in saved)
+        if not are_arrays or [(a.shape, a.dtype) for a in saved] != [(leaf.shape, leaf.dtype) for leaf in expected]:
             raise ValueError(f"the snapshot is not of {self.n_envs} environments {self.env_id}")
-        for array, leaf in zip(saved, expected, strict=True):
-            if not isinstance(array, np.ndarray) or array.shape != leaf.shape or array.dtype != leaf.dtype:
-                raise ValueError(f"the snapshot is not of {self.n_envs} environments {self.env_id}")
         self.state = jax.tree.unflatten(tree, [jnp.asarray(array) for array in saved])
         self._obs, self._seed = obs, None
         return []
@@ -256,8 +254,9 @@ class JaxVector(VectorEnv):
 def streams_of(seed: Seed, n: int) -> Array:
     """Returns the streams of ``n`` environments for a seed; see :class:`JaxVector`."""
     if seed is None or isinstance(seed, int):
-        number = int(np.random.SeedSequence().generate_state(1)[0]) if seed is None else seed
-        return streams(jax.random.key(number), n)
+        if seed is None or seed >= 2**32:  # of which JAX would ignore the upper bits
+            seed = int(np.random.SeedSequence(seed).generate_state(1)[0])
+        return streams(jax.random.key(seed), n)
     return jnp.concatenate([streams(jax.random.key(env_seed), 1) for env_seed in seed])
 
 
