@@ -3,6 +3,7 @@
 import os
 import signal
 import time
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -106,6 +107,16 @@ def test_models_of_the_course_of_training_are_thinned(asked):
     assert len(kept) <= requests.MOST_MODELS
     assert (kept[0], kept[-1]) == (0, 39_000)
     assert kept == sorted(kept)
+
+
+def test_a_model_that_somebody_reads_on_windows_does_not_stop_training(asked, monkeypatch):
+    def held(path, missing_ok=False):
+        raise PermissionError(13, "The process cannot access the file because it is being used by another process")
+
+    monkeypatch.setattr(Path, "unlink", held)
+    for step in range(0, 20_000, 1000):
+        requests.keep_model(asked.agent, asked.folder.models, step)
+    assert len(requests.models(asked.folder.models)) == 20
 
 
 def test_a_full_disk_does_not_stop_training(asked, tmp_path):

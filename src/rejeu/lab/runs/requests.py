@@ -48,7 +48,7 @@ def is_asked(path: Path) -> bool:
 
 
 def drop(*paths: Path) -> None:
-    """Removes requests, also those to an earlier process of a run, before anything that takes time."""
+    """Removes files as far as possible: requests, also those to an earlier process, before anything that takes time."""
     for path in paths:
         with suppress(OSError):
             path.unlink(missing_ok=True)
@@ -93,8 +93,7 @@ def keep_model(agent: Agent, folder: Path, step: int) -> None:
     """Writes the model of a step among those of the course of training; of too many every second one is removed."""
     show(agent, folder / f"step_{step:012}.safetensors")
     paths = models(folder)
-    for path in paths[1::2] if len(paths) > MOST_MODELS else ():
-        path.unlink(missing_ok=True)
+    drop(*(paths[1::2] if len(paths) > MOST_MODELS else ()))  # where somebody reads one, Windows keeps it
 
 
 def models(folder: Path) -> Sequence[Path]:
