@@ -307,6 +307,12 @@ def test_a_registered_environment_is_made_anew_for_evaluation():
     assert np.array_equal(one, other)
 
 
+def test_a_file_names_the_arguments_of_environments_that_were_made_before_masks_were_asked_for():
+    gym.register("rejeu-test/Rules-v1", Rules, max_episode_steps=50)
+    agent = small(rejeu.make_vector("rejeu-test/Rules-v1", 1, "gymnasium", kind="discrete"))
+    assert agent.origin == ("rejeu-test/Rules-v1", {"kind": "discrete"})
+
+
 # Where masks come from.
 
 

@@ -195,6 +195,20 @@ def test_own_environment_is_made_again_with_its_arguments_and_wrappers(tmp_path)
         del gym.registry["Lamp-v0"]
 
 
+def test_the_environment_of_a_loaded_agent_is_made_again_with_its_arguments(tmp_path):
+    import rejeu
+
+    env = rejeu.make_vector("Pendulum-v1", 1, "gymnasium", g=2.0)
+    rejeu.SAC("MlpPolicy", env, seed=0, policy_kwargs={"net_arch": [8]}).save(tmp_path / "model")
+    assert rendering_env(rejeu.load(tmp_path / "model"), None).unwrapped.g == 2.0
+
+
+def test_environments_in_worker_processes_are_made_again_with_their_arguments():
+    vector = SimpleNamespace(env_id="Pendulum-v1", wrapped_by=None)
+    agent = SimpleNamespace(run=SimpleNamespace(env=vector), origin=("Pendulum-v1", {"g": 2.0}))
+    assert rendering_env(agent, None).unwrapped.g == 2.0
+
+
 def test_parking_is_drawn_and_plays_at_15_frames_a_second(tmp_path):
     path = record_video(StillCar(), tmp_path / "v.mp4", "parking-v0", episodes=1, max_steps=5, seed=0)
     found = decode(path)

@@ -60,7 +60,7 @@ class InProcess(VectorEnv):
         """
         seed, self._seed = seed if self._seed is None else self._seed, None
         wrapped = InProcess([wrap(env) for env in self.envs], seed)
-        wrapped.seeds, wrapped.owner = self.seeds, self.owner
+        wrapped.seeds, wrapped.owner, wrapped.made_from = self.seeds, self.owner, self.made_from
         return wrapped
 
     def reset(self, seed: Seed = None) -> Observation:

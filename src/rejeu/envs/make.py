@@ -159,8 +159,7 @@ def _made(
 def _of_id(
     env: str, n_envs: int, backend: Backend, seed: Seed, workers: WorkerOptions, env_kwargs: Settings
 ) -> VectorEnv:
-    if backend == "auto":
-        backend = auto_backend(env, n_envs, env_kwargs)
+    backend = auto_backend(env, n_envs, env_kwargs) if backend == "auto" else backend
     if backend == "envpool":
         if env_kwargs:
             raise ValueError(f"the envpool backend takes no environment arguments, got {env_kwargs}; use 'gymnasium'")

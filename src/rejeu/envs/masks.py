@@ -143,7 +143,7 @@ class MaskedVector(VectorEnv):
     def __init__(self, inner: VectorEnv, asks: bool = False) -> None:
         self.inner = inner
         self.n_envs, self.backend, self.env_id = inner.n_envs, inner.backend, inner.env_id
-        self.seeds = inner.seeds
+        self.seeds, self.made_from = inner.seeds, inner.made_from
         self.venv, self.wrapped_by, self.vec_normalize = inner.venv, inner.wrapped_by, inner.vec_normalize
         self.observation_space, self.action_space = inner.observation_space, inner.action_space
         self.max_episode_steps, self.reward_threshold = inner.max_episode_steps, inner.reward_threshold
@@ -261,9 +261,7 @@ def make_masked(
         env = make_vector(env, n_envs, "jax", seed)
     if isinstance(env, JaxVector):
         n = n_choices(env.action_space, env.env_id)
-        masked = MaskedVector(env.with_env(FunctionalMask(env.env, n), seed))
-        masked.made_from = env.made_from
-        return masked
+        return MaskedVector(env.with_env(FunctionalMask(env.env, n), seed))
     if isinstance(env, InProcess):
         return MaskedVector(env.with_wrapper(MaskInObservation, seed))
     if isinstance(env, EnvPool):
@@ -281,9 +279,8 @@ def make_masked(
     backend = "gymnasium" if backend in ("auto", "envpool") else backend
     make = partial(with_mask, env)
     vector = make_vector(make, n_envs, backend, seed, worker_timeout=worker_timeout, restart_workers=restart_workers)
-    masked = MaskedVector(vector)
-    masked.made_from = made_from
-    return masked
+    vector.made_from = made_from
+    return MaskedVector(vector)
 
 
 class FunctionalMask(FunctionalEnv):

@@ -243,30 +243,31 @@ def rendering_env(agent: Any, env: Any) -> gym.Env:
                 f"{type(rendering).__name__}"
             )
         return rendering
-    vector = agent.run.env
-    if vector is None:
+    vector, origin = agent.run.env, getattr(agent, "origin", None)
+    if vector is None and origin is None:
         raise ValueError("this agent has no environment; pass one: record_video(agent, path, env='parking-v0')")
-    if vector.wrapped_by is not None:
+    if vector is not None and vector.wrapped_by is not None:
         raise ValueError(
             f"the agent's own environments are wrapped in {vector.wrapped_by}, which a new one would not have; "
             "use a VecVideoRecorder, or pass env="
         )
     spec = vector.envs[0].spec if isinstance(vector, InProcess) else None
-    if spec is None and provider(vector.env_id) is None and not register(vector.env_id):
+    env_id, env_kwargs = origin or (vector.env_id, {})
+    if spec is None and provider(env_id) is None and not register(env_id):
         raise ValueError(
-            f"the agent's own environment {vector.env_id} is not registered, so it cannot be made again; pass "
+            f"the agent's own environment {env_id} is not registered, so it cannot be made again; pass "
             "env=, made with render_mode='rgb_array'"
         )
     try:
         if spec is None:
-            return make_rendering_env(partial(make_env, vector.env_id), vector.env_id)
+            return make_rendering_env(partial(make_env, env_id, **env_kwargs), env_id)
         make = partial(gym.make, without_recorder(spec), disable_env_checker=True)
         return make_rendering_env(make, spec.id, {"render_mode": None} if "render_mode" in spec.kwargs else {})
     except ValueError as error:
         if "RecordConstructorArgs" not in str(error):
             raise
         raise ValueError(
-            f"the wrappers of the agent's own environment {vector.env_id} cannot be made again ({error}); pass "
+            f"the wrappers of the agent's own environment {env_id} cannot be made again ({error}); pass "
             "env=, made with render_mode='rgb_array' and the same wrappers"
         ) from None
 
