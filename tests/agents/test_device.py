@@ -78,9 +78,19 @@ def test_an_agent_that_must_train_on_the_device_says_why_it_cannot() -> None:
         agent.learn(30)
 
 
-def test_more_steps_than_32_bits_count_are_refused() -> None:
+@pytest.mark.parametrize("env", ["jax/CartPole-v1", "CartPole-v1"])
+def test_more_steps_than_32_bits_count_are_refused(env: str) -> None:
     with pytest.raises(ValueError, match=r"would end at step 5,000,000,000, and steps are counted up to 4,294,967,294"):
-        make(rejeu.DQN, "jax/CartPole-v1").learn(5_000_000_000)
+        make(rejeu.DQN, env).learn(5_000_000_000)
+
+
+@pytest.mark.parametrize("env", ["jax/CartPole-v1", "CartPole-v1"])
+def test_a_run_without_a_limit_of_steps_ends_where_they_cannot_be_counted(env: str) -> None:
+    agent = make(rejeu.DQN, env)
+    agent.run.step = 2**32 - 10
+    agent.learn(minutes=1.0, reset_num_timesteps=False)
+    assert agent.run.step == 2**32 - 2
+    assert agent.call.training_call.is_over(agent.run)
 
 
 def test_the_progress_bar_counts_the_steps_of_a_first_chunk_of_many_turns(capsys: Any) -> None:

@@ -24,7 +24,7 @@ from rejeu.exploration.noise import warn_without_noise
 from rejeu.logs.logging import Console, GuardedSink, Sink, guarded, next_folder, open_log
 from rejeu.training import finite
 from rejeu.training.finite import NonFiniteSteps, NonFiniteUpdate
-from rejeu.training.run import Progress, TrainingCall, checked_limits, time_shares
+from rejeu.training.run import Progress, TrainingCall, checked_limits, last_countable, time_shares
 
 TABLE_SECONDS = 2.0
 """Least time between two tables that ``verbose=1`` prints; other outputs get every row."""
@@ -124,7 +124,8 @@ def start_call(
     """Returns the limits of a call of ``learn``, and prepares the agent's counters and environments for it.
 
     Raises:
-        ValueError: without an environment; without a limit, unless the agent resumes an unfinished ``learn``.
+        ValueError: without an environment; without a limit, unless the agent resumes an unfinished ``learn``; if the steps
+            are too many to be counted with 32 bits.
         RuntimeError: if the agent is learning.
     """
     if agent.call.is_learning:
@@ -142,6 +143,12 @@ def start_call(
         call = unfinished_call(agent)
     else:
         limits = checked_limits(total_timesteps, episodes, minutes)
+        last = None if limits[0] is None else run.step + agent.steps_to_take(limits[0])
+        if last is not None and last > last_countable(run):
+            raise ValueError(
+                f"the run would end at step {last:,}, and steps are counted up to {last_countable(run):,}; give fewer "
+                "total_timesteps, or minutes"
+            )
         if reset_num_timesteps:
             agent.call.reset_step, agent.call.reset_episode = run.step, run.episode
             agent.call.reset_seconds = run.seconds["total"]
@@ -154,7 +161,7 @@ def start_call(
             steps_before=run.step - agent.call.reset_step,
             episodes_before=run.episode - agent.call.reset_episode,
             seconds_before=run.seconds["total"] - agent.call.reset_seconds,
-            last_step=None if limits[0] is None else run.step + agent.steps_to_take(limits[0]),
+            last_step=last,
         )
     is_touched = run.fingerprint is not None and run.fingerprint != snapshot.fingerprint(run.env)
     if is_touched or (run.env.venv is not None and (reset_num_timesteps or resumes)):  # or stepped by hand unseen
@@ -269,11 +276,11 @@ def hint_at_more_environments(agent: AnyAgent) -> None:
         warnings.warn(hint, UserWarning, stacklevel=2)
 
 
-def horizon(agent: AnyAgent, call: TrainingCall) -> tuple[int | None, Callable[[int], float]]:
-    """Returns the number of steps that are left to take, and the progress of schedules after a number of them."""
+def horizon(agent: AnyAgent, call: TrainingCall) -> tuple[int, Callable[[int], float]]:
+    """Returns the number of steps that are left to take at most, and the progress of schedules after a number of them."""
     run, first = agent.run, agent.run.step
-    remaining = None if call.last_step is None else call.last_step - first
-    return remaining, lambda n_steps: call.progress(first + n_steps, run.episode)
+    last = last_countable(run) if call.last_step is None else call.last_step
+    return last - first, lambda n_steps: call.progress(first + n_steps, run.episode)
 
 
 def record_turn(agent: AnyAgent, call: TrainingCall, turn: Progress) -> None:

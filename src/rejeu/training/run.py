@@ -28,6 +28,8 @@ from rejeu.training.finite import NonFiniteMonitor
 from rejeu.training.learner import Learner, PackedState
 
 F = TypeVar("F", bound=Callable[..., Any])
+MAX_STEP = 2**32 - 1
+"""The last step of a run at most: steps are counted in ``uint32``."""
 PARTS = ("env", "replay", "update")
 """Stepping environments; storing and sampling; waiting for the device."""
 
@@ -256,6 +258,11 @@ def in_episodes(run: Run) -> bool:
     return bool(run.playing.any() and run.buffer.length)
 
 
+def last_countable(run: Run) -> int:
+    """Returns the step at which a run ends that nothing else ends: the next turn might be beyond :data:`MAX_STEP`."""
+    return MAX_STEP - run.env.n_envs  # type: ignore[no-any-return]
+
+
 @dataclass
 class TrainingCall:
     """One call of ``learn``. Mutable: ``logged`` is updated with each row of statistics."""
@@ -311,7 +318,8 @@ class TrainingCall:
 
     def is_over(self, run: Run) -> bool:
         """Returns whether one of its limits is reached."""
-        by_steps = self.last_step is not None and run.step >= self.last_step and not in_episodes(run)
+        last_step = last_countable(run) if self.last_step is None else self.last_step
+        by_steps = run.step >= last_step and not in_episodes(run)
         by_episodes = self.n_episodes is not None and run.episode - self.first_episode >= self.n_episodes
         return by_steps or by_episodes or (self.seconds is not None and self.elapsed >= self.seconds)
 

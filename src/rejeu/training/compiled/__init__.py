@@ -21,7 +21,7 @@ from rejeu.core.xla import clock
 from rejeu.training.checks import check_state
 from rejeu.training.compiled.off_policy import OffPolicyProgram
 from rejeu.training.compiled.on_policy import OnPolicyProgram
-from rejeu.training.compiled.program import MAX_STEP, MAX_TURNS, Limits, Remake
+from rejeu.training.compiled.program import MAX_TURNS, Limits, Remake
 from rejeu.training.compiled.trainer import DeviceTrainer
 from rejeu.training.finite import NonFiniteSteps
 from rejeu.training.learner import Learner, bad_leaves, checked
@@ -83,7 +83,6 @@ def train(
         BadEnvironmentError: if a reward or an observation is not finite.
         NonFiniteError: if the state is not finite when training begins.
         NonFiniteSteps: if an update leaves numbers that are not finite. The run has the state before that chunk.
-        ValueError: if the steps are too many to be counted with 32 bits.
     """
     program_class: Any = OnPolicyProgram if isinstance(config, RolloutConfig) else OffPolicyProgram
     program = program_class.of(
@@ -100,11 +99,6 @@ def train(
     trainer = DeviceTrainer(program, runs, learner, hyper or [{}] * len(runs))
     first = runs[active[0]].step
     last = None if n_steps is None else first + n_steps
-    if last is not None and last + program.n_envs > MAX_STEP:
-        raise ValueError(
-            f"the run would end at step {last:,}, and steps are counted up to {MAX_STEP - program.n_envs:,} here; give fewer "
-            "total_timesteps, or minutes"
-        )
     for run in runs:
         check_state(run, learner)
     try:

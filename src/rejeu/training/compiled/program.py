@@ -45,8 +45,6 @@ MAX_TURNS = 1000
 """Turns of a chunk at most. Chunks also end at multiples of it, where the best weights are looked for."""
 LOG_SIZE = 2**18
 """Entries of a chunk's log of episodes at most: turns times environments."""
-MAX_STEP = 2**32 - 1
-"""The last step of a run at most: steps are counted in ``uint32``."""
 
 Remake = Callable[[Any], tuple[Algorithm, Explorer]]
 """Makes the algorithm of a configuration, and its exploration."""
