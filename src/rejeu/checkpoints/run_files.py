@@ -80,7 +80,7 @@ def folder_of(agent: AnyAgent, folder: Path) -> CheckpointFolder:
     """Returns the folder of an agent's checkpoints, always the same object for the same path."""
     folders: dict[Path, CheckpointFolder] = agent.files.checkpoint_folders
     if (path := folder.resolve()) not in folders:
-        folders[path] = CheckpointFolder(agent, folder)
+        folders[path] = CheckpointFolder(agent, folder.absolute())
     return folders[path]
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import itertools
 import os
 import re
 import secrets
@@ -96,13 +97,8 @@ def make_folder(path: Path) -> None:
     Raises:
         OSError: if that is impossible.
     """
-    missing = []
-    while not path.is_dir():
-        missing.append(path)
-        if path == path.parent:
-            break
-        path = path.parent
-    for folder in reversed(missing):
+    missing = itertools.takewhile(lambda folder: not folder.is_dir(), (path, *path.parents))
+    for folder in reversed([*missing]):
         folder.mkdir(exist_ok=True)
         _sync_folder(folder.parent)
 

@@ -21,6 +21,7 @@ from rejeu.lab.runs import begin, environment
 from rejeu.lab.runs.arguments import Train
 from rejeu.lab.runs.config import RunConfig
 from rejeu.lab.runs.environment import Environment
+from rejeu.lab.runs.read import read_run
 from rejeu.logs.formatting import quoted
 from tests.helpers import error_of
 from tests.lab.cli.test_cli import FEWER_FILES, TINY
@@ -74,6 +75,19 @@ def here(tmp_path, monkeypatch):
 def train(*named, out="run"):
     argv = ["train", *named, "--algo", "SAC", "--steps", "60", "--seed", "0", "--out", out, "--evaluate-episodes", "1"]
     assert main([*argv, *FEWER_FILES, "--set", *TINY, "learning_rate=1e-3"]) == 0
+
+
+def test_a_run_stays_whole_where_the_environment_changes_the_current_folder(here):
+    elsewhere = here / "elsewhere"
+    elsewhere.mkdir()
+    source = SOURCE.replace(
+        "        self.x += ", f"        import os; os.chdir({str(elsewhere)!r})\n        self.x += "
+    )
+    (here / "drift_env.py").write_text(source)
+    train("drift_env.py")
+    assert list(elsewhere.iterdir()) == []
+    run = read_run(here / "run")
+    assert (run.state, run.steps, len(run.evaluations), run.notes) == ("finished", 60, 1, ())
 
 
 def forget():

@@ -8,7 +8,7 @@ from __future__ import annotations
 import random
 import sys
 from collections.abc import Mapping
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, chdir, closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -165,7 +165,7 @@ def with_dataset(arguments: Train) -> Train:
 def check_own_environment(environment: Environment, config: Any) -> None:
     """Prints the errors of an environment of one's own, and warns of episodes that never end; ``config`` is the algorithm's.
 
-    A new environment takes some steps; random numbers of NumPy and Python are as before.
+    A new environment takes some steps; random numbers of NumPy and Python, and the current folder, are as before.
 
     Raises:
         BadEnvironmentError: if there are errors.
@@ -175,7 +175,7 @@ def check_own_environment(environment: Environment, config: Any) -> None:
     from rejeu.envs import checker
 
     states = random.getstate(), np.random.get_state()  # noqa: NPY002 - of other code
-    with closing(environment.make()) as env:
+    with chdir("."), closing(environment.make()) as env:
         keeps_infos = getattr(getattr(config, "hindsight", None), "copy_info_dict", False)
         findings = sorted(checker.quick_findings(env, keeps_infos))
     random.setstate(states[0])

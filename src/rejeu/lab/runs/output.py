@@ -112,7 +112,7 @@ def summary(facts: JsonObject, agent: Agent, folder: RunFolder, environment: Env
     lines = [""]
     if not facts["complete"]:
         can_resume = checkpoint_files(folder.checkpoints)
-        how = f"; rejeu resume {quoted(folder.path)}{options} continues" if can_resume else ""
+        how = f"; rejeu resume {quoted(facts['run'])}{options} continues" if can_resume else ""
         ending = "paused" if facts["signal"] is None else f"stopped by {NAMES[facts['signal']]}"
         saved = "; everything is saved" if agent.failed_writes.complete else ""
         lines.append(f"{ending}{saved}{how}")
@@ -124,11 +124,11 @@ def summary(facts: JsonObject, agent: Agent, folder: RunFolder, environment: Env
         lines.append(f"best model    step {evaluate.best.step:,}: {evaluate.best.evaluation}")
     backend = " --backend gymnasium" if register(environment.env_id) else ""
     steps = f"; {agent.num_timesteps:,} steps at {agent.steps_per_second:,.0f} steps/s" if agent.num_timesteps else ""
-    try_it = f"try it        rejeu evaluate {quoted(folder.path)}{options}{backend}"
+    try_it = f"try it        rejeu evaluate {quoted(facts['run'])}{options}{backend}"
     return "\n".join(
         [
             *lines,
-            f"files         {folder.path}: {', '.join(facts['files'])}",
+            f"files         {facts['run']}: {', '.join(facts['files'])}",
             f"time          {facts['seconds']:.1f} s in all, {facts['compile_seconds']:.1f} s of them compiling{steps}",
             *([try_it] if {folder.best.name, folder.agent.name} & {*facts["files"]} else ()),
         ]

@@ -78,6 +78,8 @@ class Learning(NamedTuple):
     """All of them, with ``evaluate``."""
     sinks: list[GuardedSink]
     """The outputs of the rows of statistics, of episodes and of the video."""
+    session: Session
+    """The session with the full path of its folder: an environment may change the current folder."""
 
     def close(self) -> None:
         """Closes the outputs."""
@@ -150,30 +152,32 @@ class Session(NamedTuple):
 
     def finish(self, learning: Learning, stop: Interrupt, stopwatch: Stopwatch) -> tuple[int, JsonObject]:
         """Evaluates, plots and records a video after training; prints a summary, and returns what :meth:`run` does."""
-        agent, folder, environment, evaluate = self.agent, self.folder, self.environment, learning.evaluate
+        agent, environment, evaluate, session = self.agent, self.environment, learning.evaluate, learning.session
         is_complete = not stop.requested and has_reached_goal(agent)
         try:
             if is_complete:
-                with leaving(f"interrupted after training; the models are saved in {folder.path}"):
+                with leaving(f"interrupted after training; the models are saved in {self.folder.path}"):
                     evaluate_now(evaluate, agent)
-                    self.plot_curve(evaluate)
+                    session.plot_curve(evaluate)
                     if self.has_video:
-                        self.record_video(learning)
+                        session.record_video(learning)
             else:
                 if stop.signal is None:
-                    ask(folder.paused)
-                self.plot_curve(evaluate)
-                again = f"rejeu record {quoted(folder.path)}{environment.run.again()}"
+                    ask(session.folder.paused)
+                session.plot_curve(evaluate)
+                again = f"rejeu record {quoted(self.folder.path)}{environment.run.again()}"
                 echo(f"no video of a run that was stopped; {again} makes one")
         except Exception:
-            self.write_report()
+            session.write_report()
             raise
         finally:
             learning.close()
         agent.failed_writes.retry()
-        self.write_report()
-        result = as_dict(agent, folder, evaluate, stop.signal, is_complete, stopwatch)
-        echo(summary(result, agent, folder, environment, evaluate))
+        session.write_report()
+        result = as_dict(agent, session.folder, evaluate, stop.signal, is_complete, stopwatch) | {
+            "run": self.folder.path
+        }
+        echo(summary(result, agent, session.folder, environment, evaluate))
         if failed := agent.failed_writes.summary():
             print(f"warning: {failed}", file=sys.stderr)
         if stop.signal is not None:
@@ -196,18 +200,19 @@ class Session(NamedTuple):
 
         At its end models and tables are written, and then the folder is unlocked.
         """
-        agent, folder = self.agent, self.folder
-        outputs = self.outputs()
+        agent, folder = self.agent, RunFolder(self.folder.path.absolute())
+        session = self._replace(folder=folder)
+        outputs = session.outputs()
         agent.report_folder = folder.path
-        evaluate, callbacks = self.callbacks(stop)
-        learning = Learning(evaluate, callbacks, outputs)
+        evaluate, callbacks = session.callbacks(stop)
+        learning = Learning(evaluate, callbacks, outputs, session)
         try:
             lock = closing(agent.checkpoint_folder(folder.checkpoints))
             with lock, noted_in(folder.warnings), saved_at_exit(agent, folder, evaluate):
                 yield learning
         except BaseException as error:
             if isinstance(error, Exception):
-                self.write_report()
+                session.write_report()
             learning.close()
             raise
 
