@@ -3,6 +3,7 @@
 import hashlib
 import json
 import math
+import os
 import shutil
 import subprocess
 import zipfile
@@ -279,6 +280,17 @@ def test_the_contract_is_in_the_file_and_beside_it(tmp_path):
     assert (card["outputs"][0]["low"], card["outputs"][0]["dtype"]) == (-2.0, "float32")
     assert session.get_inputs()[0].shape == [2, 3]
     assert beside["check"]["source"] == "Pendulum-v1"
+
+
+@pytest.mark.skipif(os.name != "posix", reason="the compiler is a script of a shell")
+def test_what_a_compiler_says_in_another_encoding_is_passed_on(tmp_path, monkeypatch):
+    compiler = tmp_path / "compiler"
+    compiler.write_text("#!/bin/sh\nprintf '\\377: no space left' >&2\nexit 1\n")
+    compiler.chmod(0o755)
+    monkeypatch.setattr(c_file, "main_of", lambda policy, stem: b"")
+    run = c_file.c_run(None, b"", b"", "policy", str(compiler))
+    with pytest.raises(RuntimeError, match=r"does not compile the C file: .*: no space left"):
+        run({})
 
 
 @pytest.mark.skipif(not has_compiler, reason="needs a C compiler")

@@ -113,7 +113,7 @@ def c_run(policy: Policy, source: bytes, header: bytes, stem: str, compiler: str
             options = ["-O2", "-std=c99", "-Wall", "-Wextra", "-Werror", "-c", "policy.c"]
             for arguments in (options, ["-O2", "main.c", "policy.o", "-lm", "-o", "main"]):
                 command = [compiler, *arguments]
-                compilation = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+                compilation = subprocess.run(command, cwd=folder, capture_output=True, errors="replace", check=False)
                 if compilation.returncode:
                     raise RuntimeError(f"{compiler} does not compile the C file: {compilation.stderr[:1000]}")
             input_ports = [port for port in policy.inputs if port.role != "state"]
