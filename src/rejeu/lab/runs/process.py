@@ -73,8 +73,9 @@ def program(task: Path) -> list[str]:
     return interrupt.program("-m", "rejeu", "--task", str(task))
 
 
-APART: dict[str, Any] = {"creationflags": 0x208} if sys.platform == "win32" else {"start_new_session": True}
-"""Options of a process that no signal to this one reaches; on Windows it is detached, and a process group of its own."""
+APART: dict[str, Any] = {"creationflags": 0x8000200} if sys.platform == "win32" else {"start_new_session": True}
+"""Options of a process that no signal to this one reaches; on Windows it is a process group with a hidden console of its own,
+so that no window opens for each of the programs that it starts, such as workers and ffmpeg."""
 
 
 def start_apart(words: Sequence[str], log: Path) -> subprocess.Popen[bytes]:
