@@ -260,7 +260,7 @@ def in_episodes(run: Run) -> bool:
 
 def last_countable(run: Run) -> int:
     """Returns the step at which a run ends that nothing else ends: the next turn might be beyond :data:`MAX_STEP`."""
-    return MAX_STEP - run.env.n_envs  # type: ignore[no-any-return]
+    return MAX_STEP - run.env.n_envs
 
 
 @dataclass

@@ -269,5 +269,5 @@ def environment_of(model: Path, options: RunOptions) -> Environment:
         is_of_run = folder.config.is_file() and (model in (folder.best, folder.agent) or model.parent == folder.models)
         if is_of_run and (config := read_folder(folder)).env == header.get("env_id"):
             return from_run(config, folder.path, options)
-    env_id, env_kwargs = trained_on(header) or (header.get("env_id"), {})
+    env_id, env_kwargs = trained_on(header) or (header.get("env_id", ""), {})
     return from_run(RunConfig(env=env_id, env_kwargs=env_kwargs), model, options)
