@@ -212,10 +212,15 @@ def test_rewards_that_are_infinite_beyond_the_episode_do_not_leak_into_it():
 
 
 @pytest.mark.parametrize(
-    ("strategy", "shares"),
-    [("desired", {"desired": 4}), ({"future": 2, "desired": 2}, {"future": 2, "desired": 2}), (MIXES[1], MIXES[1])],
+    ("strategy", "shares", "size"),
+    [
+        ("desired", {"desired": 4}, 500),
+        (MIXES[0], MIXES[0], 500),
+        (MIXES[1], MIXES[1], 500),
+        ({"future": 60, "desired": 40}, {"future": 60, "desired": 40}, 50),  # fewer transitions than turns
+    ],
 )
-def test_strategies_have_their_shares_of_every_batch_and_desired_takes_that_of_any_step(strategy, shares):
+def test_strategies_have_their_shares_of_every_batch_and_desired_takes_that_of_any_step(strategy, shares, size):
     """The desired goals of the stored steps are (100 + environment, place), as in no achieved goal."""
     replay, model = filled(2, 16, [turn("no", "no")] * 5 + [turn("truncated", "no")] + [turn("no", "no")] * 6, strategy)
     ring, n_envs = replay.ring, 2
@@ -224,8 +229,7 @@ def test_strategies_have_their_shares_of_every_batch_and_desired_takes_that_of_a
         ring.obs[replay.desired][ring.index(np.full(len(times), env), times)] = np.stack(
             [np.full(len(times), 100 + env), times], axis=1
         )
-    batches, size = 50, 500
-    goals = replay.sample(np.random.default_rng(0), (batches, size)).obs["desired_goal"][:, : size * 4 // 5]
+    goals = replay.sample(np.random.default_rng(0), (50, size)).obs["desired_goal"][:, : size * 4 // 5]
     is_desired = goals[..., 0] >= 100
     expected = size * 4 / 5 * shares["desired"] / sum(shares.values())
     assert (np.abs(is_desired.sum(axis=1) - expected) <= 2).all()

@@ -216,17 +216,23 @@ class MixedStrategies(NamedTuple):
 
     def goals(self, achieved: AnyArray, index: AnyArray, desired: Callable[[AnyArray], AnyArray]) -> AnyArray:
         """Returns the goals at positions, of which ``achieved`` are those of one kind, and ``desired`` returns the other."""
-        for i, (strategy, _) in enumerate(self.shares):
-            if strategy == "desired":
-                rows = rows_of_shares(tuple(share for _, share in self.shares), len(index))[0][i]
-                achieved = replaced(achieved, rows, desired(index[rows]))
+        turns, _ = rows_of_shares(tuple(share for _, share in self.shares), len(index))
+        for rows in (turns[i] for i, (strategy, _) in enumerate(self.shares) if strategy == "desired"):
+            achieved = replaced(achieved, rows, desired(index[rows]))
         return achieved
 
 
 @cache
 def rows_of_shares(shares: tuple[int, ...], n: int) -> tuple[list[np.ndarray], np.ndarray]:
-    """Returns the indices of each share of ``n`` transitions, which take turns, and the order that sorts all of them."""
-    turns = np.resize(np.repeat(np.arange(len(shares)), shares), n)
+    """Returns the indices of each share of ``n`` transitions, which take turns, and the order that sorts all of them.
+
+    The turns of each share are evenly spread, so that a batch with fewer transitions than turns has all shares too.
+
+    >>> [len(rows) for rows in rows_of_shares((60, 40), 50)[0]]
+    [30, 20]
+    """
+    times = np.concatenate([(np.arange(share) + 0.5) / share for share in shares])
+    turns = np.resize(np.repeat(np.arange(len(shares)), shares)[times.argsort(kind="stable")], n)
     rows = [np.flatnonzero(turns == i) for i in range(len(shares))]
     return rows, np.argsort(np.concatenate(rows))
 
