@@ -97,22 +97,33 @@ def test_the_files_are_written_to_a_folder_without_an_upload(server, run, tmp_pa
     assert {one.name for one in (tmp_path / "again").iterdir()} == {*written}
 
 
-def test_the_address_of_a_dataset_stays_on_this_machine(run, tmp_path):
-    """Only the name of the folder of the demonstrations is written; the model is the same otherwise."""
+def test_the_paths_of_this_machine_stay_on_it(run, tmp_path):
+    """Only the last names of folders and files are written; the model is the same otherwise."""
     network = {"policy_kwargs": {"net_arch": [8]}, "seed": 0, "learning_starts": 20}
     record(rejeu.DDPG("MlpPolicy", "Pendulum-v1", **network), "Pendulum-v1", 1, tmp_path / "shown", seed=0)
     agent = rejeu.DDPG("MlpPolicy", "Pendulum-v1", **network, demonstrations=tmp_path / "shown")
     agent.learn(40)
     agent.save(run / "best")
     (run / "agent.safetensors").unlink()
-    values = {"hyperparameters": {"demonstrations": str(tmp_path / "shown"), "gamma": 0.99}}
+    values = {"hyperparameters": {"demonstrations": str(tmp_path / "shown"), "gamma": 0.99}, "env": "a/Walk-v0"}
+    values |= {
+        "env_argument": f"{tmp_path / 'walk.py'}:Walk-v0",
+        "wrappers": ["C:\\me\\slow.py:Slow", "gymnasium.wrappers:Y"],
+    }
+    values |= {"origin": {"run": str(tmp_path / "été 1")}}
     (run / "config.json").write_text(json.dumps(values))
     (run / "evaluations.csv").unlink()
     hub.lay_out(run, tmp_path / "files", "me/pendulum")
     for path in (tmp_path / "files").iterdir():
         assert str(tmp_path).encode() not in path.read_bytes(), path
     written = json.loads((tmp_path / "files" / "config.json").read_text())
-    assert written == {"hyperparameters": {"demonstrations": "shown", "gamma": 0.99}}
+    assert written == {
+        "hyperparameters": {"demonstrations": "shown", "gamma": 0.99},
+        "env": "a/Walk-v0",
+        "env_argument": "walk.py:Walk-v0",
+        "wrappers": ["slow.py:Slow", "gymnasium.wrappers:Y"],
+        "origin": {"run": "été 1"},
+    }
     pushed = rejeu.load(tmp_path / "files" / "agent.safetensors")
     assert Path(pushed.config.demonstrations) == Path("shown").absolute()
     assert pushed.num_timesteps == 40

@@ -7,18 +7,20 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from fnmatch import fnmatchcase
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import Any
 
 from rejeu.agents import load, zip_files
 from rejeu.agents.agent import Agent
 from rejeu.checkpoints import pickled
 from rejeu.checkpoints.run_folder import check_free, find_model
+from rejeu.core import atomic
 from rejeu.core.errors import requires
 from rejeu.core.records import brief
 from rejeu.core.types import JsonObject
@@ -31,6 +33,8 @@ from rejeu.logs.formatting import counted
 VIDEO = "video.mp4"
 FILES = ("config.json", "episodes.csv", "metrics.csv", "evaluations.csv", "curve.png", VIDEO)
 """Files of a run folder that are pushed, besides the model."""
+FULL_PATH = re.compile(r'"(?:/|[A-Za-z]:[/\\]|\\\\)(?:[^"\\]|\\.)*"')
+"""A text of JSON that is a full path."""
 MODEL, ONNX, CARD = "agent.safetensors", "policy.onnx", "README.md"
 WANTED = (*FILES, MODEL, ONNX, f"{ONNX}.json", CARD, "*.zip", "*.pkl", "args.yml", "config.yml", "env_kwargs.yml")
 """Files that are pulled."""
@@ -105,9 +109,9 @@ def lay_out(source: str | Path, folder: Path, repo: str, note: Callable[[str], A
     if dataset := getattr(agent.config, "demonstrations", None):  # where it lies on this machine concerns nobody else
         assign(agent.config, demonstrations=Path(dataset).name)
         agent.save(folder / MODEL)
-        for path in folder.glob("config.json"):
-            text = path.read_text("utf-8").replace(json.dumps(dataset), json.dumps(Path(dataset).name))
-            path.write_text(text, "utf-8")
+    for path in folder.glob("config.json"):  # nor where the file of an environment does, or another run
+        name = lambda match: json.dumps(PureWindowsPath(json.loads(match[0])).name)  # noqa: E731
+        atomic.write(path, FULL_PATH.sub(name, path.read_text("utf-8")))
     try:
         agent.export(folder / ONNX)
     except (ImportError, OSError, RuntimeError, ValueError) as error:

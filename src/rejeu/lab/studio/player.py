@@ -271,11 +271,9 @@ class LivePlayer:
         for path in files.get(self.model, matching):
             if path.is_file():
                 return path
-        if not is_locked(folder.lock):
-            raise FileNotFoundError("there is no model; the run has ended before it wrote one")
-        raise FileNotFoundError(
-            "there is no policy yet; the first is shown when functions are compiled and training has begun"
-        )
+        ended = "there is no model; the run has ended before it wrote one"
+        waiting = "there is no policy yet; the first is shown when functions are compiled and training has begun"
+        raise FileNotFoundError(waiting if is_locked(folder.lock) else ended)
 
 
 def nearest_seed(env: gym.Env, goal: Sequence[float]) -> int:
