@@ -1,11 +1,11 @@
-"""Prints the test files of a change: what ``scripts/test --changed`` runs.
+"""Prints the test files of a change, which ``scripts/test --changed`` runs.
 
     python scripts/changed.py [COMMIT] [--files FILE ...]
 
-The change is what differs from COMMIT (default: ``main``), including what is not committed yet. The tests of a changed module
-are the files that have its name, and those that import it, directly or through modules of ``tests``. If there are none, they
-are those of the modules that import it, and so on. A test file that has changed is one of them. So are all tests of a folder
-in :data:`SERVED`, whose modules run in a process that tests start.
+The change is the difference from COMMIT (default: ``main``), including uncommitted files. The tests of a changed module are
+the files that have its name, and those that import it, directly or through modules of ``tests``. If there are none, they are
+those of the modules that import it, and so on. A test file that has changed is one of them. So are all tests of a folder in
+:data:`SERVED`, whose modules run in a process that tests start.
 """
 
 from __future__ import annotations
@@ -46,10 +46,10 @@ def definitions(modules: dict[str, tuple[Path, ast.Module]]) -> dict[tuple[str, 
 
 
 def used(
-    module: str, path: Path, tree: ast.Module, known: set[str], behind: dict[tuple[str, str], str]
+    module: str, path: Path, tree: ast.Module, modules: set[str], behind: dict[tuple[str, str], str]
 ) -> Iterator[str]:
     """Yields each module that a test file imports, with those behind the names that it takes from packages."""
-    for source, node in imports(module, path, tree, known):
+    for source, node in imports(module, path, tree, modules):
         yield source
         if isinstance(node, ast.ImportFrom):
             yield from (behind[source, alias.name] for alias in node.names if (source, alias.name) in behind)
@@ -60,12 +60,12 @@ def used(
 
 def reached(start: Iterable[str], edges: dict[str, set[str]]) -> set[str]:
     """Returns the names that can be reached, with those at the start."""
-    found, left = set(start), list(start)
-    while left:
-        new = edges[left.pop()] - found
-        found |= new
-        left += new
-    return found
+    names, queue = set(start), list(start)
+    while queue:
+        new = edges[queue.pop()] - names
+        names |= new
+        queue += new
+    return names
 
 
 class Graph(NamedTuple):
@@ -83,17 +83,17 @@ class Graph(NamedTuple):
 def graph() -> Graph:
     """Reads all files once."""
     package, tests = parse(ROOT / "src"), parse(ROOT, "tests")
-    behind, known = definitions(package), {*package, *tests}
+    behind, modules = definitions(package), {*package, *tests}
     edges: dict[str, set[str]] = defaultdict(set)
     for name, (path, tree) in tests.items():
-        edges[name] = set(used(name, path, tree, known, behind))
+        edges[name] = set(used(name, path, tree, modules, behind))
     importers: dict[str, set[str]] = defaultdict(set)
     for name, (path, tree) in package.items():
         for source, _ in imports(name, path, tree, set(package)):
             importers[source].add(name)
-    within_tests = defaultdict(set, {name: {one for one in found if one in tests} for name, found in edges.items()})
+    within_tests = defaultdict(set, {name: sources & tests.keys() for name, sources in edges.items()})
     needs = {
-        name: set[str]().union(*(edges[one] for one in reached([name], within_tests))) | {name}
+        name: set[str]().union(*(edges[module] for module in reached([name], within_tests))) | {name}
         for name in tests
         if name.rpartition(".")[2].startswith("test_")
     }
@@ -105,30 +105,32 @@ def graph() -> Graph:
 def tests_of(changed: Iterable[str]) -> list[str]:
     """Returns the test files of changed files, as paths below the repository, sorted."""
     paths, needs, importers = graph()
-    found: set[str] = set()
-    for module in (paths[one] for one in changed if one in paths):
-        found |= {name for name in needs if f"test_{module.rpartition('.')[2]}" == name.rpartition(".")[2]}
+    selected: set[str] = set()
+    for module in (paths[file] for file in changed if file in paths):
+        selected |= {name for name in needs if f"test_{module.rpartition('.')[2]}" == name.rpartition(".")[2]}
         package = {module.rpartition(".")[0]}
         ring = {module} | (package if package <= importers[module] & DISPATCHING else set())
-        seen = set(ring)
+        visited = set(ring)
         while ring and not (of_ring := {name for name, modules in needs.items() if modules & ring}):
-            ring = set[str]().union(*(importers[one] for one in ring)) - seen
-            seen |= ring
-        found |= of_ring if ring else set()
+            ring = set[str]().union(*(importers[importer] for importer in ring)) - visited
+            visited |= ring
+        selected |= of_ring if ring else set()
         served = SERVED.get(module.rpartition(".")[0])
-        found |= {name for name in needs if name.rpartition(".")[0] == served}
-    return sorted(path for path, name in paths.items() if name in found)
+        selected |= {name for name in needs if name.rpartition(".")[0] == served}
+    return sorted(path for path, name in paths.items() if name in selected)
 
 
 def main() -> None:
     """Runs the command."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("commit", nargs="?", default="main", help="what the change is compared with")
+    parser.add_argument("commit", nargs="?", default="main", help="compare with this commit")
     parser.add_argument("--files", nargs="+", help="these files instead, as paths below the repository")
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     git = ["git", "-C", str(ROOT)]
-    commands = [[*git, "diff", "--name-only", given.commit], [*git, "ls-files", "--others", "--exclude-standard"]]
-    changed = given.files or [line for one in commands for line in subprocess.check_output(one, text=True).splitlines()]
+    commands = [[*git, "diff", "--name-only", arguments.commit], [*git, "ls-files", "--others", "--exclude-standard"]]
+    changed = arguments.files or [
+        line for command in commands for line in subprocess.check_output(command, text=True).splitlines()
+    ]
     print("\n".join(tests_of(changed)))
 
 

@@ -23,7 +23,6 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 from gymnasium import spaces
-from scipy import stats
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "src")]
@@ -41,6 +40,7 @@ from rejeu.algorithms.soft import EntropyConfig  # noqa: E402
 from rejeu.core import schedules, validation  # noqa: E402
 from rejeu.envs.masks import n_choices  # noqa: E402
 from scripts import sb3_parity  # noqa: E402
+from trials.provenance import half_interval  # noqa: E402
 
 DATA = ROOT / "benchmarks" / "results"
 PRESET_RESULTS = ROOT / "src" / "rejeu" / "agents" / "presets" / "results.json"
@@ -96,8 +96,8 @@ def measured() -> list[PresetResult]:
     Those in goal environments are in ``goals``, unless there is a file of the same name with another budget.
     """
     files = [*(DATA / "learning" / "goals").glob("*.json"), *(DATA / "learning").glob("*.json")]
-    found = [result_of(load(path.name, path.parent)) for path in {path.name: path for path in files}.values()]
-    return sorted(found, key=lambda result: (result.env_id, result.algorithm, result.setting))
+    results = [result_of(load(path.name, path.parent)) for path in {path.name: path for path in files}.values()]
+    return sorted(results, key=lambda result: (result.env_id, result.algorithm, result.setting))
 
 
 def result_of(data: dict[str, Any], judged_by_success: tuple[str, ...] = JUDGED_BY_SUCCESS) -> PresetResult:
@@ -145,7 +145,7 @@ def code(text: str) -> str:
 def learned(folder: str, length: str = "") -> str:
     """Every result of a folder of ``benchmarks/results``, beside all that is published; ``short`` leaves its origin out.
 
-    The text above a short table says that what is published is RL Zoo's or of CleanRL's defaults.
+    The text above a short table says that the published returns are RL Zoo's or of CleanRL's defaults.
     """
     rows = []
     for path in sorted((DATA / folder).glob("*.json")):
@@ -186,8 +186,8 @@ def learned(folder: str, length: str = "") -> str:
         "options",
     )
     shown = {"short": slice(0, 5), "own": [0, 1, 2, 3, 5, 6, 7]}.get(length, slice(None))
-    kept = np.arange(len(header))[shown]
-    return table([header[i] for i in kept], [[row[i] for i in kept] for row in rows])
+    columns = np.arange(len(header))[shown]
+    return table([header[i] for i in columns], [[row[i] for i in columns] for row in rows])
 
 
 def goals(folder: str = "") -> str:
@@ -207,7 +207,7 @@ def goals(folder: str = "") -> str:
                 *(success([curve[mark] for curve in curves if mark in curve]) for mark in marks),
                 f"{success([run['success_rate'] for run in runs])} at {runs[0]['steps']:,}",
                 success([run["reached_rate"] for run in runs if "reached_rate" in run]),
-                " to ".join(dict.fromkeys(f"{one:.1f}" for one in (min(minutes), max(minutes)))),
+                " to ".join(dict.fromkeys(f"{value:.1f}" for value in (min(minutes), max(minutes)))),
                 str(len(runs)),
                 content["commit"],
                 code(re.sub(r" *--(out|keep) \S+", "", options).strip()),
@@ -215,8 +215,8 @@ def goals(folder: str = "") -> str:
         )
     columns = ["environment", "algorithm", *(f"at {mark:,}" for mark in marks), "at the end", "reached once"]
     header = [*columns, "minutes", "seeds", "commit", "options"]
-    kept = [i for i in range(len(header)) if any(row[i] for row in rows)]
-    return table([header[i] for i in kept], [[row[i] for i in kept] for row in rows])
+    filled = [i for i in range(len(header)) if any(row[i] for row in rows)]
+    return table([header[i] for i in filled], [[row[i] for i in filled] for row in rows])
 
 
 def other_goals() -> str:
@@ -247,7 +247,7 @@ def success(rates: list[float]) -> str:
     mean = 100 * float(np.mean(rates))
     if len(rates) < 3:
         return f"{mean:.3g} %"
-    half = 100 * float(stats.t.ppf(0.975, len(rates) - 1) * stats.sem(rates))
+    half = 100 * half_interval(rates)
     return f"{mean:.1f} % ({max(mean - half, 0):.0f} to {min(mean + half, 100):.0f})"
 
 
@@ -265,19 +265,19 @@ def hyperparameters(algorithm: str) -> str:
     """The hyperparameters of an algorithm with defaults and meanings; of those that it shares, the defaults that differ."""
     config = AGENTS[algorithm].algorithm.Config
     docs, defaults = validation.field_docs(config), validation.field_defaults(config)
-    known: set[str] = set()
+    shared_names: set[str] = set()
     shared = []
     for base, owner, link in SHARED:
         if issubclass(config, base) and config is not base and owner != algorithm:
             explained = validation.field_docs(base)
             usual = validation.field_defaults(AGENTS[owner].algorithm.Config if owner in AGENTS else base)
-            names = [name for name in docs if name not in known and docs[name] == explained.get(name)]
+            names = [name for name in docs if name not in shared_names and docs[name] == explained.get(name)]
             differ = {name: shown(defaults[name]) for name in names if shown(defaults[name]) != shown(usual[name])}
             shared += [differences(f"[of {owner}]({link})", differ, [*(explained.keys() - docs.keys())])] * bool(names)
-            known.update(names)
+            shared_names.update(names)
     declared = [name for owner in config.__mro__ for name in vars(owner).get("__annotations__", ()) if name in docs]
-    own = [name for name in dict.fromkeys(declared) if name not in known]
-    return "\n\n".join([meanings(own, docs, defaults)] * bool(own) + shared)
+    own_names = [name for name in dict.fromkeys(declared) if name not in shared_names]
+    return "\n\n".join([meanings(own_names, docs, defaults)] * bool(own_names) + shared)
 
 
 def differences(where: str, defaults: dict[str, str], missing: list[str]) -> str:
@@ -290,11 +290,11 @@ def differences(where: str, defaults: dict[str, str], missing: list[str]) -> str
     )
 
 
-def shared_hyperparameters(kind: str) -> str:
+def shared_hyperparameters(family: str) -> str:
     """The hyperparameters that all off-policy or all on-policy algorithms have; the latter without those of both kinds."""
-    config, other = (OffPolicyConfig, None) if kind == "off-policy" else (OnPolicyConfig, OffPolicyConfig)
-    docs, known = validation.field_docs(config), validation.field_docs(other) if other else {}
-    names = [name for name in docs if known.get(name) != docs[name]]
+    config, other_config = (OffPolicyConfig, None) if family == "off-policy" else (OnPolicyConfig, OffPolicyConfig)
+    docs, other_docs = validation.field_docs(config), validation.field_docs(other_config) if other_config else {}
+    names = [name for name in docs if other_docs.get(name) != docs[name]]
     return meanings(names, docs, validation.field_defaults(config))
 
 
@@ -373,10 +373,10 @@ def can_make(agent: Any, config: Any, observation_space: spaces.Space, action_sp
 def training_times() -> str:
     """The preset of each environment that takes the least time, in the order of ``rejeu list``."""
     trained = (result for result in reversed(measured()) if "--curve" not in result.command)  # which evaluates as well
-    found = {(result.env_id, result.algorithm): result for result in trained}
+    results = {(result.env_id, result.algorithm): result for result in trained}
     rows: dict[str, tuple[float, tuple[str, ...]]] = {}
     for preset in presets.ALL:
-        result = found.get((preset.env_id, preset.algorithm))
+        result = results.get((preset.env_id, preset.algorithm))
         if result and result.seconds[1] < rows.get(preset.env_id, (float("inf"),))[0]:
             row = (preset.env_id, preset.algorithm, result.budget.removesuffix(" steps"), time_of(result))
             rows[preset.env_id] = result.seconds[1], row
@@ -405,16 +405,16 @@ def speed(length: str = "") -> str:
     samples = load("bench.json")["samples"]
 
     def row(text: str, case: str, name: str, peer_name: str = "") -> tuple[str, ...]:
-        own = step_seconds(samples, case, name, "rejeu")
+        rejeu_seconds = step_seconds(samples, case, name, "rejeu")
         peers = [step_seconds(samples, case, peer_name or name, library) for library in ("sb3", "sbx")]
-        return (text, *(f"{times(ratio(peer, own))}x" if peer else "" for peer in peers))
+        return (text, *(f"{times(ratio(peer, rejeu_seconds))}x" if peer else "" for peer in peers))
 
     def parking_row(text: str, name: str) -> tuple[str, ...]:
-        own, peer = (
+        rejeu_rates, peer = (
             by_round(best(samples, "parking", n, library), lambda sample: sample["result"]["training_steps_per_second"])
             for n, library in ((name, "rejeu"), ("highway-env", "sb3"))
         )
-        return (text, f"{times(ratio(own, peer))}x", "")
+        return (text, f"{times(ratio(rejeu_rates, peer))}x", "")
 
     rows = [
         row("SAC, Pendulum-v1, 64-64, batches of 64", "steps", "SAC"),
@@ -453,17 +453,20 @@ def equal_time() -> str:
     shares: dict[str, list[float]] = {name: [] for name in EQUAL_TIME}
     rows: list[tuple[str, ...]] = []
     for env_id, options in [*((env_id, "") for env_id in TD3_RETURNS), ("Ant-v5", "-without-contact-forces")]:
-        found, (least, td3) = equal_time_runs(env_id, options), TD3_RETURNS[env_id]
+        runs_by_method, (least, td3) = equal_time_runs(env_id, options), TD3_RETURNS[env_id]
         cells = dict.fromkeys(EQUAL_TIME, "")
-        for name, runs in found.items():
+        for name, runs in runs_by_method.items():
             returns = [run["mean_return"] for run in runs]
             share = float((np.mean(returns) - least) / (td3 - least))
             shares[name] += [] if options else [share]
-            seeds = f"; {' and '.join(f'{one:,.0f}' for one in returns)}" if len(runs) > 1 else ""
+            seeds = f"; {' and '.join(f'{value:,.0f}' for value in returns)}" if len(runs) > 1 else ""
             steps = np.mean([run["steps"] for run in runs])
             cells[name] = f"{np.mean(returns):,.0f} ({share:.2f}{seeds}), {steps:,.0f} steps"
         rows.append((env_id + options.replace("-", " "), *cells.values()))
-    means = (f"({np.mean(found):.2f})" if len(found) == len(TD3_RETURNS) else "" for found in shares.values())
+    means = (
+        f"({np.mean(method_shares):.2f})" if len(method_shares) == len(TD3_RETURNS) else ""
+        for method_shares in shares.values()
+    )
     rows.append(("mean of the five", *means))
     return table(("environment", *EQUAL_TIME), rows)
 
@@ -474,23 +477,24 @@ def data(path: str, key: str, *columns: str) -> str:
     Args:
         path: the file, from the root of the repository.
         key: the part, such as ``results`` or ``rejeu/summary``; ``-`` for the whole file.
-        columns: what to show of each row, in the same way; all numbers and words if there are none.
+        columns: the values of each row to show, in the same way; all numbers and words if there are none.
     """
     content = load(path, ROOT)
-    part = within(content, key)
-    is_table = isinstance(part, list) or bool(columns)
+    section = within(content, key)
+    is_table = isinstance(section, list) or bool(columns)
     if is_table:
-        found = [("", row) for row in part] if isinstance(part, list) else [*part.items()]
-        rows = [(name, row) for name, row in found if isinstance(row, dict)]
-        named = [("",)] if any(name for name, _ in rows) else []
-        header = [*(("",) if named else ()), *(column.split("/")[-1].replace("_", " ") for column in columns)]
+        named_rows = [("", row) for row in section] if isinstance(section, list) else [*section.items()]
+        rows = [(name, row) for name, row in named_rows if isinstance(row, dict)]
+        name_column = [("",)] if any(name for name, _ in rows) else []
+        header = [*(("",) if name_column else ()), *(column.split("/")[-1].replace("_", " ") for column in columns)]
         cells = [
-            [*((name,) if named else ()), *(cell(within(row, column)) for column in columns)] for name, row in rows
+            [*((name,) if name_column else ()), *(cell(within(row, column)) for column in columns)]
+            for name, row in rows
         ]
     else:
         header, cells = (
             ["", ""],
-            [[name.replace("_", " "), cell(value)] for name, value in part.items() if is_plain(value)],
+            [[name.replace("_", " "), cell(value)] for name, value in section.items() if is_plain(value)],
         )
     origin = [
         content.get("commit", "")[:7],
@@ -502,7 +506,7 @@ def data(path: str, key: str, *columns: str) -> str:
 
 
 def within(content: Any, key: str) -> Any:
-    """Returns what is under a path of keys, None if there is nothing."""
+    """Returns the value under a path of keys, None if there is none."""
     for name in key.split("/") if key != "-" else ():
         content = content.get(name) if isinstance(content, dict) else None
     return content
@@ -522,7 +526,7 @@ def cell(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
     if isinstance(value, dict):
-        return ", ".join(f"{name} {cell(one)}" for name, one in value.items())
+        return ", ".join(f"{name} {cell(item)}" for name, item in value.items())
     if isinstance(value, list):
         return " to ".join(map(cell, value))
     return "" if value is None else f"{value:,}" if isinstance(value, int) else str(value)

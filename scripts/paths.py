@@ -6,7 +6,7 @@
 
 Real steps of each path run under a profiler. Each function of the package that is called counts with all its lines, and with
 the functions inside it, except those of ``EXEMPT``, which every path shares. Exits with status 1 if a path has more files or
-lines than the page says, or more than the page allows. ``--write`` puts what was measured into the page.
+lines than the page says, or more than the page allows. ``--write`` puts the measured numbers into the page.
 """
 
 from __future__ import annotations
@@ -162,27 +162,27 @@ TRACES = {
 
 def lengths(path: Path) -> dict[str, int]:
     """Returns the number of lines of each function, class and method of a file, decorators included."""
-    found: dict[str, int] = {}
+    lines_by_name: dict[str, int] = {}
 
     def visit(node: ast.AST, prefix: str) -> None:
         for child in ast.iter_child_nodes(node):
             if isinstance(child, ast.FunctionDef | ast.ClassDef):
                 first = min([child.lineno, *(decorator.lineno for decorator in child.decorator_list)])
-                found[prefix + child.name] = (child.end_lineno or first) - first + 1
+                lines_by_name[prefix + child.name] = (child.end_lineno or first) - first + 1
                 if isinstance(child, ast.ClassDef):
                     visit(child, f"{prefix}{child.name}.")
 
     visit(ast.parse(path.read_text(encoding="utf-8")), "")
-    return found
+    return lines_by_name
 
 
 def counted(called: Called) -> dict[str, dict[str, int]]:
     """Returns the lines of each function that counts, by file."""
-    found: dict[str, dict[str, int]] = {}
+    functions_by_file: dict[str, dict[str, int]] = {}
     for file, name in called:
         if not file.startswith(EXEMPT):
-            found.setdefault(file, {})[name] = lengths(PACKAGE / file).get(name, 0)
-    return found
+            functions_by_file.setdefault(file, {})[name] = lengths(PACKAGE / file).get(name, 0)
+    return functions_by_file
 
 
 def total(functions: dict[str, dict[str, int]]) -> tuple[int, int]:
@@ -190,11 +190,11 @@ def total(functions: dict[str, dict[str, int]]) -> tuple[int, int]:
     return len(functions), sum(sum(lines.values()) for lines in functions.values())
 
 
-def block(found: dict[str, dict[str, dict[str, int]]], most: dict[str, tuple[int, int]]) -> str:
+def block(measured: dict[str, dict[str, dict[str, int]]], limits: dict[str, tuple[int, int]]) -> str:
     """Returns the table of the page about the paths."""
     lines = ["| path | files | lines | files, at most | lines, at most |", "|---|---|---|---|---|"]
-    for name, functions in found.items():
-        (n_files, n_lines), (files, of_lines) = total(functions), most[name]
+    for name, functions in measured.items():
+        (n_files, n_lines), (files, of_lines) = total(functions), limits[name]
         lines.append(f"| {name} | {n_files} | {n_lines:,} | {files} | {of_lines:,} |")
     return "\n".join(lines) + "\n"
 
@@ -202,10 +202,10 @@ def block(found: dict[str, dict[str, dict[str, int]]], most: dict[str, tuple[int
 def main() -> int:
     """Measures all paths; returns 1 if one has grown beyond the page."""
     text = DESIGN.read_text(encoding="utf-8")
-    rows = {name: [int(one.replace(",", "")) for one in numbers] for name, *numbers in ROW.findall(text)}
-    found = {name: counted(trace()) for name, trace in TRACES.items()}
+    rows = {name: [int(number.replace(",", "")) for number in numbers] for name, *numbers in ROW.findall(text)}
+    measured = {name: counted(trace()) for name, trace in TRACES.items()}
     problems = []
-    for name, functions in found.items():
+    for name, functions in measured.items():
         n_files, n_lines = total(functions)
         known_files, known_lines, most_files, most_lines = rows[name]
         print(f"{name:<18} {n_files} files, {n_lines} lines (page {known_files}, {known_lines})")
@@ -216,7 +216,7 @@ def main() -> int:
         elif (n_files > known_files or n_lines > known_lines) and "--write" not in sys.argv:
             problems.append(f"{name} has grown; if it must, say why in the commit, and run scripts/paths.py --write")
     if "--write" in sys.argv:
-        new = block(found, {name: (files, lines) for name, (_, _, files, lines) in rows.items()})
+        new = block(measured, {name: (files, lines) for name, (_, _, files, lines) in rows.items()})
         DESIGN.write_text(TABLE.sub(lambda match: match[1] + new + match[3], text), encoding="utf-8")
     print("\n".join(problems), file=sys.stderr, end="\n" if problems else "")
     return bool(problems)

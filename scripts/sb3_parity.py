@@ -4,9 +4,9 @@
     python scripts/sb3_parity.py           # prints the comparison of names
 
 ``record`` writes the public classes and functions of each module, with their arguments and methods, to
-``tests/data/sb3/signatures.json``, and to ``visible_names.json`` beside it what else can be imported from each module: its
-constants and types, and what it passes on of other modules of the packages. Names that begin with an underscore are left out,
-and so are type variables.
+``tests/data/sb3/signatures.json``, and to ``visible_names.json`` beside it the other names that each module exports: its
+constants and types, and the names of other modules of the packages that it passes on. Names that begin with an underscore
+are left out, and so are type variables.
 """
 
 from __future__ import annotations
@@ -38,10 +38,11 @@ PACKAGES = {"stable_baselines3": "rejeu.sb3", "sb3_contrib": "rejeu.sb3_contrib"
 def arguments_of(function: Any) -> list[str]:
     """Returns the names of the arguments of a function or of a class, without those for any number of arguments."""
     try:
-        given = inspect.signature(function).parameters.values()
+        parameters = inspect.signature(function).parameters.values()
     except (TypeError, ValueError):
         return []
-    return [one.name for one in given if one.kind not in (one.VAR_POSITIONAL, one.VAR_KEYWORD) and one.name != "self"]
+    any_number = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+    return [parameter.name for parameter in parameters if parameter.kind not in any_number and parameter.name != "self"]
 
 
 def modules_of(package: str) -> Iterator[ModuleType]:
@@ -60,18 +61,18 @@ def recorded() -> dict[str, Any]:
     signatures: dict[str, Any] = {}
     for package in PACKAGES:
         for module in modules_of(package):
-            own = {
+            definitions = {
                 key: described(value, package)
                 for key, value in vars(module).items()
                 if callable(value) and not key.startswith("_") and getattr(value, "__module__", None) == module.__name__
             }
-            if own:
-                signatures[module.__name__] = own
+            if definitions:
+                signatures[module.__name__] = definitions
     return signatures
 
 
 def visible() -> dict[str, list[str]]:
-    """Returns what can be imported from each module of the installed packages, without what is of third parties."""
+    """Returns the names that can be imported from each module of the installed packages, without those of third parties."""
     return {module.__name__: sorted({*bound_by(module)}) for package in PACKAGES for module in modules_of(package)}
 
 
@@ -81,8 +82,8 @@ def bound_by(module: ModuleType) -> Iterator[str]:
         names: list[str] = []
         if isinstance(node, ast.Module | ast.If | ast.Try):
             statements = [*node.body, *getattr(node, "orelse", ())]
-            names += [one.name for one in statements if isinstance(one, ast.FunctionDef | ast.ClassDef)]
-            targets = [target for one in statements if isinstance(one, ast.Assign) for target in one.targets]
+            names += [node.name for node in statements if isinstance(node, ast.FunctionDef | ast.ClassDef)]
+            targets = [target for node in statements if isinstance(node, ast.Assign) for target in node.targets]
             names += [target.id for target in targets if isinstance(target, ast.Name)]
         elif isinstance(node, ast.ImportFrom) and (node.module or "").partition(".")[0] in PACKAGES:
             names += [alias.asname or alias.name for alias in node.names]
@@ -92,41 +93,41 @@ def bound_by(module: ModuleType) -> Iterator[str]:
                 yield name
 
 
-def described(one: Any, package: str) -> dict[str, list[str]]:
+def described(definition: Any, package: str) -> dict[str, list[str]]:
     """Returns the arguments and, of a class, the methods that the package defines."""
-    if not inspect.isclass(one):
-        return {"arguments": arguments_of(one)}
-    bases = [base for base in one.__mro__ if base.__module__.startswith(package)]
+    if not inspect.isclass(definition):
+        return {"arguments": arguments_of(definition)}
+    bases = [base for base in definition.__mro__ if base.__module__.startswith(package)]
     methods = {key for base in bases for key, method in vars(base).items() if inspect.isroutine(method)}
-    return {"arguments": arguments_of(one), "methods": sorted(key for key in methods if not key.startswith("_"))}
+    return {"arguments": arguments_of(definition), "methods": sorted(key for key in methods if not key.startswith("_"))}
 
 
-def accepted(one: Any) -> set[str]:
+def accepted(definition: Any) -> set[str]:
     """Returns the arguments that a class or function of rejeu takes by name."""
     from rejeu.checkpoints.agent_state import AGENT_ARGUMENTS
     from rejeu.core import validation
     from rejeu.sb3 import algorithms, arguments
 
-    names = set(arguments_of(one))
-    if inspect.isclass(one) and issubclass(one, algorithms.Original):
-        names |= {*validation.field_names(one.algorithm.Config), *AGENT_ARGUMENTS}
+    names = set(arguments_of(definition))
+    if inspect.isclass(definition) and issubclass(definition, algorithms.Original):
+        names |= {*validation.field_names(definition.algorithm.Config), *AGENT_ARGUMENTS}
         names |= {*arguments.WITHOUT_EFFECT, *arguments.NEUTRAL}
     return names
 
 
-def takes_any(one: Any) -> bool:
+def takes_any(definition: Any) -> bool:
     """Returns whether a function passes arguments of any name on, or depends on Python's version, as of enumerations."""
-    if inspect.isclass(one) and issubclass(one, enum.Enum):
+    if inspect.isclass(definition) and issubclass(definition, enum.Enum):
         return True
     try:
-        kinds = [given.kind for given in inspect.signature(one).parameters.values()]
+        parameter_kinds = [parameter.kind for parameter in inspect.signature(definition).parameters.values()]
     except (TypeError, ValueError):
         return True
-    return inspect.Parameter.VAR_KEYWORD in kinds
+    return inspect.Parameter.VAR_KEYWORD in parameter_kinds
 
 
 def compared() -> tuple[dict[str, tuple[int, int, list[str]]], dict[str, set[str]], dict[str, set[str]]]:
-    """Returns what is here, of how much, and what is missing, by module; and classes and functions by what they lack."""
+    """Returns the counts of names and the missing ones, by module; and the owners of each lacking argument and method."""
     from rejeu.sb3 import algorithms
 
     modules: dict[str, tuple[int, int, list[str]]] = {}
@@ -142,13 +143,13 @@ def compared() -> tuple[dict[str, tuple[int, int, list[str]]], dict[str, set[str
         missing = [name for name in names if not hasattr(module, name)]
         modules[here] = len(names) - len(missing), len(names), missing
         for name in names.keys() - {*missing}:
-            one, original = getattr(module, name), names[name]
-            is_agent = inspect.isclass(one) and issubclass(one, algorithms.Original)
-            for key in original["arguments"] if is_agent or not takes_any(one) else ():
-                if key not in accepted(one):
+            definition, original = getattr(module, name), names[name]
+            is_agent = inspect.isclass(definition) and issubclass(definition, algorithms.Original)
+            for key in original["arguments"] if is_agent or not takes_any(definition) else ():
+                if key not in accepted(definition):
                     arguments.setdefault(key, set()).add(name)
             for key in original.get("methods", ()):
-                if inspect.isclass(one) and not hasattr(one, key):
+                if inspect.isclass(definition) and not hasattr(definition, key):
                     methods.setdefault(key, set()).add(name)
     return modules, arguments, methods
 
@@ -169,7 +170,7 @@ def importable() -> dict[str, list[tuple[str, bool]]]:
 
 
 def names_of(lacking: dict[str, set[str]]) -> str:
-    """Returns what is lacking, with the class or function that lacks it and the number of others."""
+    """Returns the lacking names, each with a class or function that lacks it and the number of others."""
     shown = []
     for key, owners in sorted(lacking.items()):
         more = f" and {len(owners) - 1} more" if len(owners) > 1 else ""
@@ -248,33 +249,29 @@ def suite(length: str = "") -> str:
     return "\n".join([share, "", f"{content['date']}, `{content['command']}`", "", *lines])
 
 
-def counted(kinds: dict[str, int]) -> str:
+def counted(failures: dict[str, int]) -> str:
     """Returns numbers of failures by kind, the most frequent first."""
-    return ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items(), key=lambda item: -item[1]))
+    return ", ".join(f"{count} {failure}" for failure, count in sorted(failures.items(), key=lambda item: -item[1]))
 
 
 def same_scripts() -> str:
-    """Returns what one script reaches with either library, for the documentation."""
-    from scipy import stats
+    """Returns the table of mean returns of one script with either library, for the documentation."""
+    from trials.provenance import half_interval, read
 
     folder = ROOT / "benchmarks" / "results" / "sb3_scripts"
-    runs = {
-        name: json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))["runs"]
-        for name in ("original", "rejeu")
-    }
+    runs = {name: read(folder / f"{name}.json")["runs"] for name in ("original", "rejeu")}
     lines = ["| | task | steps | seeds | Stable-Baselines3 | rejeu |", "|---|---|---|---|---|---|"]
     apart = []
     for algorithm in dict.fromkeys(run["algorithm"] for run in runs["rejeu"]):
         shown, limits = [], []
         for rows in runs.values():
-            own = [run for run in rows if run["algorithm"] == algorithm]
-            values = [run["mean_return"] for run in own]
-            mean, half = statistics.mean(values), 0.0
-            half = float(stats.t.ppf(0.975, len(values) - 1)) * statistics.stdev(values) / len(values) ** 0.5
+            algorithm_runs = [run for run in rows if run["algorithm"] == algorithm]
+            values = [run["mean_return"] for run in algorithm_runs]
+            mean, half = statistics.mean(values), half_interval(values)
             limits.append((mean - half, mean + half))
             shown.append(f"{mean:.1f} [{mean - half:.1f}, {mean + half:.1f}]")
         apart += [algorithm] * (max(low for low, _ in limits) > min(high for _, high in limits))
-        first = f"| {algorithm} | {own[0]['env_id']} | {own[0]['steps']:,} | {len(own)} |"
+        first = f"| {algorithm} | {algorithm_runs[0]['env_id']} | {algorithm_runs[0]['steps']:,} | {len(values)} |"
         lines.append(f"{first} {' | '.join(shown)} |")
     overlap = f"Intervals do not overlap: {', '.join(apart)}." if apart else "All intervals overlap."
     return "\n".join([*lines, "", overlap])

@@ -1,4 +1,4 @@
-"""Records what a few hundred steps of training end with, and compares two checkouts: results for a seed must not change.
+"""Records weights and episodes of a few hundred steps, and compares two checkouts: results for a seed must not change.
 
     PYTHONPATH=../before/src python scripts/signatures.py --out before.json
     python scripts/signatures.py --against before.json
@@ -112,23 +112,23 @@ AGENTS: dict[str, Callable[[], Any]] = {
 
 def signature(trained: Any) -> str:
     """Returns a hash of the weights and episodes of one agent or several."""
-    found = hashlib.sha256()
+    digest = hashlib.sha256()
     for agent in trained if isinstance(trained, list | tuple) else [trained]:
         for name, value in sorted(agent.get_parameters().items()):
-            found.update(f"{name} {value.dtype} {value.shape}".encode() + np.ascontiguousarray(value).tobytes())
+            digest.update(f"{name} {value.dtype} {value.shape}".encode() + np.ascontiguousarray(value).tobytes())
         for column in ("step", "env", "return", "length"):
-            found.update(agent.history[column].tobytes())
-    return found.hexdigest()[:16]
+            digest.update(agent.history[column].tobytes())
+    return digest.hexdigest()[:16]
 
 
 def record(only: list[str]) -> dict[str, str]:
     """Trains the configurations and returns their signatures."""
-    found = {}
+    signatures = {}
     for name in only:
         agent = AGENTS[name]()
-        found[name] = signature(agent.learn(256) if hasattr(agent, "learn") else agent)
-        print(f"{found[name]}  {name}", flush=True)
-    return found
+        signatures[name] = signature(agent.learn(256) if hasattr(agent, "learn") else agent)
+        print(f"{signatures[name]}  {name}", flush=True)
+    return signatures
 
 
 def main() -> int:
@@ -140,14 +140,18 @@ def main() -> int:
     arguments = parser.parse_args()
     warnings.simplefilter("ignore")
     print(rejeu.__file__)
-    found = record(arguments.only)
+    signatures = record(arguments.only)
     if arguments.out:
-        arguments.out.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+        arguments.out.write_text(json.dumps(signatures, indent=1) + "\n", encoding="utf-8")
     if not arguments.against:
         return 0
     before = json.loads(arguments.against.read_text(encoding="utf-8"))
-    changed = [name for name in found if before.get(name) != found[name]]
-    print(f"{len(found) - len(changed)} of {len(found)} equal", *(f"changed: {name}" for name in changed), sep="\n")
+    changed = [name for name in signatures if before.get(name) != signatures[name]]
+    print(
+        f"{len(signatures) - len(changed)} of {len(signatures)} equal",
+        *(f"changed: {name}" for name in changed),
+        sep="\n",
+    )
     return int(bool(changed))
 
 

@@ -52,8 +52,8 @@ def lines(path: Path, name: str) -> tuple[int, int]:
     """
     body: list[ast.stmt] = syntax_tree(path).body
     node: ast.stmt | None = None
-    for part in name.split("."):
-        node = next((statement for statement in body if part in names(statement)), None)
+    for identifier in name.split("."):
+        node = next((statement for statement in body if identifier in names(statement)), None)
         if node is None:
             raise LookupError(f"{path.relative_to(ROOT).as_posix()} does not define {name}")
         body = getattr(node, "body", [])
@@ -69,8 +69,8 @@ def url(path: Path, name: str = "") -> str:
     """
     if not path.exists():
         raise LookupError(f"{path} does not exist")
-    kind = "tree" if path.is_dir() else "blob"
-    address = f"{base()}/{kind}/main/{path.relative_to(ROOT).as_posix()}"
+    view = "tree" if path.is_dir() else "blob"
+    address = f"{base()}/{view}/main/{path.relative_to(ROOT).as_posix()}"
     if not name:
         return address
     if path.suffix != ".py":

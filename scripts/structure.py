@@ -91,7 +91,7 @@ def parse(src: Path, package: str = PACKAGE) -> dict[str, tuple[Path, ast.Module
     return modules
 
 
-def imports(module: str, path: Path, tree: ast.Module, known: set[str]) -> Iterator[tuple[str, ast.stmt]]:
+def imports(module: str, path: Path, tree: ast.Module, modules: set[str]) -> Iterator[tuple[str, ast.stmt]]:
     """Yields each module of the package that a module imports, anywhere in it, and the statement that does so."""
     package = module if path.name == "__init__.py" else module.rpartition(".")[0]
     for node in ast.walk(tree):
@@ -101,10 +101,10 @@ def imports(module: str, path: Path, tree: ast.Module, known: set[str]) -> Itera
             base = package.rsplit(".", node.level - 1)[0] if node.level else ""
             source = ".".join(filter(None, (base, node.module)))
             submodules = {f"{source}.{alias.name}" for alias in node.names}
-            names = [*(submodules & known), *([source] if submodules - known else [])]
+            names = [*(submodules & modules), *([source] if submodules - modules else [])]
         else:
             continue
-        yield from ((name, node) for name in names if name in known and name != module)
+        yield from ((name, node) for name in names if name in modules and name != module)
 
 
 def cycles(edges: dict[str, set[str]]) -> list[list[str]]:
@@ -165,7 +165,7 @@ def layers() -> list[str]:
     return [name.replace("/", ".") for name in re.findall(r"^  ([\w/]+?)(?:\.py|/) ", listing[1], re.MULTILINE)]
 
 
-def layering_violations(found: list[tuple[str, str, int]], order: list[str]) -> list[str]:
+def layering_violations(module_imports: list[tuple[str, str, int]], order: list[str]) -> list[str]:
     """Returns the imports from a layer further down the list, and modules that are not in the list.
 
     ``__init__`` may import everything. Only the command line may import from it, and :data:`HANDS_OVER`.
@@ -177,20 +177,20 @@ def layering_violations(found: list[tuple[str, str, int]], order: list[str]) -> 
         prefixes = [".".join(parts[:n]) for n in range(len(parts), 0, -1)]
         return next((prefix for prefix in prefixes if prefix in rank), parts[0])
 
-    listed = {layer(name) for name, *_ in found}
+    listed = {layer(name) for name, *_ in module_imports}
     violations = [f"rejeu.{name} is not in the list" for name in sorted(listed - rank.keys())]
-    for importer, imported, line in found:
+    for importer, imported, line in module_imports:
         a, b = layer(importer), layer(imported)
         if a in rank and b in rank and rank[a] < rank[b] and a != "__init__" and (importer, b) not in HANDS_OVER:
             violations.append(f"{importer}:{line} imports {imported}")
     return violations
 
 
-def both_ways(found: list[tuple[str, str, int]]) -> list[str]:
+def both_ways(module_imports: list[tuple[str, str, int]]) -> list[str]:
     """Returns the pairs of rooms, which are the folders of the package, that import each other."""
     arrows = {
         (importer.split(".")[1], imported.split(".")[1])
-        for importer, imported, _ in found
+        for importer, imported, _ in module_imports
         if "." in importer and "." in imported
     }
     return sorted(f"{a} and {b}" for a, b in arrows if a < b and (b, a) in arrows)
@@ -297,16 +297,16 @@ def measure(src: Path) -> dict[str, Any]:
     modules = parse(src)
     code: dict[str, list[str]] = {}
     lines: Counter[str] = Counter()
-    found = []
+    module_imports = []
     for name, (path, tree) in modules.items():
         parts = path.relative_to(src / PACKAGE).parts
         code[name] = code_lines(path)
         lines[parts[0] if len(parts) > 1 else "top level"] += len(code[name])
         if not path.stem.isidentifier():  # a notebook, which imports what users import
             continue
-        found += [(name, imported, node.lineno) for imported, node in imports(name, path, tree, set(modules))]
+        module_imports += [(name, imported, node.lineno) for imported, node in imports(name, path, tree, set(modules))]
     edges: dict[str, set[str]] = {name: set() for name in modules}
-    for importer, imported, _ in found:
+    for importer, imported, _ in module_imports:
         edges[importer].add(imported)
     algorithms = [code[name] for name in modules if ".algorithms" in name]
     repeated, of = repeated_lines(algorithms)
@@ -333,8 +333,8 @@ def measure(src: Path) -> dict[str, Any]:
             f"{m}:{line} {text}" for m, (_, t) in modules.items() for line, text in private_accesses(t)
         ],
         "private_imports": [f"{m}:{line} {text}" for m, (_, t) in modules.items() for line, text in private_imports(t)],
-        "layering_violations": layering_violations(found, layers()),
-        "both_ways": both_ways(found),
+        "layering_violations": layering_violations(module_imports, layers()),
+        "both_ways": both_ways(module_imports),
         "over_the_limit": over_the_limit(lines) + over_the_share(modules, placeholders, vague, n_any),
         "placeholders": placeholders,
         "vague_docstrings": vague,
@@ -361,11 +361,11 @@ def report(counts: dict[str, Any], verbose: bool) -> None:
     )
     print(f"vague docstrings: {len(counts['vague_docstrings'])}; Any: {counts['any']:,}")
     for key in (*ENFORCED, *(("placeholders", "vague_docstrings") if verbose else ())):
-        found = counts[key]
-        sizes = f" of {', '.join(str(len(cycle)) for cycle in found)} modules" if key == "cycles" and found else ""
-        print(f"{key.replace('_', ' ')}: {len(found)}{sizes}")
-        if verbose or (found and key in ENFORCED):
-            print("".join(f"    {entry if isinstance(entry, str) else ' '.join(entry)}\n" for entry in found), end="")
+        entries = counts[key]
+        sizes = f" of {', '.join(str(len(cycle)) for cycle in entries)} modules" if key == "cycles" and entries else ""
+        print(f"{key.replace('_', ' ')}: {len(entries)}{sizes}")
+        if verbose or (entries and key in ENFORCED):
+            print("".join(f"    {entry if isinstance(entry, str) else ' '.join(entry)}\n" for entry in entries), end="")
 
 
 def main() -> int:

@@ -2,7 +2,7 @@
 
     python scripts/surface.py ../before             # exits with status 1 if something of the other checkout is missing here
     python scripts/surface.py ../before --examples  # also runs the examples and commands of its pages with this package
-    python scripts/surface.py --record FILE         # writes what is here as JSON, which may stand for a checkout
+    python scripts/surface.py --record FILE         # writes this surface as JSON, which may stand for a checkout
 
 Names are those of ``rejeu``, of every module of ``rejeu.sb3``, those in docs/api, and those that a page or an example of
 the other checkout imports. Help texts may be worded anew: those that changed are listed and are no error.
@@ -43,19 +43,19 @@ def helps() -> dict[str, str]:
 
 def options(text: str) -> list[str]:
     """Returns the options and positional arguments in a help text, in a box or not."""
-    found = re.findall(r"^(?:│ |  )(?:-\w, )?(--[\w-]+)", text, re.MULTILINE)
-    return sorted({*found, *re.findall(r"^(?:│ |  )([A-Z_]+)(?:  |$)", text, re.MULTILINE)})
+    matches = re.findall(r"^(?:│ |  )(?:-\w, )?(--[\w-]+)", text, re.MULTILINE)
+    return sorted({*matches, *re.findall(r"^(?:│ |  )([A-Z_]+)(?:  |$)", text, re.MULTILINE)})
 
 
 def documented(root: Path) -> set[str]:
     """Returns the dotted names in the API reference and in the imports of the pages and examples of a checkout."""
     names = set()
     for path in (root / "docs" / "api").glob("*.rst"):
-        for kind, name, more in DIRECTIVE.findall(path.read_text(encoding="utf-8")):
+        for directive, name, more in DIRECTIVE.findall(path.read_text(encoding="utf-8")):
             listed = re.search(r":members: (.+)", more)
             members = listed[1].split(", ") if listed else []
-            names |= {f"{name}.{member}" for member in members} | ({name} if kind != "module" else set())
-            if kind == "module" and not members:
+            names |= {f"{name}.{member}" for member in members} | ({name} if directive != "module" else set())
+            if directive == "module" and not members:
                 module = importlib.import_module(name)
                 names |= {f"{name}.{key}" for key in public(module) if is_own(module, key)}
     for path in [root / "README.md", *(root / "docs").rglob("*.md"), *(root / "examples").rglob("*.py")]:
@@ -70,7 +70,7 @@ def with_methods(names: set[str], root: Path) -> set[str]:
     listed = {name for _, name, more in DIRECTIVE.findall(reference) if re.search(r":members:$", more, re.MULTILINE)}
     excluded = {name for names in re.findall(r":exclude-members: (.+)", reference) for name in names.split(", ")}
     agent = pkgutil.resolve_name("rejeu.agents.Agent")
-    found = set(names)
+    all_names = set(names)
     for name in names:
         value = pkgutil.resolve_name(name)
         is_listed = (
@@ -78,8 +78,8 @@ def with_methods(names: set[str], root: Path) -> set[str]:
         )
         if inspect.isclass(value) and is_listed:
             methods = {key for key in dir(value) if key[0] != "_" and is_rejeu(getattr(value, key, None))}
-            found |= {f"{name}.{key}" for key in methods - excluded}
-    return found
+            all_names |= {f"{name}.{key}" for key in methods - excluded}
+    return all_names
 
 
 def public(module: Any) -> list[str]:
@@ -93,7 +93,7 @@ def is_own(module: Any, name: str) -> bool:
 
 
 def surface(root: Path) -> dict[str, Any]:
-    """Returns the commands and, by dotted name, the parameters of what is public."""
+    """Returns the commands and, by dotted name, the parameters of public classes and functions."""
     import rejeu
     import rejeu.sb3
 
@@ -109,16 +109,16 @@ def surface(root: Path) -> dict[str, Any]:
     }
 
 
-def is_rejeu(found: Any) -> bool:
+def is_rejeu(value: Any) -> bool:
     """Returns whether a class or function is defined in the package."""
-    return callable(found) and str(getattr(found, "__module__", "")).startswith("rejeu")
+    return callable(value) and str(getattr(value, "__module__", "")).startswith("rejeu")
 
 
 def parameters(name: str) -> list[str] | None:
-    """Returns the names of the parameters, None of what cannot be called; raises an error if there is no such name."""
-    found = pkgutil.resolve_name(name)
+    """Returns the names of the parameters, None of a value that cannot be called; raises an error if there is no such name."""
+    value = pkgutil.resolve_name(name)
     try:
-        return [key for key in inspect.signature(found).parameters if key != "self"] if callable(found) else None
+        return [key for key in inspect.signature(value).parameters if key != "self"] if callable(value) else None
     except ValueError:
         return None
 
@@ -134,20 +134,24 @@ def of_checkout(path: Path) -> dict[str, Any]:
 
 def missing(before: dict[str, Any], now: dict[str, Any]) -> list[str]:
     """Returns a line for each command, option, name and parameter that is not here any more."""
-    found = []
-    for name, known in before["options"].items():
+    lines = []
+    for name, recorded_options in before["options"].items():
         if name not in now["options"]:
-            found.append(f"command {name}")
-        found += [f"{name} {option}" for option in known if option not in now["options"].get(name, known)]
-    for name, known in before["names"].items():
+            lines.append(f"command {name}")
+        lines += [
+            f"{name} {option}"
+            for option in recorded_options
+            if option not in now["options"].get(name, recorded_options)
+        ]
+    for name, recorded_parameters in before["names"].items():
         try:
             here = parameters(name)
         except (ImportError, AttributeError) as error:
-            found.append(f"{name}: {error}")
+            lines.append(f"{name}: {error}")
             continue
-        if known and here is not None and not any(key in ("kwargs", "hyperparameters") for key in here):
-            found += [f"{name}({key})" for key in known if key not in here]
-    return found
+        if recorded_parameters and here is not None and not any(key in ("kwargs", "hyperparameters") for key in here):
+            lines += [f"{name}({key})" for key in recorded_parameters if key not in here]
+    return lines
 
 
 def run_examples(root: Path) -> int:
