@@ -36,7 +36,7 @@ from typing import Any, NamedTuple
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from trials.provenance import provenance, write
+from trials.provenance import provenance, read, write
 
 RESULT = Path(__file__).parent / "results" / "catalog.json"
 STEPS, SECONDS, KNOWN_SECONDS, SEEDED, CHECKED, TRAINED, CUT = 1_000, 15.0, 0.5, 20, 10, 500, 300
@@ -83,11 +83,11 @@ class Group(NamedTuple):
     """Returns the family of each id."""
     vector: Callable[[str], Any]
     """Returns two of them."""
-    one: Callable[[str], Any] | None = None
+    gymnasium_env: Callable[[str], Any] | None = None
     """Returns a Gymnasium environment for ``rejeu check``; None if there is none."""
 
 
-def made(env_id: str, backend: str = "gymnasium", **kwargs: Any) -> Any:
+def make_two(env_id: str, backend: str = "gymnasium", **kwargs: Any) -> Any:
     import rejeu
 
     return rejeu.make_vector(env_id, 2, backend, seed=0, **kwargs)  # type: ignore[arg-type]
@@ -108,25 +108,25 @@ def grid(env_id: str) -> Any:
 
 
 def registered(package: str) -> dict[str, str]:
-    """Returns what a package registers in Gymnasium, with the module as family."""
+    """Returns the ids that a package registers in Gymnasium, with the module as family."""
     import gymnasium as gym
 
     with suppress(Exception):
         gym.register_envs(import_module(package))
-    found = {}
+    families = {}
     for env_id, spec in gym.registry.items():
         entry = getattr(spec.entry_point, "func", spec.entry_point)
         origin = entry if isinstance(entry, str) else getattr(entry, "__module__", "")
-        parts = [part for part in re.split(r"[.:]", origin) if part != "envs"]
+        parts = [segment for segment in re.split(r"[.:]", origin) if segment != "envs"]
         if parts[0] == package:
-            found[env_id] = parts[1] if len(parts) > 2 else package
-    return found
+            families[env_id] = parts[1] if len(parts) > 2 else package
+    return families
 
 
 def gymnasium_group(package: str, *also: str) -> Group:
     from rejeu.envs.registry import make_env
 
-    return Group((package.replace("_", "-"), *also), lambda: registered(package), made, make_env)
+    return Group((package.replace("_", "-"), *also), lambda: registered(package), make_two, make_env)
 
 
 def envpool_ids() -> dict[str, str]:
@@ -148,12 +148,12 @@ def atari_vector(env_id: str) -> Any:
 
 
 def pettingzoo_ids() -> dict[str, str]:
-    found = {}
+    families = {}
     for package in ("pettingzoo.butterfly", "pettingzoo.sisl", "mpe2"):
         with suppress(ImportError):
             folder = Path(next(iter(import_module(package).__path__)))
-            found |= {path.stem: package for path in sorted(folder.glob("*_v*.py"))}
-    return found
+            families |= {path.stem: package for path in sorted(folder.glob("*_v*.py"))}
+    return families
 
 
 def pettingzoo_vector(name: str) -> Any:
@@ -187,7 +187,7 @@ def groups() -> dict[str, Group]:
         "ale": gymnasium_group("ale_py")._replace(ids=lambda: atari_ids("ale_py")),
         "dm-control": gymnasium_group("shimmy", "dm-control", "mujoco"),
         "panda": gymnasium_group("panda_gym", "pybullet"),
-        "envpool": Group(("envpool",), envpool_ids, lambda env_id: made(env_id, "envpool")),
+        "envpool": Group(("envpool",), envpool_ids, lambda env_id: make_two(env_id, "envpool")),
         "ale-vector": Group(
             ("ale-py",),
             lambda: {env_id: "AtariVectorEnv" for env_id in atari_ids("ale_py") if env_id.startswith("ALE/")},
@@ -196,7 +196,7 @@ def groups() -> dict[str, Group]:
         "metaworld": Group(
             ("metaworld", "mujoco"),
             lambda: dict.fromkeys(import_module("metaworld").ALL_V3_ENVIRONMENTS, "metaworld"),
-            lambda name: made("Meta-World/MT1", env_name=name),
+            lambda name: make_two("Meta-World/MT1", env_name=name),
             metaworld,
         ),
         "pettingzoo": Group(("pettingzoo", "mpe2", "supersuit"), pettingzoo_ids, pettingzoo_vector),
@@ -214,7 +214,7 @@ def groups() -> dict[str, Group]:
 
 
 class Case:
-    """The environment that is tried. Its stages are methods that return what is to be recorded; None for ``"ok"``."""
+    """The environment that is tried. Its stages are methods that return the value to record; None for ``"ok"``."""
 
     def __init__(self, group: Group, env_id: str, rows: list[dict[str, Any]], is_brief: bool) -> None:
         self.group, self.env_id, self.is_brief = group, env_id, is_brief
@@ -226,7 +226,7 @@ class Case:
         yield self.make
         if not self.row.get("same_as"):
             yield from (self.seed, self.step, self.bounds, self.end)
-            if self.group.one is not None and sum("check" in row for row in self.of_family) < CHECKED:
+            if self.group.gymnasium_env is not None and sum("check" in row for row in self.of_family) < CHECKED:
                 yield self.check
             if self.is_new_kind() and not self.is_brief:
                 yield from (self.train, self.save, self.resume)
@@ -235,8 +235,8 @@ class Case:
         from rejeu.core.spaces import action_scaler, leaves
 
         self.vector = self.group.vector(self.env_id)
-        kinds = ", ".join(sorted({leaf.kind for leaf in leaves(self.vector.observation_space)}))
-        self.row["kind"] = f"{kinds} -> {type(self.vector.action_space).__name__}"
+        space_kinds = ", ".join(sorted({leaf.kind for leaf in leaves(self.vector.observation_space)}))
+        self.row["kind"] = f"{space_kinds} -> {type(self.vector.action_space).__name__}"
         self.obs = self.vector.reset()
         self.scale = action_scaler(self.vector.action_space)
         self.row["same_as"] = self.twin()
@@ -248,7 +248,7 @@ class Case:
             return None
         specs = import_module("envpool.registration").registry.specs
         others = [row["id"] for row in self.rows if row["id"] != self.env_id and "same_as" not in row]
-        same = [one for one in others if specs[one] == specs[self.env_id]]
+        same = [env_id for env_id in others if specs[env_id] == specs[self.env_id]]
         return same[0] if same else None
 
     def is_new_kind(self) -> bool:
@@ -265,8 +265,8 @@ class Case:
         import jax
         import numpy as np
 
-        def equal(one: Any, two: Any) -> bool:
-            pairs = zip(jax.tree.leaves(one), jax.tree.leaves(two), strict=True)
+        def equal(first: Any, second: Any) -> bool:
+            pairs = zip(jax.tree.leaves(first), jax.tree.leaves(second), strict=True)
             return all(np.array_equal(a, b, equal_nan=a.dtype.kind == "f") for a, b in pairs)
 
         twin = self.group.vector(self.env_id)
@@ -276,10 +276,10 @@ class Case:
                 return "resets differ"
             for i in range(SEEDED):
                 action = self.actions(rng)
-                one, two = self.vector.step(action), twin.step(action)
-                if not equal(one[:4], two[:4]):
+                result, twin_result = self.vector.step(action), twin.step(action)
+                if not equal(result[:4], twin_result[:4]):
                     return f"step {i + 1} differs"
-                if (done := one.terminated | one.truncated).any():
+                if (done := result.terminated | result.truncated).any():
                     self.vector.reset_done(done), twin.reset_done(done)
             return None
         finally:
@@ -297,8 +297,8 @@ class Case:
             result = self.vector.step(self.actions(rng))
             self.n_steps += self.vector.n_envs
             length += 1
-            for part in (result.reward, *jax.tree.leaves(result.obs)):
-                if np.asarray(part).dtype.kind == "f" and not np.isfinite(part).all():
+            for values in (result.reward, *jax.tree.leaves(result.obs)):
+                if np.asarray(values).dtype.kind == "f" and not np.isfinite(values).all():
                     raise ValueError(f"not finite in step {self.n_steps}")
             self.outside = self.outside or outside(self.vector.observation_space, result.obs)
             done = np.asarray(result.terminated | result.truncated)
@@ -326,8 +326,8 @@ class Case:
     def check(self) -> str | None:
         from rejeu.envs import checker
 
-        assert self.group.one is not None
-        env = self.group.one(self.env_id)
+        assert self.group.gymnasium_env is not None
+        env = self.group.gymnasium_env(self.env_id)
         try:
             errors = [finding.text for finding in checker.findings(env) if finding.level == "error"]
         finally:
@@ -399,8 +399,8 @@ def outside(space: Any, obs: Any) -> str:
 
     if hasattr(space, "spaces"):
         keys = space.spaces.keys() if isinstance(space.spaces, dict) else range(len(space.spaces))
-        found = (outside(space.spaces[key], obs[key]) for key in keys)
-        return next(filter(None, found), "")
+        excesses = (outside(space.spaces[key], obs[key]) for key in keys)
+        return next(filter(None, excesses), "")
     if type(space).__name__ == "Box":
         low, high, values = (np.asarray(a, np.float64) for a in (space.low, space.high, obs))
         beyond = np.maximum(low - values, values - high)
@@ -436,11 +436,11 @@ def try_one(group: Group, env_id: str, rows: list[dict[str, Any]], is_brief: boo
 
 def untrained(rows: dict[str, dict[str, Any]]) -> list[str]:
     """Returns the first environment of each kind in a family of which none was trained."""
-    kinds: dict[tuple[str, str], list[dict[str, Any]]] = collections.defaultdict(list)
+    rows_by_kind: dict[tuple[str, str], list[dict[str, Any]]] = collections.defaultdict(list)
     for row in rows.values():
         if "seed" in row and row.get("failed") in (None, "train", "save", "resume"):
-            kinds[row["family"], row["kind"]].append(row)
-    return [of_kind[0]["id"] for of_kind in kinds.values() if not any("train" in row for row in of_kind)]
+            rows_by_kind[row["family"], row["kind"]].append(row)
+    return [of_kind[0]["id"] for of_kind in rows_by_kind.values() if not any("train" in row for row in of_kind)]
 
 
 def read_rows(path: Path) -> list[dict[str, Any]]:
@@ -504,17 +504,13 @@ def run(name: str, folder: Path, minutes: float, longest: float, only: list[str]
             append(path, {**row, "seconds": round(time.monotonic() - since, 1)})
             todo = todo[1:]
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    before = json.loads(text) if (text := read_text(folder / f"{name}.json")) else {}
+    before = read(folder / f"{name}.json")
     names = {str(folder): "FOLDER"}
     origin = {**provenance(names), "ids": len(families), "versions": {p: version(p) for p in group.packages}}
     origin["families"] = collections.Counter(families.values())
     origin["cpu_minutes"] = round(before.get("cpu_minutes", 0.0) + (used.ru_utime + used.ru_stime) / 60, 1)
     write(folder / f"{name}.json", origin)
     print(f"{name}: {len(todo)} of {len(families)} left, {origin['cpu_minutes']} minutes of processor time")
-
-
-def read_text(path: Path) -> str:
-    return path.read_text(encoding="utf-8") if path.exists() else ""
 
 
 def version(package: str) -> str | None:
@@ -534,31 +530,31 @@ def cause(row: dict[str, Any]) -> str:
 
 
 def collect(folder: Path) -> None:
-    """Writes the table of all groups: a line for each family, and the ids that failed or stood out by what was found.
+    """Writes the table of all groups: a line for each family, and the ids that failed or stood out, by cause.
 
     Groups and families that the folder does not have stay as the table has them.
     """
     result: dict[str, Any] = {**provenance({str(folder): "FOLDER"}), "groups": {}, "families": [], "failures": []}
-    before = json.loads(read_text(RESULT) or "{}")
+    before = read(RESULT)
     new = {(path.stem, row["family"]) for path in folder.glob("*.jsonl") for row in read_rows(path)}
     result["groups"] = dict(before.get("groups", {}))
-    for part in ("families", "failures"):
-        result[part] = [row for row in before.get(part, []) if (row["group"], row["family"]) not in new]
+    for section in ("families", "failures"):
+        result[section] = [row for row in before.get(section, []) if (row["group"], row["family"]) not in new]
     for path in sorted(folder.glob("*.jsonl")):
         name, rows = path.stem, [*{row["id"]: row for row in read_rows(path)}.values()]
-        result["groups"][name] = json.loads(read_text(path.with_suffix(".json")))
+        result["groups"][name] = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
         by_family, by_cause = collections.defaultdict(list), collections.defaultdict(list)
         for row in rows:
             by_family[row["family"]].append(row)
             if why := cause(row):
                 by_cause[row["family"], why].append(row["id"])
-        known = result["groups"][name].pop("families", {})
-        kept = {row["family"] for row in result["families"] if row["group"] == name}
-        for family in sorted({*by_family, *known} - kept):
+        n_ids = result["groups"][name].pop("families", {})
+        recorded = {row["family"] for row in result["families"] if row["group"] == name}
+        for family in sorted({*by_family, *n_ids} - recorded):
             of_family = by_family[family]
             resumed = [row["resume"] for row in of_family if "resume" in row]
             result["families"].append({
-                "group": name, "family": family, "ids": known.get(family, len(of_family)),
+                "group": name, "family": family, "ids": n_ids.get(family, len(of_family)),
                 "tried": len(of_family),
                 "work": sum(not cause(row) for row in of_family),
                 "same_episodes_by_seed": sum(row.get("seed") == "ok" for row in of_family),
@@ -570,8 +566,8 @@ def collect(folder: Path) -> None:
         for (family, why), ids in sorted(by_cause.items()):
             result["failures"].append({"group": name, "family": family, "cause": why, "number": len(ids), "ids": ids})
     result |= {key: sum(row[key] for row in result["families"]) for key in ("ids", "tried", "work")}
-    for part in ("families", "failures"):
-        result[part].sort(key=lambda row: row["group"])
+    for section in ("families", "failures"):
+        result[section].sort(key=lambda row: row["group"])
     write(RESULT, result)
     print({key: result[key] for key in ("ids", "tried", "work")})
 
@@ -585,13 +581,13 @@ def main() -> None:
     parser.add_argument("--brief", action="store_true", help="train nothing yet: a later run without this does")
     parser.add_argument("--longest", type=float, default=LONGEST, help="seconds of one environment")
     parser.add_argument("--only", nargs="*", default=[])
-    given = parser.parse_args()
-    if given.action == "collect":
-        collect(Path(given.group))
-    elif given.action == "run":
-        run(given.group, given.out, given.minutes, given.longest, given.only, given.brief)
+    arguments = parser.parse_args()
+    if arguments.action == "collect":
+        collect(Path(arguments.group))
+    elif arguments.action == "run":
+        run(arguments.group, arguments.out, arguments.minutes, arguments.longest, arguments.only, arguments.brief)
     else:
-        try_batch(given.group, given.out / f"{given.group}.jsonl", given.only, given.brief)
+        try_batch(arguments.group, arguments.out / f"{arguments.group}.jsonl", arguments.only, arguments.brief)
 
 
 if __name__ == "__main__":

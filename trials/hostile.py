@@ -56,22 +56,22 @@ def main() -> None:
         path = Path(folder) / "file.safetensors"
         loaders = readers()
         schemas = [f"schema{schema}" for schema in range(1, checkpoint.SCHEMA + 1)]
-        files = [(of, kind, name) for of in schemas for kind, name in KINDS.items()]
-        for of, kind, name in [*files, ("replay_without_counters", "replay", "replay")]:
+        files = [(of, file_kind, name) for of in schemas for file_kind, name in KINDS.items()]
+        for of, file_kind, name in [*files, ("replay_without_counters", "replay", "replay")]:
             content = (ROOT / "tests" / "golden" / of / f"{name}.safetensors").read_bytes()
-            title = f"{of.replace('schema', 'schema ').replace('_', ' ')}, {kind}"
-            found = result[title] = {
+            title = f"{of.replace('schema', 'schema ').replace('_', ' ')}, {file_kind}"
+            outcomes = result[title] = {
                 "bytes": len(content),
-                "cut short at every byte": count(cuts(content), lambda p, k=kind: checkpoint.read(p, k), path),
-                "every bit flipped": count(flips(content), lambda p, k=kind: checkpoint.read(p, k), path),
+                "cut short at every byte": count(cuts(content), lambda p, k=file_kind: checkpoint.read(p, k), path),
+                "every bit flipped": count(flips(content), lambda p, k=file_kind: checkpoint.read(p, k), path),
             }
             if of not in schemas[:-1]:
-                found["hostile"] = by_kind(kind, content, loaders[kind], path)
-                found["six GiB in a hole"] = holes(content, lambda p, k=kind: outcome(loaders[k], p), path)
-            print(title, json.dumps(found), flush=True)
-        for kind, parts in runs(Path(folder)).items():
-            result[kind] = parts
-            print(kind, json.dumps(parts), flush=True)
+                outcomes["hostile"] = by_kind(file_kind, content, loaders[file_kind], path)
+                outcomes["six GiB in a hole"] = holes(content, lambda p, k=file_kind: outcome(loaders[k], p), path)
+            print(title, json.dumps(outcomes), flush=True)
+        for file_kind, parts in runs(Path(folder)).items():
+            result[file_kind] = parts
+            print(file_kind, json.dumps(parts), flush=True)
         result["megabytes that reading all of them took"] = round((peak_memory() - before) / 2**20)
         result["code in a rejeu file"] = code_in_ours(Path(folder))
     write(ROOT / "trials" / "results" / "hostile.json", result)
@@ -102,7 +102,7 @@ def outcome(read: Callable[[Path], object], path: Path) -> str:
 
 def count(contents: Iterator[bytes], read: Callable[[Path], object], path: Path) -> dict[str, Any]:
     """Reads files and returns the count of each outcome and the longest time of one file in seconds."""
-    found: collections.Counter[str] = collections.Counter()
+    outcomes: collections.Counter[str] = collections.Counter()
     longest = 0.0
     with path.open("w+b", buffering=0) as file:
         for content in contents:
@@ -110,9 +110,9 @@ def count(contents: Iterator[bytes], read: Callable[[Path], object], path: Path)
             file.truncate()
             file.write(content)
             began = time.perf_counter()
-            found[outcome(read, path)] += 1
+            outcomes[outcome(read, path)] += 1
             longest = max(longest, time.perf_counter() - began)
-    return {**found, "longest seconds": round(longest, 2)}
+    return {**outcomes, "longest seconds": round(longest, 2)}
 
 
 def cuts(content: bytes) -> Iterator[bytes]:
@@ -125,43 +125,43 @@ def flips(content: bytes) -> Iterator[bytes]:
     return (hostile_files.flipped(content, bit) for bit in range(8 * len(content)))
 
 
-def by_kind(kind: str, content: bytes, read: Callable[[Path], object], path: Path) -> dict[str, Any]:
+def by_kind(file_kind: str, content: bytes, read: Callable[[Path], object], path: Path) -> dict[str, Any]:
     """Returns the outcomes of the corpus, by fault."""
     groups = collections.defaultdict(list)
-    for variant in (*hostile_files.variants(content), *SPECIAL[kind](content)):
+    for variant in (*hostile_files.variants(content), *SPECIAL[file_kind](content)):
         groups[variant.kind].append(variant.content)
     return {group: count(iter(contents), read, path) for group, contents in sorted(groups.items())}
 
 
 def holes(content: bytes, read: Callable[[Path], str], path: Path) -> dict[str, Any]:
     """Returns the outcomes of sparse files, and the longest time of one file in seconds."""
-    found: collections.Counter[str] = collections.Counter()
+    outcomes: collections.Counter[str] = collections.Counter()
     longest = 0.0
-    for one in hostile_files.sparse(content):
-        path.write_bytes(one.content)
-        os.truncate(path, one.size)
+    for sparse_file in hostile_files.sparse(content):
+        path.write_bytes(sparse_file.content)
+        os.truncate(path, sparse_file.size)
         began = time.perf_counter()
-        found[read(path)] += 1
+        outcomes[read(path)] += 1
         longest = max(longest, time.perf_counter() - began)
     path.unlink()
-    return {**found, "longest seconds": round(longest, 2)}
+    return {**outcomes, "longest seconds": round(longest, 2)}
 
 
 def runs(folder: Path) -> dict[str, Any]:
     """Returns the outcomes of checkpoints with one file replaced by each file of the corpus, by the replaced file."""
-    found: dict[str, Any] = {}
+    results: dict[str, Any] = {}
     for name in ("replay", "rollout"):
         with shared_learners():
             run = make_run(name, folder / name)
             for whole in files_of(run[1]):
-                content, kind = whole.read_bytes(), whole.name.split("_")[0]
+                content, file_kind = whole.read_bytes(), whole.name.split("_")[0]
                 groups: dict[str, collections.Counter[str]] = collections.defaultdict(collections.Counter)
                 longest = 0.0
                 for variant in (*hostile_files.variants(content), *hostile_files.bad_runs(content)):
                     began = time.perf_counter()
                     groups[variant.kind][replaced(run, folder / "tried", whole, variant.content)] += 1
                     longest = max(longest, time.perf_counter() - began)
-                found[f"checkpoint with a {name}, {kind}"] = {
+                results[f"checkpoint with a {name}, {file_kind}"] = {
                     "bytes": len(content),
                     "hostile": {group: {**counts} for group, counts in sorted(groups.items())},
                     "longest seconds": round(longest, 2),
@@ -169,7 +169,7 @@ def runs(folder: Path) -> dict[str, Any]:
                         content, lambda path, r=run, w=whole: replaced_by(r, folder / "tried", w, path), folder / "hole"
                     ),
                 }
-    return found
+    return results
 
 
 def replaced_by(run: Any, folder: Path, whole: Path, path: Path) -> str:
@@ -218,7 +218,7 @@ def code_in_ours(folder: Path) -> dict[str, Any]:
 def texts(tree: Any) -> list[tuple[Any, Any]]:
     """Returns the paths of all values of a header."""
     items = tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, list) else ()
-    return [place for key, value in items for place in [(tree, key), *texts(value)]]
+    return [path for key, value in items for path in [(tree, key), *texts(value)]]
 
 
 if __name__ == "__main__":

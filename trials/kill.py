@@ -57,17 +57,17 @@ class Life:
 
     def __init__(self, command: list[str]) -> None:
         self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
-        self.said = -1
+        self.last_number = -1
         os.set_blocking(self.process.stdout.fileno(), False)
         self._rest = b""
 
     def listen(self) -> int:
         """Reads the output so far and returns the last number, or -1 if there is none."""
-        while part := self._read():
-            *lines, self._rest = (self._rest + part).split(b"\n")
+        while chunk := self._read():
+            *lines, self._rest = (self._rest + chunk).split(b"\n")
             if lines:
-                self.said = int(lines[-1])
-        return self.said
+                self.last_number = int(lines[-1])
+        return self.last_number
 
     def _read(self) -> bytes:
         try:
@@ -79,9 +79,9 @@ class Life:
         """Kills the process and returns the last number that it printed."""
         self.process.send_signal(signal.SIGKILL)
         self.process.wait()
-        said = self.listen()
+        last_number = self.listen()
         self.process.stdout.close()
-        return said
+        return last_number
 
 
 def wait_for_a_write(folder: Path, seconds: float) -> bool:
@@ -106,17 +106,17 @@ def kill_rejeu(kills: int, rng: random.Random) -> dict[str, object]:
         for k in range(kills):
             life = Life([sys.executable, __file__, "--live", str(folder), str(10**9)])
             first, early = None, k % 10 == 0  # one in ten is killed during startup, before its first update
-            while first is None or (not early and life.said < first + EVERY):
+            while first is None or (not early and life.last_number < first + EVERY):
                 if life.process.poll() is not None:
                     raise SystemExit(f"the run could not go on after {k} kills")
                 time.sleep(0.01)
                 life.listen()
-                first = life.said if first is None and life.said >= 0 else first
+                first = life.last_number if first is None and life.last_number >= 0 else first
             time.sleep(rng.uniform(0, 1.0))
             writing = k % 3 != 0 and not early and wait_for_a_write(folder, 10.0)
             if writing:
                 time.sleep(rng.choice([0.0, rng.uniform(0, 0.01)]))
-            said = life.kill()
+            printed = life.kill()
             during_writes += any(name.endswith(".tmp") for name in os.listdir(folder))
             try:
                 step = rejeu.SAC.resume(folder).num_timesteps
@@ -124,15 +124,15 @@ def kill_rejeu(kills: int, rng: random.Random) -> dict[str, object]:
                 unreadable += 1
                 print(f"kill {k}: {error}", flush=True)
                 continue
-            lost.append(said - step)
-            print(f"kill {k}: said {said}, checkpoint {step}, while writing {writing}", flush=True)
+            lost.append(printed - step)
+            print(f"kill {k}: said {printed}, checkpoint {step}, while writing {writing}", flush=True)
         last = rejeu.SAC.resume(folder).num_timesteps + 3 * EVERY + 17
         subprocess.run(
             [sys.executable, __file__, "--live", str(folder), str(last)], check=True, stdout=subprocess.DEVNULL
         )
         agent = rejeu.SAC.resume(folder)
         whole = make().learn(10**9, lambda agent, turn: turn.step < last)
-        one, two = agent.get_parameters(), whole.get_parameters()
+        parameters, expected_parameters = agent.get_parameters(), whole.get_parameters()
         arrays = agent.replay_buffer.arrays(), whole.replay_buffer.arrays()
         leftovers = sum(name.endswith(".tmp") for name in os.listdir(folder))
         return {
@@ -146,7 +146,7 @@ def kill_rejeu(kills: int, rng: random.Random) -> dict[str, object]:
             "temporary_files_left": leftovers,
             "equal_to_a_run_without_kills": bool(
                 agent.num_timesteps == whole.num_timesteps == last
-                and all(np.array_equal(one[key], two[key]) for key in two)
+                and all(np.array_equal(parameters[key], expected_parameters[key]) for key in expected_parameters)
                 and all(np.array_equal(arrays[0][key], arrays[1][key]) for key in arrays[1])
             ),
         }

@@ -129,7 +129,7 @@ def vector(case: Case) -> Any:
     return rejeu.make_vector(case.env_id, case.n_envs, case.backend, seed=3)
 
 
-def live(name: str, folder: str, kept: bool) -> None:
+def live(name: str, folder: str, with_checkpoints: bool) -> None:
     """Trains to the end, from the newest checkpoint if there is one. Prints the first step and a final digest."""
     import rejeu
     from rejeu.callbacks import Checkpoint
@@ -137,18 +137,18 @@ def live(name: str, folder: str, kept: bool) -> None:
 
     case = CASES[name]
     agent_class = rejeu.AGENTS[case.algorithm]
-    callbacks = [Checkpoint(folder, every=case.every), say_that_it_learns()] if kept else []
+    callbacks = [Checkpoint(folder, every=case.every), say_that_it_learns()] if with_checkpoints else []
     env = vector(case)
     restore, seconds = env.restore, [0.0]
 
     def timed(saved: Any, obs: Any) -> list[int]:
         began = time.perf_counter()
-        said = restore(saved, obs)
+        restored = restore(saved, obs)
         seconds[0] = time.perf_counter() - began
-        return said
+        return restored
 
     env.restore = timed
-    if kept and checkpoint_files(Path(folder)):
+    if with_checkpoints and checkpoint_files(Path(folder)):
         agent = agent_class.resume(folder, env)
         say(resumed=agent.num_timesteps, exact=agent.resumed.exact, replay=seconds[0], trained=agent.seconds["total"])
         if agent.num_timesteps < case.steps:
@@ -177,8 +177,8 @@ def say_that_it_learns() -> Callable[[Any, Any], None]:
     return callback
 
 
-def say(**what: Any) -> None:
-    os.write(1, (json.dumps(what) + "\n").encode())
+def say(**message: Any) -> None:
+    os.write(1, (json.dumps(message) + "\n").encode())
 
 
 def digest(agent: Any) -> dict[str, str]:
@@ -203,12 +203,13 @@ def digest(agent: Any) -> dict[str, str]:
     return {key: hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest() for key, value in arrays.items()}
 
 
-def start(name: str, folder: Path, kept: bool) -> subprocess.Popen[bytes]:
-    command = [sys.executable, __file__, "--live", name, str(folder), "kept" if kept else "not kept"]
+def start(name: str, folder: Path, with_checkpoints: bool) -> subprocess.Popen[bytes]:
+    mode = "checkpoints" if with_checkpoints else "no checkpoints"
+    command = [sys.executable, __file__, "--live", name, str(folder), mode]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, start_new_session=True)
 
 
-def said(process: subprocess.Popen[bytes]) -> dict[str, Any]:
+def next_message(process: subprocess.Popen[bytes]) -> dict[str, Any]:
     """Returns the next message of a process, empty if it has ended."""
     line = process.stdout.readline()
     return json.loads(line) if line else {}
@@ -217,8 +218,8 @@ def said(process: subprocess.Popen[bytes]) -> dict[str, Any]:
 def finished(process: subprocess.Popen[bytes]) -> dict[str, Any]:
     """Returns the last message of a process."""
     last: dict[str, Any] = {}
-    while one := said(process):
-        last = one
+    while message := next_message(process):
+        last = message
     if process.wait() or "digest" not in last:
         raise SystemExit(f"a life ended with {process.returncode}")
     return last
@@ -234,23 +235,23 @@ class Killed(NamedTuple):
     """The last message."""
 
 
-def killed(name: str, folder: Path, most: int, pause: float, rng: random.Random) -> Killed:
-    """Kills a run until there were ``most`` kills or it ended, and lets it end.
+def killed(name: str, folder: Path, max_kills: int, pause: float, rng: random.Random) -> Killed:
+    """Kills a run until there were ``max_kills`` kills or it ended, and lets it end.
 
     Args:
         name: of the case.
         folder: of the checkpoints.
-        most: kills at most.
-        pause: most seconds of training before a kill.
+        max_kills: maximum number of kills.
+        pause: maximum seconds of training before a kill.
         rng: draws the moments.
     """
     lives = []
-    for kills in range(most + 1):
-        process = start(name, folder, kept=True)
-        lives.append(said(process))
-        if kills == most:
+    for kills in range(max_kills + 1):
+        process = start(name, folder, with_checkpoints=True)
+        lives.append(next_message(process))
+        if kills == max_kills:
             break
-        second = said(process)
+        second = next_message(process)
         if "digest" in second:
             return Killed(kills, lives, second)
         time.sleep(rng.uniform(0.0, pause))  # a random moment during training
@@ -264,7 +265,7 @@ def killed(name: str, folder: Path, most: int, pause: float, rng: random.Random)
 def try_case(name: str, kills: int, rng: random.Random) -> dict[str, Any]:
     case = CASES[name]
     with tempfile.TemporaryDirectory() as root:
-        whole = finished(start(name, Path(root) / "none", kept=False))
+        whole = finished(start(name, Path(root) / "none", with_checkpoints=False))
         runs: list[Killed] = []
         began = time.monotonic()
         while (done := sum(run.kills for run in runs)) < kills:
@@ -300,24 +301,23 @@ def main() -> None:
     parser.add_argument("--live", nargs=3, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.live:
-        name, folder, kept = arguments.live
-        live(name, folder, kept == "kept")
+        name, folder, mode = arguments.live
+        live(name, folder, mode == "checkpoints")
         return
-    from provenance import commit
+    from provenance import commit, read, write
 
     tried = commit()  # at the start: the sources may change while it runs
-    known = json.loads(arguments.out.read_text(encoding="utf-8")) if arguments.out.exists() else {}
+    results = read(arguments.out)
     for name in arguments.only or CASES:
         result = try_case(name, arguments.kills, random.Random(f"{arguments.seed} {name}"))
         only = f' --only "{name}"'
-        known[name] = {
+        results[name] = {
             "command": f"python trials/kill_processes.py --kills {arguments.kills}{only}",
             "commit": tried,
         }
-        known[name] |= {"date": time.strftime("%Y-%m-%d"), **result}
-        print(json.dumps(known[name]), flush=True)
-        arguments.out.parent.mkdir(parents=True, exist_ok=True)
-        arguments.out.write_text(json.dumps(known, indent=1) + "\n", encoding="utf-8")
+        results[name] |= {"date": time.strftime("%Y-%m-%d"), **result}
+        print(json.dumps(results[name]), flush=True)
+        write(arguments.out, results)
 
 
 if __name__ == "__main__":

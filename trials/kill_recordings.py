@@ -48,17 +48,17 @@ def played(folder: str | None, episodes: int = EPISODES) -> Any:
     class Saying(gym.Wrapper):
         n = 0
 
-        def reset(self, **given: Any) -> Any:
+        def reset(self, **kwargs: Any) -> Any:
             if folder is not None:
                 os.write(1, b"%d\n" % self.n)
             self.n += 1
-            return self.env.reset(**given)
+            return self.env.reset(**kwargs)
 
     env = Saying(gym.make("Pendulum-v1"))
-    found = record(Random(env.action_space), env, episodes, folder, seed=0)
+    recording = record(Random(env.action_space), env, episodes, folder, seed=0)
     if folder is not None:
         os.write(1, b"%d\n" % env.n)
-    return found
+    return recording
 
 
 def start(folder: Path) -> subprocess.Popen[bytes]:
@@ -73,18 +73,18 @@ def n_equal(folder: Path, expected: Any) -> int:
 
     from rejeu.demonstrations import read
 
-    found = read(folder).episodes
+    episodes = read(folder).episodes
     same = [
-        np.array_equal(one.observations, other.observations)
-        and np.array_equal(one.actions, other.actions)
-        and np.array_equal(one.rewards, other.rewards)
-        for one, other in zip(found, expected.episodes, strict=False)
+        np.array_equal(episode.observations, expected_episode.observations)
+        and np.array_equal(episode.actions, expected_episode.actions)
+        and np.array_equal(episode.rewards, expected_episode.rewards)
+        for episode, expected_episode in zip(episodes, expected.episodes, strict=False)
     ]
     return len(same) if all(same) else -1
 
 
 def kill(folder: Path, rng: random.Random, at_the_end: bool) -> tuple[int, str]:
-    """Kills a recording; returns how many episodes it had completed, and what it was doing."""
+    """Kills a recording; returns the number of its complete episodes, and the activity that the kill interrupted."""
     process = start(folder)
     assert process.stdout is not None
     process.stdout.readline()
@@ -95,13 +95,13 @@ def kill(folder: Path, rng: random.Random, at_the_end: bool) -> tuple[int, str]:
     else:
         time.sleep(rng.uniform(0.02, 2.0))
     process.send_signal(signal.SIGKILL)
-    rest = process.communicate()[0].split()
+    numbers = process.communicate()[0].split()
     doing = "an episode"
     if [*folder.rglob(".*.tmp")]:
         doing = "a write"
     if [*folder.rglob(".main_data.hdf5.*.tmp")] or [*folder.rglob("main_data.hdf5")]:
         doing = "the end"
-    return int(rest[-1]) if rest else 0, doing
+    return int(numbers[-1]) if numbers else 0, doing
 
 
 def killed(kills: int, rng: random.Random, expected: Any) -> dict[str, Any]:
@@ -110,15 +110,15 @@ def killed(kills: int, rng: random.Random, expected: Any) -> dict[str, Any]:
         with tempfile.TemporaryDirectory() as root:
             n, doing = kill(Path(root) / "shown", rng, i % 4 == 3)
             try:
-                found = n_equal(Path(root) / "shown", expected) if n else 0
+                n_read = n_equal(Path(root) / "shown", expected) if n else 0
             except ValueError as error:
                 print(error)
-                found = -1
+                n_read = -1
         result["during"][doing] = result["during"].get(doing, 0) + 1
         result["episodes_complete"] += n
-        result["episodes_lost"] += max(n - max(found, 0), 0)
-        result["unreadable"] += found < 0
-        print(f"kill {i}: {n} episodes complete, {found} read and equal, during {doing}", flush=True)
+        result["episodes_lost"] += max(n - max(n_read, 0), 0)
+        result["unreadable"] += n_read < 0
+        print(f"kill {i}: {n} episodes complete, {n_read} read and equal, during {doing}", flush=True)
     return result
 
 
@@ -127,12 +127,12 @@ def full_disk(expected: Any) -> dict[str, Any]:
         subprocess.run(["mount", "-t", "tmpfs", "-o", "size=100k", "tmpfs", root], check=True)
         try:
             process = start(Path(root) / "shown")
-            said, errors = process.communicate()
+            output, errors = process.communicate()
             folder = Path(root) / "shown"
             return {
                 "bytes": 100 * 1024,
                 "status": process.returncode,
-                "episodes_played": int(said.split()[-1]),
+                "episodes_played": int(output.split()[-1]),
                 "episodes_written": len([*folder.rglob("episode_*.hdf5")]),
                 "episodes_read_and_equal": n_equal(folder, expected),
                 "warnings": errors.count(b"Warning:"),

@@ -25,9 +25,9 @@ MOST_MIB = 50
 
 def one_round(number: int, path: Path, on_device: bool) -> None:
     """Trains, evaluates, saves and loads an agent."""
-    kind, env = [(rejeu.PPO, "jax/CartPole-v1"), (rejeu.SAC, "jax/Pendulum-v1")][number % 2]
-    settings = {"n_steps": 64} if kind is rejeu.PPO else {"buffer_size": 2000, "learning_starts": 100}
-    agent = kind("MlpPolicy", env, seed=number, policy_kwargs={"net_arch": [16]}, **settings)
+    agent_class, env = [(rejeu.PPO, "jax/CartPole-v1"), (rejeu.SAC, "jax/Pendulum-v1")][number % 2]
+    settings = {"n_steps": 64} if agent_class is rejeu.PPO else {"buffer_size": 2000, "learning_starts": 100}
+    agent = agent_class("MlpPolicy", env, seed=number, policy_kwargs={"net_arch": [16]}, **settings)
     agent.on_device = on_device
     agent.learn(512)
     agent.evaluate(2)

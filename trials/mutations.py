@@ -5,11 +5,11 @@ Run it with the active python::
     python trials/mutations.py                      # all that are not in the table yet
     python trials/mutations.py --only td3 --again   # those whose file or name contains the text, also known ones
     python trials/mutations.py --check              # only whether every line that is changed is still there
-    python trials/mutations.py --stages 1           # only the files that are about what was changed
+    python trials/mutations.py --stages 1           # only the tests of the changed file
     python trials/mutations.py --together           # those that this missed: all of them at once, then one by one
 
 Each mutation is made in a copy of the tracked files, and the default tests run there with ``pytest -x``: first the test that
-the table names, then the files that ``scripts/changed.py`` finds for what was changed, then all. The first test that fails is
+the table names, then the files that ``scripts/changed.py`` finds for the change, then all. The first test that fails is
 written beside the bug to ``trials/results/mutations.json``, from which the page "How we check" has its table. A mutation that
 no test notices is *missed*. The lines are in ``trials/mutations.toml``. One that no longer occurs exactly once stops the
 script before anything runs.
@@ -62,8 +62,8 @@ class Mutation(NamedTuple):
 
 
 MUTATIONS = [
-    Mutation(**one)
-    for one in tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))["mutation"]
+    Mutation(**entry)
+    for entry in tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))["mutation"]
 ]
 """The lines and what takes their place."""
 
@@ -141,9 +141,9 @@ def run(mutation: Mutation, folder: Path, n_stages: int, limit: float) -> dict[s
     """Makes the change in ``folder``, runs the tests, takes it back, and returns a row of the table."""
     row, began, done = as_row(mutation), time.monotonic(), list[str]()
     numbered = [*enumerate(stages(mutation)[:n_stages], 1)]
-    known = table().get(key(mutation), row)
-    if known["caught_by"] is not None and "::" in known["caught_by"]:
-        numbered.insert(0, (known["stage"], [known["caught_by"]]))
+    earlier = table().get(key(mutation), row)
+    if earlier["caught_by"] is not None and "::" in earlier["caught_by"]:
+        numbered.insert(0, (earlier["stage"], [earlier["caught_by"]]))
     with planted([mutation], folder):
         for number, tests in numbered:
             tests = [test for test in tests if test not in done]
@@ -156,8 +156,8 @@ def run(mutation: Mutation, folder: Path, n_stages: int, limit: float) -> dict[s
                 row |= {"caught_by": f"no end after {limit:g} s", "stage": number}
                 break
             if ended.returncode in (1, 2):  # 2: a file of tests cannot be imported
-                found = failed(ended.stdout)
-                row |= {"caught_by": found[0].partition("[")[0] if found else "?", "stage": number}
+                failures = failed(ended.stdout)
+                row |= {"caught_by": failures[0].partition("[")[0] if failures else "?", "stage": number}
                 break
             if ended.returncode not in (0, 4, 5):  # 4 and 5: there is no such test
                 sys.exit(
@@ -170,18 +170,18 @@ def run_together(mutations: Sequence[Mutation], folder: Path, tests: Sequence[st
     """Runs tests with all changes at once, then those that fail with each change alone, and writes the table."""
     with planted(mutations, folder):
         ended = pytest(tests, folder, limit)
-    found = failed(ended.stdout)
-    print(f"{len(found)} tests fail with {len(mutations)} changes\n{ended.stdout[-300:]}", flush=True)
-    if not found:
+    failures = failed(ended.stdout)
+    print(f"{len(failures)} tests fail with {len(mutations)} changes\n{ended.stdout[-300:]}", flush=True)
+    if not failures:
         return
-    found = [test for test in found if test not in failed(pytest(found, folder, limit).stdout)]
+    failures = [test for test in failures if test not in failed(pytest(failures, folder, limit).stdout)]
     for mutation in mutations:
         began = time.monotonic()
         with planted([mutation], folder):
-            caught = failed(pytest(found, folder, limit, "-x").stdout)
-        about = {"caught_by": caught[0].partition("[")[0] if caught else None, "stage": 2 if caught else None}
-        print(f"{mutation.file}  {mutation.kind}: {about['caught_by'] or 'MISSED'}", flush=True)
-        write({key(mutation): as_row(mutation) | about | {"seconds": round(time.monotonic() - began)}})
+            caught = failed(pytest(failures, folder, limit, "-x").stdout)
+        outcome = {"caught_by": caught[0].partition("[")[0] if caught else None, "stage": 2 if caught else None}
+        print(f"{mutation.file}  {mutation.kind}: {outcome['caught_by'] or 'MISSED'}", flush=True)
+        write({key(mutation): as_row(mutation) | outcome | {"seconds": round(time.monotonic() - began)}})
 
 
 def main() -> None:
@@ -191,34 +191,37 @@ def main() -> None:
     parser.add_argument("--again", action="store_true", help="also those that the table has")
     parser.add_argument("--missed", action="store_true", help="those that the table has as missed")
     parser.add_argument(
-        "--stages", type=int, default=2, choices=(1, 2), help="1: only the tests of what was changed; 2: then all"
+        "--stages", type=int, default=2, choices=(1, 2), help="1: only the tests of the changed file; 2: then all"
     )
     parser.add_argument("--part", default="0/1", help="i/n: every n-th mutation, from the i-th")
     parser.add_argument("--limit", type=float, default=LIMIT, help="seconds for the tests of one stage")
     parser.add_argument("--together", nargs="*", metavar="TESTS", help="those missed, at once, by these tests or all")
     parser.add_argument("--check", action="store_true", help="only check that every line is there")
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     check()
-    if given.check:
+    if arguments.check:
         return
-    i, n = map(int, given.part.split("/"))
+    i, n = map(int, arguments.part.split("/"))
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name) / "copy"
         folder.mkdir()
         copied(folder)
-        if given.together is not None:
-            known = table()
-            missed = [m for m in MUTATIONS if key(m) in known and known[key(m)]["caught_by"] is None]
+        if arguments.together is not None:
+            recorded = table()
+            missed = [m for m in MUTATIONS if key(m) in recorded and recorded[key(m)]["caught_by"] is None]
             run_together(
-                [m for m in missed if given.only in m.file + m.old], folder, given.together or ["tests"], given.limit
+                [m for m in missed if arguments.only in m.file + m.old],
+                folder,
+                arguments.together or ["tests"],
+                arguments.limit,
             )
             return
         for mutation in MUTATIONS[i::n]:
             old = table().get(key(mutation))
-            again = given.again or (given.missed and old is not None and old["caught_by"] is None)
-            if given.only not in mutation.file + mutation.old or (old is not None and not again):
+            again = arguments.again or (arguments.missed and old is not None and old["caught_by"] is None)
+            if arguments.only not in mutation.file + mutation.old or (old is not None and not again):
                 continue
-            row = run(mutation, folder, given.stages, given.limit)
+            row = run(mutation, folder, arguments.stages, arguments.limit)
             print(
                 f"{row['seconds']:>5} s  {mutation.file}  {mutation.kind}: {row['caught_by'] or 'MISSED'}", flush=True
             )
@@ -237,9 +240,9 @@ def table() -> dict[tuple[str, str, str], dict]:
     """Returns the rows of the table whose mutations are still made."""
     if not RESULTS.exists():
         return {}
-    known = {key(mutation) for mutation in MUTATIONS}
+    planted_keys = {key(mutation) for mutation in MUTATIONS}
     rows = json.loads(RESULTS.read_text(encoding="utf-8"))["mutations"]
-    return {k: row for row in rows if (k := (row["file"], row["old"], row["new"])) in known}
+    return {k: row for row in rows if (k := (row["file"], row["old"], row["new"])) in planted_keys}
 
 
 def write(new: dict[tuple[str, str, str], dict]) -> None:
@@ -251,7 +254,11 @@ def write(new: dict[tuple[str, str, str], dict]) -> None:
     ordered = [rows[key(m)] for m in MUTATIONS if key(m) in rows]
     caught = sum(row["caught_by"] is not None for row in ordered)
     at_first, elsewhere = (
-        [one.at_first for one in MUTATIONS if one.at_first and (one.room is not None) == is_elsewhere]
+        [
+            mutation.at_first
+            for mutation in MUTATIONS
+            if mutation.at_first and (mutation.room is not None) == is_elsewhere
+        ]
         for is_elsewhere in (False, True)
     )
     content = {
@@ -269,8 +276,8 @@ def write(new: dict[tuple[str, str, str], dict]) -> None:
         },
         "rooms": [
             {"room": room, "planted": len(first), "caught_at_first": first.count("caught")}
-            for room in sorted({one.room for one in MUTATIONS if one.room is not None})
-            if (first := [one.at_first for one in MUTATIONS if one.room == room])
+            for room in sorted({mutation.room for mutation in MUTATIONS if mutation.room is not None})
+            if (first := [mutation.at_first for mutation in MUTATIONS if mutation.room == room])
         ],
         "mutations": ordered,
     }

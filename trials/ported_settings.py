@@ -1,4 +1,4 @@
-"""Compares every setting that is ported under the original's name with what the original does with it.
+"""Compares every setting that is ported under the original's name with the same setting of the original.
 
     python trials/ported_settings.py --peer PYTHON
 
@@ -66,12 +66,12 @@ class Library:
     def __call__(self, module: str, *names: str) -> Any:
         package = "sb3_contrib" if module.startswith("contrib.") else "stable_baselines3"
         path = f"{package if self.is_original else PACKAGES[package]}.{module.removeprefix('contrib.')}"
-        found = [getattr(importlib.import_module(path.rstrip(".")), name) for name in names]
-        return found[0] if len(found) == 1 else found
+        attributes = [getattr(importlib.import_module(path.rstrip(".")), name) for name in names]
+        return attributes[0] if len(attributes) == 1 else attributes
 
     def algorithm(self, name: str) -> Any:
-        own = ("A2C", "DDPG", "DQN", "PPO", "SAC", "TD3")
-        return self("" if name in own else "contrib.", name)
+        core_algorithms = ("A2C", "DDPG", "DQN", "PPO", "SAC", "TD3")
+        return self("" if name in core_algorithms else "contrib.", name)
 
     def tensor(self, array: Any) -> Any:
         if not self.is_original:
@@ -88,13 +88,13 @@ class Library:
             model.save(path)
         else:
             loaded = self.algorithm(name).load(path, device="cpu")
-            own = model.get_parameters()
-            given = loaded.get_parameters()
-            for part, arrays in own.items():
+            parameters = model.get_parameters()
+            saved = loaded.get_parameters()
+            for group, arrays in parameters.items():
                 for field, array in arrays.items():
-                    if field in given.get(part, {}) and given[part][field].shape == array.shape:
-                        arrays[field] = given[part][field]
-            model.set_parameters(own)
+                    if field in saved.get(group, {}) and saved[group][field].shape == array.shape:
+                        arrays[field] = saved[group][field]
+            model.set_parameters(parameters)
         return model
 
 
@@ -164,12 +164,12 @@ def constant_noise(lib: Library) -> Iterator[None]:
 
             from stable_baselines3.common.distributions import StateDependentNoiseDistribution as OfStates
 
-            own = OfStates.sample
+            original_sample = OfStates.sample
 
             def by_state(self: Any) -> Any:
                 """One noise for each state of a batch, instead of one matrix for all of them: equal for each alone."""
                 if self.distribution.mean.shape[0] == 1:
-                    return own(self)
+                    return original_sample(self)
                 drawn = self.distribution.mean + SHARE * self.distribution.stddev
                 return drawn if self.bijector is None else self.bijector.forward(drawn)
 
@@ -179,7 +179,7 @@ def constant_noise(lib: Library) -> Iterator[None]:
                 return drawn_numbers(*limits, **options) if options else 0
 
             stack.enter_context(mock.patch.object(np.random, "randint", first))
-            for one, name, value in (
+            for owner, name, value in (
                 (OfStates, "sample", by_state),
                 (Categorical, "sample", likeliest),
                 (Normal, "sample", shifted),
@@ -187,7 +187,7 @@ def constant_noise(lib: Library) -> Iterator[None]:
                 (torch.Tensor, "normal_", filled),
                 (torch, "randn_like", zeros),
             ):
-                stack.enter_context(mock.patch.object(one, name, value))
+                stack.enter_context(mock.patch.object(owner, name, value))
         else:
             import jax
             import jax.numpy as jnp
@@ -217,8 +217,8 @@ def whole_batches(lib: Library, model: Any) -> None:
             env = np.repeat(np.arange(ring.n_envs), ring.head - begins)
             time = np.concatenate([np.arange(*ends) for ends in zip(begins, ring.head, strict=True)])
             steps = np.flatnonzero(ring.at(env, time).kind != LAST)
-            chosen = np.resize(steps, n)
-            return ring.at(env[chosen], time[chosen])
+            repeated = np.resize(steps, n)
+            return ring.at(env[repeated], time[repeated])
 
         ring.draw = draw
 
@@ -228,7 +228,7 @@ LAST = 2
 
 
 def learned(lib: Library, name: str, space: gym.Space, total: int, settings: dict[str, Any]) -> Any:
-    """Returns what an agent says after ``total`` steps in ``Line``, from the original's weights."""
+    """Returns the outputs of an agent after ``total`` steps in ``Line``, from the original's weights."""
     settings = copy.deepcopy(settings)  # the original adds to policy_kwargs
     shape = settings.get("policy_kwargs", {})
     if lib.is_original and "activation_fn" in shape:
@@ -237,7 +237,7 @@ def learned(lib: Library, name: str, space: gym.Space, total: int, settings: dic
         shape["activation_fn"] = getattr(torch.nn, shape["activation_fn"])
     of_line = {key: settings.pop(key) for key in ("length", "truncates", "varies") if key in settings}
     lines = [Line(space, **of_line) for _ in range(settings.pop("n_envs", 1))]
-    env = lib("common.vec_env", "DummyVecEnv")([partial(lambda one: one, one) for one in lines])
+    env = lib("common.vec_env", "DummyVecEnv")([partial(lambda line: line, line) for line in lines])
     is_off = name in ("DQN", "QRDQN", "SAC", "TD3", "DDPG", "TQC", "CrossQ")
     if is_off and not lib.is_original:
         settings["overlap"] = False
@@ -255,7 +255,7 @@ def says(lib: Library, name: str, model: Any, space: gym.Space) -> list[float]:
     looks, is_box = lib.tensor(LOOKS), isinstance(space, gym.spaces.Box)
     action = np.full((len(LOOKS), 2), 0.25, np.float32) if is_box else np.arange(len(LOOKS)) % 3
     if name in ("PPO", "A2C", "TRPO", "MaskablePPO"):
-        numbers += [plain(one) for one in model.policy.evaluate_actions(looks, lib.tensor(action))[:2]]
+        numbers += [plain(tensor) for tensor in model.policy.evaluate_actions(looks, lib.tensor(action))[:2]]
     elif name in ("DQN", "QRDQN"):
         if lib.is_original:
             net = model.policy.q_net if name == "DQN" else model.policy.quantile_net
@@ -266,12 +266,12 @@ def says(lib: Library, name: str, model: Any, space: gym.Space) -> list[float]:
     elif is_box and name not in ("ARS", "RecurrentPPO"):
         if lib.is_original:
             model.policy.set_training_mode(False)
-            found = model.critic(looks, lib.tensor(action))
-            values = plain(found).mean(axis=2).T if name == "TQC" else np.stack([plain(q)[:, 0] for q in found])
+            q_values = model.critic(looks, lib.tensor(action))
+            values = plain(q_values).mean(axis=2).T if name == "TQC" else np.stack([plain(q)[:, 0] for q in q_values])
         else:
             values = model.q_values(LOOKS, action, critics="all")
         numbers.append(values)
-    return np.concatenate([np.ravel(one) for one in numbers]).tolist()
+    return np.concatenate([np.ravel(array) for array in numbers]).tolist()
 
 
 def plain(value: Any) -> np.ndarray:
@@ -486,48 +486,48 @@ UPDATES: list[tuple[str, gym.Space, int, dict[str, Any], dict[str, list[Any]]]] 
 def update_cases() -> None:
     """Adds a case for each value of each setting of ``UPDATES``."""
     for name, space, total, base, variants in UPDATES:
-        kind = "Box" if isinstance(space, gym.spaces.Box) else "Discrete"
-        known = {"": [None], **variants}
-        for setting, values in known.items():
+        space_name = "Box" if isinstance(space, gym.spaces.Box) else "Discrete"
+        values_by_setting = {"": [None], **variants}
+        for setting, values in values_by_setting.items():
             for i, value in enumerate(values):
-                given = base if setting == "" else {**base, setting: value}
+                settings = base if setting == "" else {**base, setting: value}
                 if setting == "n_steps" and "batch_size" in base and name not in OFF:
-                    given = {**given, "batch_size": value}
+                    settings = {**settings, "batch_size": value}
                 if setting == "train_freq":
-                    given = {**given, "batch_size": 120}  # a multiple of all numbers of rows: each counts as much
+                    settings = {**settings, "batch_size": 120}  # a multiple of all numbers of rows: each counts as much
                 if setting == "n_envs" and "batch_size" in base:
-                    given = {**given, "batch_size": 32}
+                    settings = {**settings, "batch_size": 32}
                 if setting == "policy_kwargs" and value.get("use_sde"):
-                    given = {
-                        **given,
+                    settings = {
+                        **settings,
                         "use_sde": True,
                         "policy_kwargs": {k: v for k, v in value.items() if k != "use_sde"},
                     }
-                case_name = f"{name}_{kind}{'_' * bool(setting)}{setting}{i or ''}"
+                case_name = f"{name}_{space_name}{'_' * bool(setting)}{setting}{i or ''}"
                 inside = f",policy_kwargs.{','.join(value)}" if setting == "policy_kwargs" else ""
                 CASES[case_name] = (
                     f"{name}.{setting or '(base)'}{inside}",
-                    partial(run_update, name, space, total, given),
+                    partial(run_update, name, space, total, settings),
                 )
 
 
 OFF = ("DQN", "QRDQN", "SAC", "TD3", "DDPG", "TQC", "CrossQ")
 
 
-def run_update(name: str, space: gym.Space, total: int, given: dict[str, Any], lib: Library) -> Any:
-    return learned(lib, name, space, total, given)
+def run_update(name: str, space: gym.Space, total: int, settings: dict[str, Any], lib: Library) -> Any:
+    return learned(lib, name, space, total, settings)
 
 
 def vec(lib: Library, *envs: gym.Env, monitored: bool = False) -> Any:
     """Returns a ``DummyVecEnv`` of environments."""
     wrap = lib("common.monitor", "Monitor") if monitored else (lambda env: env)
-    return lib("common.vec_env", "DummyVecEnv")([partial(lambda one: one, wrap(env)) for env in envs])
+    return lib("common.vec_env", "DummyVecEnv")([partial(lambda env: env, wrap(env)) for env in envs])
 
 
 def small(lib: Library, env: Any, name: str = "A2C", **settings: Any) -> Any:
     """Returns an agent that learns quickly."""
-    given = copy.deepcopy({"policy_kwargs": {"net_arch": [8]}, "seed": 0, **settings})
-    return lib.algorithm(name)("MlpPolicy", env, device="cpu", **given)
+    agent_settings = copy.deepcopy({"policy_kwargs": {"net_arch": [8]}, "seed": 0, **settings})
+    return lib.algorithm(name)("MlpPolicy", env, device="cpu", **agent_settings)
 
 
 def noted(lib: Library, note: Callable[[Any], Any]) -> tuple[Any, list[Any]]:
@@ -544,11 +544,11 @@ def noted(lib: Library, note: Callable[[Any], Any]) -> tuple[Any, list[Any]]:
 
 def stepped(env: Any, n: int, action: Any) -> list[Any]:
     """Returns observations, rewards and ends of a vector environment."""
-    found = [np.asarray(env.reset()).tolist()]
+    results = [np.asarray(env.reset()).tolist()]
     for _ in range(n):
         obs, reward, done, _ = env.step(action)
-        found += [obs.tolist(), np.asarray(reward, float).tolist(), np.asarray(done).tolist()]
-    return found
+        results += [obs.tolist(), np.asarray(reward, float).tolist(), np.asarray(done).tolist()]
+    return results
 
 
 @case("NormalActionNoise.mean,sigma,dtype", 0.03)
@@ -561,12 +561,12 @@ def normal_noise(lib: Library) -> Any:
 
 @case("OrnsteinUhlenbeckActionNoise.mean,theta,dt,initial_noise")
 def ornstein_uhlenbeck_path(lib: Library) -> Any:
-    kind = lib("common.noise", "OrnsteinUhlenbeckActionNoise")
-    noise = kind(np.array([0.5]), np.array([0.0]), theta=0.3, dt=0.1, initial_noise=np.array([0.2]))
+    noise_class = lib("common.noise", "OrnsteinUhlenbeckActionNoise")
+    noise = noise_class(np.array([0.5]), np.array([0.0]), theta=0.3, dt=0.1, initial_noise=np.array([0.2]))
     path = [noise().tolist() for _ in range(5)]
     noise.reset()
-    other = kind(np.array([0.5]), np.array([0.0]))
-    return [path, noise(), [other().tolist() for _ in range(3)]]
+    default_noise = noise_class(np.array([0.5]), np.array([0.0]))
+    return [path, noise(), [default_noise().tolist() for _ in range(3)]]
 
 
 @case("OrnsteinUhlenbeckActionNoise.sigma", 0.05)
@@ -579,15 +579,15 @@ def ornstein_uhlenbeck_spread(lib: Library) -> Any:
 
 @case("VectorizedActionNoise.base_noise,n_envs")
 def vectorized_noise(lib: Library) -> Any:
-    one, many = lib("common.noise", "NormalActionNoise", "VectorizedActionNoise")
-    noise = many(one(np.array([0.3, 0.1]), np.zeros(2)), 3)
+    normal, many = lib("common.noise", "NormalActionNoise", "VectorizedActionNoise")
+    noise = many(normal(np.array([0.3, 0.1]), np.zeros(2)), 3)
     return [noise(), noise.n_envs]
 
 
 @case("VecNormalize.training,norm_obs,norm_reward,clip_obs,clip_reward,gamma,epsilon")
 def vec_normalize(lib: Library) -> Any:
-    kind, found = lib("common.vec_env", "VecNormalize"), []
-    for given in (
+    wrapper, results = lib("common.vec_env", "VecNormalize"), []
+    for options in (
         {},
         {"gamma": 0.5},
         {"clip_obs": 0.7, "clip_reward": 0.4},
@@ -596,17 +596,17 @@ def vec_normalize(lib: Library) -> Any:
         {"norm_reward": False},
         {"training": False},
     ):
-        env = kind(vec(lib, Line(THREE, scale=10.0), Line(THREE, 3, scale=5.0)), **given)
-        found.append(stepped(env, 8, np.zeros(2, int)))
-        found.append([env.get_original_reward(), env.get_original_obs()])
-    return found
+        env = wrapper(vec(lib, Line(THREE, scale=10.0), Line(THREE, 3, scale=5.0)), **options)
+        results.append(stepped(env, 8, np.zeros(2, int)))
+        results.append([env.get_original_reward(), env.get_original_obs()])
+    return results
 
 
 class Goals(Line):
     """``Line`` with a Dict of observations."""
 
-    def __init__(self, *arguments: Any, **named: Any) -> None:
-        super().__init__(*arguments, **named)
+    def __init__(self, *arguments: Any, **kwargs: Any) -> None:
+        super().__init__(*arguments, **kwargs)
         self.observation_space = gym.spaces.Dict(a=self.observation_space, b=gym.spaces.Box(-9, 9, (1,), np.float32))
 
     def look(self) -> Any:
@@ -616,18 +616,18 @@ class Goals(Line):
 @case("VecNormalize.norm_obs_keys VecExtractDictObs.key")
 def keys_of_dict(lib: Library) -> Any:
     normalize, extract = lib("common.vec_env", "VecNormalize", "VecExtractDictObs")
-    found = []
+    results = []
     for keys, key in ((["b"], "b"), (["b"], "a"), (None, "a")):
         env = extract(normalize(vec(lib, Goals(THREE)), norm_obs_keys=keys), key)
-        found.append(stepped(env, 6, np.zeros(1, int)))
-    return found
+        results.append(stepped(env, 6, np.zeros(1, int)))
+    return results
 
 
 class Images(Line):
     """``Line`` with images."""
 
-    def __init__(self, shape: tuple[int, ...], *arguments: Any, **named: Any) -> None:
-        super().__init__(THREE, *arguments, **named)
+    def __init__(self, shape: tuple[int, ...], *arguments: Any, **kwargs: Any) -> None:
+        super().__init__(THREE, *arguments, **kwargs)
         self.observation_space = gym.spaces.Box(0, 255, shape, np.uint8)
 
     def look(self) -> Any:
@@ -636,37 +636,37 @@ class Images(Line):
 
 @case("VecFrameStack.venv,n_stack,channels_order StackedObservations.n_stack,channels_order")
 def frame_stack(lib: Library) -> Any:
-    kind, found = lib("common.vec_env", "VecFrameStack"), []
+    wrapper, results = lib("common.vec_env", "VecFrameStack"), []
     for shape, order in (((36, 36, 1), None), ((1, 36, 36), None), ((36, 36, 1), "last"), ((1, 36, 36), "first")):
-        env = kind(vec(lib, Images(shape, 3)), 3, channels_order=order)
-        found.append(list(env.observation_space.shape))
+        env = wrapper(vec(lib, Images(shape, 3)), 3, channels_order=order)
+        results.append(list(env.observation_space.shape))
         env.reset()
         for _ in range(5):
             obs, _, done, infos = env.step([0])
             axis = int(np.argmin(obs.shape[1:])) + 1
-            found.append(np.moveaxis(obs, axis, -1)[0, 0, 0].tolist())
+            results.append(np.moveaxis(obs, axis, -1)[0, 0, 0].tolist())
             if done[0]:
-                found.append(np.moveaxis(infos[0]["terminal_observation"], axis - 1, -1)[0, 0].tolist())
-    return [found, stepped(kind(vec(lib, Line(THREE)), 2), 6, [0])]
+                results.append(np.moveaxis(infos[0]["terminal_observation"], axis - 1, -1)[0, 0].tolist())
+    return [results, stepped(wrapper(vec(lib, Line(THREE)), 2), 6, [0])]
 
 
 @case("VecTransposeImage.skip")
 def transpose(lib: Library) -> Any:
-    kind = lib("common.vec_env", "VecTransposeImage")
-    return [list(kind(vec(lib, Images((36, 40, 1))), skip=skip).reset().shape) for skip in (False, True)]
+    wrapper = lib("common.vec_env", "VecTransposeImage")
+    return [list(wrapper(vec(lib, Images((36, 40, 1))), skip=skip).reset().shape) for skip in (False, True)]
 
 
 @case("VecCheckNan.raise_exception,warn_once,check_inf")
 def check_nan(lib: Library) -> Any:
-    kind, found = lib("common.vec_env", "VecCheckNan"), []
+    wrapper, results = lib("common.vec_env", "VecCheckNan"), []
 
     class Broken(Line):
         def step(self, action: Any) -> Any:
-            obs, reward, *rest = super().step(action)
-            return obs * (math.inf if self.t == 1 else math.nan), reward, *rest
+            obs, reward, *ends = super().step(action)
+            return obs * (math.inf if self.t == 1 else math.nan), reward, *ends
 
-    for given in ({"raise_exception": True}, {}, {"warn_once": False}, {"check_inf": False, "raise_exception": True}):
-        env = kind(vec(lib, Broken(THREE, 9)), **given)
+    for options in ({"raise_exception": True}, {}, {"warn_once": False}, {"check_inf": False, "raise_exception": True}):
+        env = wrapper(vec(lib, Broken(THREE, 9)), **options)
         env.reset()
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
@@ -677,8 +677,8 @@ def check_nan(lib: Library) -> Any:
                     errors.append("")
                 except ValueError as error:
                     errors.append(isinstance(error, ValueError))
-        found.append([errors, len(caught)])
-    return found
+        results.append([errors, len(caught)])
+    return results
 
 
 def table(path: Path) -> list[list[str]]:
@@ -697,16 +697,16 @@ class Informed(Line):
         return super().reset(**options)
 
     def step(self, action: Any) -> Any:
-        *found, info = super().step(action)
-        return *found, {**info, "t2": self.t**2, "is_success": self.t > 3}
+        *transition, info = super().step(action)
+        return *transition, {**info, "t2": self.t**2, "is_success": self.t > 3}
 
 
 @case(
     "Monitor.filename,allow_early_resets,reset_keywords,info_keywords,override_existing ResultsWriter.filename,extra_keys,override_existing"
 )
 def monitor(lib: Library) -> Any:
-    kind, found = lib("common.monitor", "Monitor"), []
-    for name, given in (
+    wrapper, results = lib("common.monitor", "Monitor"), []
+    for name, options in (
         ("a", {}),
         ("b", {"info_keywords": ("t2",)}),
         ("b", {"info_keywords": ("t2",), "override_existing": False}),
@@ -716,12 +716,12 @@ def monitor(lib: Library) -> Any:
     ):
         if name == "folder":
             Path(name).mkdir()
-        env = kind(Informed(THREE, 4), name, **given)
+        env = wrapper(Informed(THREE, 4), name, **options)
         env.reset()
         for i in range(9):
             *_, over, _, info = env.step(0)
             if over:
-                found.append({key: x for key, x in info["episode"].items() if key != "t"})
+                results.append({key: x for key, x in info["episode"].items() if key != "t"})
                 env.reset()
         early = ""
         try:
@@ -729,9 +729,9 @@ def monitor(lib: Library) -> Any:
         except RuntimeError as error:
             early = type(error).__name__
         env.close()
-        found += [early, env.get_total_steps(), env.get_episode_lengths(), env.get_episode_rewards()]
-        found.append([[path.name, table(path)] for path in sorted(Path().glob("**/*monitor.csv"))])
-    return found
+        results += [early, env.get_total_steps(), env.get_episode_lengths(), env.get_episode_rewards()]
+        results.append([[path.name, table(path)] for path in sorted(Path().glob("**/*monitor.csv"))])
+    return results
 
 
 @case("VecMonitor.filename,info_keywords")
@@ -740,12 +740,12 @@ def vec_monitor(lib: Library) -> Any:
         vec(lib, Informed(THREE, 3), Informed(THREE, 4)), "v", info_keywords=("t2",)
     )
     env.reset()
-    found = []
+    results = []
     for _ in range(8):
         *_, infos = env.step([0, 0])
-        found.append([{k: float(x) for k, x in one.get("episode", {}).items() if k != "t"} for one in infos])
+        results.append([{k: float(x) for k, x in info.get("episode", {}).items() if k != "t"} for info in infos])
     env.close()
-    return [found, [[path.name, table(path)] for path in sorted(Path().glob("*monitor.csv"))]]
+    return [results, [[path.name, table(path)] for path in sorted(Path().glob("*monitor.csv"))]]
 
 
 class Screen(gym.Env):
@@ -779,16 +779,16 @@ class Screen(gym.Env):
 
 
 def played(env: Any, n: int, seed: int = 3) -> list[Any]:
-    """Returns what a game says: the mean of the frames, rewards, ends and the steps that were taken."""
+    """Returns the record of a game: the mean of the frames, rewards, ends and the steps that were taken."""
     obs, _ = env.reset(seed=seed)
-    found: list[Any] = [list(obs.shape), float(obs.mean())]
+    results: list[Any] = [list(obs.shape), float(obs.mean())]
     for i in range(n):
         obs, reward, terminated, truncated, _ = env.step(i % 4)
-        found.append([round(float(obs.mean()), 3), float(reward), bool(terminated), bool(truncated), env.unwrapped.t])
+        results.append([round(float(obs.mean()), 3), float(reward), bool(terminated), bool(truncated), env.unwrapped.t])
         if terminated or truncated:
             obs, _ = env.reset()
-            found.append([round(float(obs.mean()), 3), env.unwrapped.t])
-    return [found, env.unwrapped.taken]
+            results.append([round(float(obs.mean()), 3), env.unwrapped.t])
+    return [results, env.unwrapped.taken]
 
 
 @case(
@@ -798,31 +798,31 @@ def played(env: Any, n: int, seed: int = 3) -> list[Any]:
 def atari_wrappers(lib: Library) -> Any:
     names = ("MaxAndSkipEnv", "ClipRewardEnv", "EpisodicLifeEnv", "FireResetEnv", "WarpFrame", "NoopResetEnv")
     skip, clip, lives, fire, warp, noop = lib("common.atari_wrappers", *names)
-    found = [played(make(Screen()), 45) for make in (clip, lives, fire)]
-    found += [played(skip(Screen(), skip=3), 30), played(warp(Screen(), width=40, height=50), 3)]
+    results = [played(make(Screen()), 45) for make in (clip, lives, fire)]
+    results += [played(skip(Screen(), skip=3), 30), played(warp(Screen(), width=40, height=50), 3)]
     env = noop(Screen(), noop_max=5)
     starts = []
     for seed in range(30):
         env.reset(seed=seed)
         starts.append(env.unwrapped.t)
-    return [found, [min(starts), max(starts)]]
+    return [results, [min(starts), max(starts)]]
 
 
 @case("AtariWrapper.frame_skip,screen_size,terminal_on_life_loss,clip_reward,noop_max", 0.02)
 def atari_wrapper(lib: Library) -> Any:
-    kind, found = lib("common.atari_wrappers", "AtariWrapper"), []
-    for given in (
+    wrapper, results = lib("common.atari_wrappers", "AtariWrapper"), []
+    for options in (
         {"noop_max": 0},
         {"noop_max": 0, "frame_skip": 2, "screen_size": 50},
         {"noop_max": 0, "terminal_on_life_loss": False, "clip_reward": False},
     ):
-        found.append(played(kind(Screen(), **given), 30))
-    return found
+        results.append(played(wrapper(Screen(), **options), 30))
+    return results
 
 
 @case("StickyActionEnv.action_repeat_probability AtariWrapper.action_repeat_probability", 0.06)
 def sticky(lib: Library) -> Any:
-    found = []
+    results = []
     for make in (
         lambda: lib("common.atari_wrappers", "StickyActionEnv")(Screen(), 0.3),
         lambda: lib("common.atari_wrappers", "AtariWrapper")(
@@ -837,8 +837,8 @@ def sticky(lib: Library) -> Any:
             repeated += env.unwrapped.taken[-1] != i % 4
             if env.unwrapped.t >= 78:
                 env.reset()
-        found.append(repeated / n)
-    return found
+        results.append(repeated / n)
+    return results
 
 
 @case(
@@ -859,12 +859,12 @@ def make_vec(lib: Library) -> Any:
         vec_env_kwargs={},
         monitor_kwargs={"override_existing": True},
     )
-    found = stepped(env, 9, np.zeros(2, int))
-    spaces_drawn = [int(one.action_space.sample()) for one in env.envs]
+    results = stepped(env, 9, np.zeros(2, int))
+    spaces_drawn = [int(member.action_space.sample()) for member in env.envs]
     env.close()
     names = sorted(path.name for path in Path("m").iterdir())
-    own = make(lambda: Line(THREE), n_envs=1)
-    return [found, spaces_drawn, names, stepped(own, 6, [0])]
+    from_function = make(lambda: Line(THREE), n_envs=1)
+    return [results, spaces_drawn, names, stepped(from_function, 6, [0])]
 
 
 class Fixed:
@@ -879,37 +879,37 @@ class Fixed:
     "evaluate_policy.model,env,n_eval_episodes,deterministic,render,callback,reward_threshold,return_episode_rewards,warn"
 )
 def evaluating(lib: Library) -> Any:
-    evaluate, found = lib("common.evaluation", "evaluate_policy"), []
+    evaluate, results = lib("common.evaluation", "evaluate_policy"), []
     for n, lengths in ((5, (3, 7)), (4, (2, 3, 9)), (1, (4, 4)), (3, (4,))):
-        policy, seen = Fixed(), []
+        policy, callback_calls = Fixed(), []
         envs = vec(lib, *(Line(THREE, length) for length in lengths), monitored=True)
-        found.append(
+        results.append(
             evaluate(
                 policy,
                 envs,
                 n_eval_episodes=n,
                 deterministic=n != 5,
-                callback=lambda l, g: seen.append([sorted(l)[:0], l["i"]]),  # noqa: B023, E741
+                callback=lambda l, g: callback_calls.append([sorted(l)[:0], l["i"]]),  # noqa: B023, E741
                 return_episode_rewards=True,
                 warn=False,
             )
         )
-        found += [policy.calls, seen, evaluate(policy, envs, n_eval_episodes=n, reward_threshold=-100.0)]
+        results += [policy.calls, callback_calls, evaluate(policy, envs, n_eval_episodes=n, reward_threshold=-100.0)]
         try:
             evaluate(policy, envs, n_eval_episodes=n, reward_threshold=100.0)
         except AssertionError:
-            found.append("below")
+            results.append("below")
         except ValueError:
-            found.append("below, as ValueError")
+            results.append("below, as ValueError")
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         evaluate(Fixed(), Line(THREE), 1)
         evaluate(Fixed(), Line(THREE), 1, warn=False)
-    return [found, len(caught)]
+    return [results, len(caught)]
 
 
-def eval_callback(lib: Library, n_envs: int, **given: Any) -> Any:
-    kind, base = lib("common.callbacks", "EvalCallback", "BaseCallback")
+def eval_callback(lib: Library, n_envs: int, **options: Any) -> Any:
+    callback_class, base = lib("common.callbacks", "EvalCallback", "BaseCallback")
     events: list[Any] = []
 
     class Event(base):  # type: ignore[misc]
@@ -921,13 +921,13 @@ def eval_callback(lib: Library, n_envs: int, **given: Any) -> Any:
             events.append([self.title, self.num_timesteps, self.parent.n_calls, round(self.parent.last_mean_reward, 3)])
             return True
 
-    callback = kind(
+    callback = callback_class(
         vec(lib, Line(THREE, 4), monitored=True),
         callback_on_new_best=Event("best"),
         callback_after_eval=Event("after"),
         warn=False,
         verbose=0,
-        **given,
+        **options,
     )
     small(lib, vec(lib, *(Line(THREE) for _ in range(n_envs)))).learn(40, callback=callback)
     files = {}
@@ -954,11 +954,11 @@ def eval_callback_2(lib: Library) -> Any:
 
 @case("CheckpointCallback.save_freq,save_path,name_prefix,save_replay_buffer,save_vecnormalize,verbose")
 def checkpoints(lib: Library) -> Any:
-    kind, normalize = lib("common.callbacks", "CheckpointCallback"), lib("common.vec_env", "VecNormalize")
+    callback_class, normalize = lib("common.callbacks", "CheckpointCallback"), lib("common.vec_env", "VecNormalize")
     for prefix, n_envs, off in (("one", 1, False), ("two", 2, False), ("off", 1, True)):
         env = normalize(vec(lib, *(Line(THREE) for _ in range(n_envs))))
         model = small(lib, env, "DQN", learning_starts=10, buffer_size=100) if off else small(lib, env)
-        model.learn(30, callback=kind(7, "saved", prefix, save_replay_buffer=True, save_vecnormalize=True))
+        model.learn(30, callback=callback_class(7, "saved", prefix, save_replay_buffer=True, save_vecnormalize=True))
     return sorted(path.name for path in Path("saved").iterdir())
 
 
@@ -973,7 +973,7 @@ def stopping(lib: Library) -> Any:
         "StopTrainingOnMaxEpisodes",
     )
     evaluate, threshold, improvement, episodes = lib("common.callbacks", *names)
-    many, found = lib("common.callbacks", "CallbackList"), []
+    many, results = lib("common.callbacks", "CallbackList"), []
     fixed = {"eval_freq": 5, "n_eval_episodes": 1, "warn": False, "verbose": 0}
     for n_envs, make in (
         (1, lambda env: evaluate(env, callback_on_new_best=threshold(-50.0), **fixed)),
@@ -986,8 +986,8 @@ def stopping(lib: Library) -> Any:
     ):
         model = small(lib, vec(lib, *(Line(THREE) for _ in range(n_envs))))
         model.learn(60, callback=make(vec(lib, Constant(THREE), monitored=True)))
-        found.append(model.num_timesteps)
-    return found
+        results.append(model.num_timesteps)
+    return results
 
 
 class Constant(Line):
@@ -1000,14 +1000,14 @@ class Constant(Line):
 
 @case("EveryNTimesteps.n_steps,callback LogEveryNTimesteps.n_steps ConvertCallback.callback EventCallback.callback")
 def every(lib: Library) -> Any:
-    kind, found = lib("common.callbacks", "EveryNTimesteps"), []
+    callback_class, results = lib("common.callbacks", "EveryNTimesteps"), []
     for n_envs, n in ((1, 7), (3, 7), (2, 10)):
-        callback, notes = noted(lib, lambda one: one.num_timesteps)
-        small(lib, vec(lib, *(Line(THREE) for _ in range(n_envs)))).learn(60, callback=kind(n, callback))
-        found.append(notes)
+        callback, notes = noted(lib, lambda event: event.num_timesteps)
+        small(lib, vec(lib, *(Line(THREE) for _ in range(n_envs)))).learn(60, callback=callback_class(n, callback))
+        results.append(notes)
     calls: list[int] = []
     small(lib, vec(lib, Line(THREE))).learn(20, callback=lambda l, g: calls.append(l["self"].num_timesteps) or True)  # noqa: E741
-    return [found, calls]
+    return [results, calls]
 
 
 @case(
@@ -1015,7 +1015,7 @@ def every(lib: Library) -> Any:
 )
 def logging(lib: Library) -> Any:
     names = ("configure", "HumanOutputFormat", "make_output_format", "Logger")
-    configure, human, make, kind = lib("common.logger", *names)
+    configure, human, make, logger_class = lib("common.logger", *names)
     logger = configure("logs", ["csv", "json", "log"])
     for step in range(3):
         logger.record("a/x", step * 0.123456789)
@@ -1028,10 +1028,10 @@ def logging(lib: Library) -> Any:
         logger.dump(step)
     logger.close()
     text = io.StringIO()
-    other = kind(None, [human(text, max_length=12)])
-    other.record("group/a_very_long_key_indeed", 3)
-    other.record("group/b", "a long text for this table")
-    other.dump(0)
+    table_logger = logger_class(None, [human(text, max_length=12)])
+    table_logger.record("group/a_very_long_key_indeed", 3)
+    table_logger.record("group/b", "a long text for this table")
+    table_logger.dump(0)
     make("csv", "logs", "_2").close()
     files = {path.name: path.read_text() for path in sorted(Path("logs").iterdir())}
     return [files, text.getvalue()]
@@ -1042,17 +1042,17 @@ def logging(lib: Library) -> Any:
 )
 def schedules(lib: Library) -> Any:
     names = ("LinearSchedule", "ConstantSchedule", "FloatSchedule", "get_linear_fn", "get_schedule_fn", "constant_fn")
-    linear, constant, number, line, given, fixed = lib("common.utils", *names)
+    linear, constant, number, line, as_schedule, fixed = lib("common.utils", *names)
     makes = [
         linear(1.0, 0.1, 0.4),
         constant(0.3),
         number(0.2),
         number(lambda p: p * p),
         line(0.0, 2.0, 0.5),
-        given(0.7),
+        as_schedule(0.7),
         fixed(0.9),
     ]
-    return [[float(one(p)) for p in (1.0, 0.9, 0.6, 0.3, 0.0)] for one in makes]
+    return [[float(schedule(p)) for p in (1.0, 0.9, 0.6, 0.3, 0.0)] for schedule in makes]
 
 
 @case(
@@ -1086,13 +1086,13 @@ def preprocessing(lib: Library) -> Any:
     )
     image, first, shape, flat, dim = lib("common.preprocessing", *names)
     box = gym.spaces.Box
-    made = [box(0, 255, s, np.uint8) for s in ((36, 36, 3), (3, 36, 36), (36, 36, 5), (36, 36))]
+    images = [box(0, 255, s, np.uint8) for s in ((36, 36, 3), (3, 36, 36), (36, 36, 5), (36, 36))]
     floats = box(0.0, 1.0, (36, 36, 3), np.float32)
     others = [gym.spaces.Discrete(4), gym.spaces.MultiDiscrete([2, 3]), gym.spaces.MultiBinary(3), BOX]
     return [
-        [[bool(image(s)), bool(image(s, check_channels=True))] for s in made],
+        [[bool(image(s)), bool(image(s, check_channels=True))] for s in images],
         [bool(image(floats)), bool(image(floats, normalized_image=True))],
-        [bool(first(s)) for s in made[:2]],
+        [bool(first(s)) for s in images[:2]],
         [[list(shape(s)), int(flat(s)), int(dim(s))] for s in others],
     ]
 
@@ -1101,20 +1101,20 @@ def preprocessing(lib: Library) -> Any:
     "DQN.exploration_fraction,exploration_initial_eps,exploration_final_eps QRDQN.exploration_fraction,exploration_initial_eps,exploration_final_eps"
 )
 def exploration(lib: Library) -> Any:
-    found = []
+    results = []
     for name, n_envs in (("DQN", 1), ("DQN", 2), ("QRDQN", 1)):
-        callback, notes = noted(lib, lambda one: [one.num_timesteps, float(one.model.exploration_rate)])
-        given = {"exploration_fraction": 0.5, "exploration_initial_eps": 0.9, "exploration_final_eps": 0.2}
+        callback, notes = noted(lib, lambda event: [event.num_timesteps, float(event.model.exploration_rate)])
+        options = {"exploration_fraction": 0.5, "exploration_initial_eps": 0.9, "exploration_final_eps": 0.2}
         env = vec(lib, *(Line(THREE) for _ in range(n_envs)))
-        small(lib, env, name, learning_starts=1000, **given).learn(40, callback=callback)
-        found.append(notes)
-    return found
+        small(lib, env, name, learning_starts=1000, **options).learn(40, callback=callback)
+        results.append(notes)
+    return results
 
 
 @case("DQN.learning_starts,train_freq,gradient_steps")
 def updates_counted(lib: Library) -> Any:
-    found = []
-    for given in (
+    results = []
+    for options in (
         {"learning_starts": 10, "train_freq": 4, "gradient_steps": 1},
         {"learning_starts": 10, "train_freq": 4, "gradient_steps": 3},
         {"learning_starts": 10, "train_freq": 4, "gradient_steps": -1},
@@ -1123,21 +1123,21 @@ def updates_counted(lib: Library) -> Any:
         {"learning_starts": 10, "train_freq": (1, "episode"), "gradient_steps": 2},
         {"learning_starts": 0, "train_freq": (3, "step"), "gradient_steps": 1},
     ):
-        model = small(lib, vec(lib, Line(THREE)), "DQN", buffer_size=100, batch_size=8, **given)
-        found.append(model.learn(40)._n_updates)
-    return found
+        model = small(lib, vec(lib, Line(THREE)), "DQN", buffer_size=100, batch_size=8, **options)
+        results.append(model.learn(40)._n_updates)
+    return results
 
 
 @case("DQN.learning_starts,train_freq,gradient_steps(2 environments)")
 def updates_counted_2(lib: Library) -> Any:
-    found = []
-    for given in (
+    results = []
+    for options in (
         {"learning_starts": 10, "train_freq": 4, "gradient_steps": 1},
         {"learning_starts": 10, "train_freq": 4, "gradient_steps": -1},
     ):
-        model = small(lib, vec(lib, Line(THREE), Line(THREE)), "DQN", buffer_size=100, batch_size=8, **given)
-        found.append(model.learn(40)._n_updates)
-    return found
+        model = small(lib, vec(lib, Line(THREE), Line(THREE)), "DQN", buffer_size=100, batch_size=8, **options)
+        results.append(model.learn(40)._n_updates)
+    return results
 
 
 WIDE = gym.spaces.Box(np.array([-2.0, 0.0], np.float32), np.array([2.0, 4.0], np.float32))
@@ -1145,19 +1145,19 @@ WIDE = gym.spaces.Box(np.array([-2.0, 0.0], np.float32), np.array([2.0, 4.0], np
 
 @case("TD3.action_noise DDPG.action_noise SAC.action_noise")
 def action_noise(lib: Library) -> Any:
-    normal, found = lib("common.noise", "NormalActionNoise"), []
+    normal, results = lib("common.noise", "NormalActionNoise"), []
     for name, mean in (("TD3", [0.3, -0.2]), ("DDPG", [0.9, -5.0])):
         env = Line(WIDE)
         noise = normal(np.array(mean), np.zeros(2))
         model = lib.make(name, "MlpPolicy", env, name, action_noise=noise, learning_starts=0, train_freq=100)
         model.learn(10)
-        found.append(env.actions[:10])  # the original goes on to the end of a rollout
-    return found
+        results.append(env.actions[:10])  # the original goes on to the end of a rollout
+    return results
 
 
 @case("PPO.use_sde,sde_sample_freq A2C.use_sde,sde_sample_freq SAC.use_sde,sde_sample_freq")
 def noise_of_states(lib: Library) -> Any:
-    found = []
+    results = []
 
     class Same(Line):
         def look(self) -> np.ndarray:
@@ -1168,36 +1168,36 @@ def noise_of_states(lib: Library) -> Any:
         off = {"learning_starts": 0, "train_freq": 20, "batch_size": 4} if name == "SAC" else {"n_steps": 20}
         small(lib, vec(lib, env), name, use_sde=True, sde_sample_freq=frequency, **off).learn(20)
         actions = np.array(env.actions)
-        found.append(np.flatnonzero(np.abs(np.diff(actions, axis=0)).max(axis=1) > 1e-6).tolist())
-    return found
+        results.append(np.flatnonzero(np.abs(np.diff(actions, axis=0)).max(axis=1) > 1e-6).tolist())
+    return results
 
 
 @case("PPO.stats_window_size,verbose,tensorboard_log,seed A2C.stats_window_size,verbose,seed")
 def outputs(lib: Library) -> Any:
-    found = []
+    results = []
     for window in (2, 7):
         model = small(lib, vec(lib, Line(THREE), monitored=True), stats_window_size=window).learn(40)
-        found.append([len(model.ep_info_buffer), [one["l"] for one in model.ep_info_buffer]])
+        results.append([len(model.ep_info_buffer), [episode["l"] for episode in model.ep_info_buffer]])
     for verbose in (0, 1):
         with contextlib.redirect_stdout(io.StringIO()) as text:
             small(lib, vec(lib, Line(THREE), monitored=True), verbose=verbose).learn(600, log_interval=1)
-        found.append(bool(text.getvalue()))
+        results.append(bool(text.getvalue()))
     same = [
         small(lib, vec(lib, Line(THREE)), seed=seed).learn(20).predict(LOOKS, deterministic=False)[0] for seed in (3, 3)
     ]
-    return [found, bool(np.array_equal(*same))]
+    return [results, bool(np.array_equal(*same))]
 
 
 @case("TimeFeatureWrapper.max_steps,test_mode")
 def time_feature(lib: Library) -> Any:
-    kind = lib("contrib.common.wrappers", "TimeFeatureWrapper")
-    found = []
-    for given in ({"max_steps": 8}, {"max_steps": 8, "test_mode": True}):
+    wrapper = lib("contrib.common.wrappers", "TimeFeatureWrapper")
+    results = []
+    for options in ({"max_steps": 8}, {"max_steps": 8, "test_mode": True}):
         for env in (Line(THREE), gym.wrappers.TimeLimit(Line(THREE), 6)):
-            wrapped = kind(env, **given)
-            found.append([wrapped.observation_space.low, wrapped.observation_space.high, wrapped.reset()[0]])
-            found.append([wrapped.step(0)[0] for _ in range(4)])
-    return found
+            wrapped = wrapper(env, **options)
+            results.append([wrapped.observation_space.low, wrapped.observation_space.high, wrapped.reset()[0]])
+            results.append([wrapped.step(0)[0] for _ in range(4)])
+    return results
 
 
 class Masking(Line):
@@ -1211,12 +1211,12 @@ class Masking(Line):
 def masks(lib: Library) -> Any:
     masker = lib("contrib.common.wrappers", "ActionMasker")
     get, supported = lib("contrib.common.maskable.utils", "get_action_masks", "is_masking_supported")
-    found = []
+    results = []
     for function in ("masks_of", lambda env: [True, False, True]):
         env = masker(Masking(THREE), function)
         env.reset()
-        found.append([np.asarray(get(env), int), np.asarray(get(vec(lib, env)), int), bool(supported(vec(lib, env)))])
-    return found
+        results.append([np.asarray(get(env), int), np.asarray(get(vec(lib, env)), int), bool(supported(vec(lib, env)))])
+    return results
 
 
 class Played(Line):
@@ -1229,18 +1229,18 @@ class Played(Line):
 
 @case("ARS.n_delta,n_top,alive_bonus_offset")
 def random_search(lib: Library) -> Any:
-    found = []
-    for given in ({}, {"n_delta": 3}, {"n_top": 2}, {"alive_bonus_offset": -1.0}, {"alive_bonus_offset": 2.0}):
-        settings = {"n_delta": 4, "policy_kwargs": {}, **given}
+    results = []
+    for options in ({}, {"n_delta": 3}, {"n_top": 2}, {"alive_bonus_offset": -1.0}, {"alive_bonus_offset": 2.0}):
+        settings = {"n_delta": 4, "policy_kwargs": {}, **options}
         model = small(lib, vec(lib, Played(THREE, 3, varies=True), monitored=True), "ARS", **settings)
         logger = lib("common.logger", "Logger")(None, [])
         model.set_logger(logger)
         values: dict[str, float] = {}
         plain_record = logger.record
 
-        def record(key: str, value: Any, *rest: Any, **more: Any) -> None:
+        def record(key: str, value: Any, *arguments: Any, **more: Any) -> None:
             values[key] = value  # noqa: B023
-            plain_record(key, value, *rest, **more)  # noqa: B023
+            plain_record(key, value, *arguments, **more)  # noqa: B023
 
         logger.record = record
         while model._n_updates < 1:
@@ -1251,13 +1251,13 @@ def random_search(lib: Library) -> Any:
             deviation = values["rollout/return_std"] * math.sqrt((2 * top - 1) / (2 * top))
         else:
             deviation = float(model.statistics()["train/return_std"])
-        found.append([deviation, model._n_updates])
-    return found
+        results.append([deviation, model._n_updates])
+    return results
 
 
 @case("HerReplayBuffer.n_sampled_goal,goal_selection_strategy SAC.replay_buffer_class,replay_buffer_kwargs", 0.1)
 def hindsight(lib: Library) -> Any:
-    found = []
+    results = []
     her = lib("", "HerReplayBuffer")
 
     class Reach(Line):
@@ -1274,8 +1274,8 @@ def hindsight(lib: Library) -> Any:
             return -(np.abs(np.asarray(achieved) - desired).max(axis=-1) > 0.5).astype(np.float32)
 
         def step(self, action: Any) -> Any:
-            obs, _, *rest = super().step(action)
-            return obs, float(self.compute_reward(obs["achieved_goal"], obs["desired_goal"], {})), *rest
+            obs, _, *ends = super().step(action)
+            return obs, float(self.compute_reward(obs["achieved_goal"], obs["desired_goal"], {})), *ends
 
     for strategy, n in (("future", 4), ("final", 1), ("episode", 2), ("future", 0)):
         if n == 0:
@@ -1294,17 +1294,21 @@ def hindsight(lib: Library) -> Any:
             here, goal, reward = drawn.obs["observation"], drawn.obs["desired_goal"], drawn.reward
         ahead = (np.asarray(goal) - np.asarray(here)).ravel()
         new = np.asarray(goal).ravel() < 40
-        found.append(
+        results.append(
             [float(new.mean()), float(ahead[new].mean()), float(ahead[new].min() / 10), float(np.mean(reward))]
         )
-    return found
+    return results
 
 
 @case("OrnsteinUhlenbeckActionNoise.dtype")
 def noise_types(lib: Library) -> Any:
-    one, path = lib("common.noise", "NormalActionNoise", "OrnsteinUhlenbeckActionNoise")
+    normal, path = lib("common.noise", "NormalActionNoise", "OrnsteinUhlenbeckActionNoise")
     zeros = np.zeros(2)
-    return [str(kind(zeros, zeros, dtype=dtype)().dtype) for kind in (one, path) for dtype in (np.float32, np.float64)]
+    return [
+        str(noise_class(zeros, zeros, dtype=dtype)().dtype)
+        for noise_class in (normal, path)
+        for dtype in (np.float32, np.float64)
+    ]
 
 
 @case("unwrap_wrapper.wrapper_class is_wrapped.wrapper_class unwrap_vec_wrapper.vec_wrapper_class is_vecenv_wrapped.vec_wrapper_class sync_envs_normalization.eval_env VecEnvWrapper.venv DummyVecEnv.env_fns VecEnv.num_envs VecCheckNan.venv VecExtractDictObs.venv VecMonitor.venv VecNormalize.venv VecTransposeImage.venv StackedObservations.num_envs")  # fmt: skip
@@ -1316,18 +1320,24 @@ def wrapped(lib: Library) -> Any:
     names = ("VecCheckNan", "VecMonitor", "VecNormalize", "VecFrameStack", "VecExtractDictObs", "VecTransposeImage")
     nan, monitor, normalize, stack, extract, transpose = lib("common.vec_env", *names)
     env = gym.wrappers.TimeLimit(Line(THREE), 5)
-    found = [is_in(env, gym.wrappers.TimeLimit), is_in(env, gym.wrappers.ClipAction)]
-    found += [unwrap(env, gym.wrappers.TimeLimit) is env, unwrap(env, gym.wrappers.ClipAction)]
+    results = [is_in(env, gym.wrappers.TimeLimit), is_in(env, gym.wrappers.ClipAction)]
+    results += [unwrap(env, gym.wrappers.TimeLimit) is env, unwrap(env, gym.wrappers.ClipAction)]
     plain_env = vec(lib, Line(THREE), Line(THREE))
     both = normalize(nan(plain_env))
-    other = normalize(nan(vec(lib, Line(THREE))), training=False)
+    evaluation_env = normalize(nan(vec(lib, Line(THREE))), training=False)
     stepped(both, 4, np.zeros(2, int))
-    sync(both, other)
-    found += [is_vec(both, nan), is_vec(both, stack), unwrap_vec(both, nan) is both.venv, unwrap_vec(both, stack)]
-    found += [other.obs_rms.mean, other.ret_rms.var, both.venv.venv is plain_env, plain_env.num_envs, both.num_envs]
-    for made in (monitor(plain_env), stack(plain_env, 2), extract(vec(lib, Goals(THREE)), "a")):
-        found.append([made.num_envs, made.venv.num_envs, list(made.observation_space.shape)])
-    return [*found, transpose(vec(lib, Images((36, 36, 3)))).venv.num_envs]
+    sync(both, evaluation_env)
+    results += [is_vec(both, nan), is_vec(both, stack), unwrap_vec(both, nan) is both.venv, unwrap_vec(both, stack)]
+    results += [
+        evaluation_env.obs_rms.mean,
+        evaluation_env.ret_rms.var,
+        both.venv.venv is plain_env,
+        plain_env.num_envs,
+        both.num_envs,
+    ]
+    for wrapper in (monitor(plain_env), stack(plain_env, 2), extract(vec(lib, Goals(THREE)), "a")):
+        results.append([wrapper.num_envs, wrapper.venv.num_envs, list(wrapper.observation_space.shape)])
+    return [*results, transpose(vec(lib, Images((36, 36, 3)))).venv.num_envs]
 
 
 @case("make_atari_env.env_id,n_envs,seed,start_index,monitor_dir,wrapper_kwargs,env_kwargs,vec_env_cls,vec_env_kwargs,monitor_kwargs", 0.02)  # fmt: skip
@@ -1338,10 +1348,10 @@ def make_atari(lib: Library) -> Any:
         wrapper_kwargs={"noop_max": 0, "frame_skip": 2, "screen_size": 40}, env_kwargs={},
         monitor_kwargs={"override_existing": True},
     )  # fmt: skip
-    found = [list(env.observation_space.shape), list(env.reset().shape)]
-    found += [[x.tolist() for x in env.step([1, 2])[1:3]] for _ in range(4)]
+    results = [list(env.observation_space.shape), list(env.reset().shape)]
+    results += [[x.tolist() for x in env.step([1, 2])[1:3]] for _ in range(4)]
     env.close()
-    return [found, sorted(path.name for path in Path("m").iterdir())]
+    return [results, sorted(path.name for path in Path("m").iterdir())]
 
 
 @case(
@@ -1350,17 +1360,17 @@ def make_atari(lib: Library) -> Any:
 def logged_values(lib: Library) -> Any:
     names = ("Video", "Figure", "Image", "HParam", "FormatUnsupportedError", "filter_excluded_keys", "CSVOutputFormat")
     video, figure, image, hparam, error, excluded, table_of = lib("common.logger", *names)
-    made = [video(np.zeros(2), 4.0), figure("f", close=True), image(np.ones(2), "HW"), hparam({"a": 1}, {"b": 2.0})]
-    found = [{key: str(x) for key, x in vars(one).items()} for one in made]
-    found.append(excluded({"a": 1, "b": 2, "c": 3}, {"a": ("csv",), "b": None, "c": ("log", "stdout")}, "log"))
+    values = [video(np.zeros(2), 4.0), figure("f", close=True), image(np.ones(2), "HW"), hparam({"a": 1}, {"b": 2.0})]
+    results = [{key: str(x) for key, x in vars(value).items()} for value in values]
+    results.append(excluded({"a": 1, "b": 2, "c": 3}, {"a": ("csv",), "b": None, "c": ("log", "stdout")}, "log"))
     writer, errors = table_of("x.csv"), []
-    for one in made:
+    for value in values:
         try:
-            writer.write({"k": one}, {"k": ()}, 0)
+            writer.write({"k": value}, {"k": ()}, 0)
         except error as raised:
             errors.append(isinstance(raised, NotImplementedError))
     texts = [word in str(error(["json", "csv"], "video")) for word in ("json", "csv", "video")]
-    return [found, errors, texts]
+    return [results, errors, texts]
 
 
 @case("get_monitor_files.path load_results.path ts2xy.data_frame,x_axis ResultsWriter.header")
@@ -1368,58 +1378,64 @@ def monitor_files(lib: Library) -> Any:
     writer, files, load = lib("common.monitor", "ResultsWriter", "get_monitor_files", "load_results")
     curve = lib("common.results_plotter", "ts2xy")
     for i, start in enumerate((10.0, 5.5)):
-        one = writer(f"m/{i}", {"t_start": start, "env_id": "E"})
+        monitor_file = writer(f"m/{i}", {"t_start": start, "env_id": "E"})
         for k in range(3):
-            one.write_row({"r": k + 0.5, "l": 4 + k, "t": 2.0 * k + i})
-        one.close()
+            monitor_file.write_row({"r": k + 0.5, "l": 4 + k, "t": 2.0 * k + i})
+        monitor_file.close()
     table = load("m")
-    found = [[np.asarray(x, float) for x in curve(table, axis)] for axis in ("timesteps", "episodes", "walltime_hrs")]
-    return [[Path(name).name for name in sorted(files("m"))], found, [list(map(float, table[key])) for key in "rlt"]]
+    results = [[np.asarray(x, float) for x in curve(table, axis)] for axis in ("timesteps", "episodes", "walltime_hrs")]
+    return [[Path(name).name for name in sorted(files("m"))], results, [list(map(float, table[key])) for key in "rlt"]]
 
 
 @case(
     "is_vectorized_observation.observation is_vectorized_box_observation.observation is_vectorized_discrete_observation.observation is_vectorized_multidiscrete_observation.observation is_vectorized_multibinary_observation.observation is_vectorized_dict_observation.observation set_random_seed.seed,using_cuda check_for_nested_spaces.obs_space preprocess_obs.obs,normalize_images configure_logger.verbose,tensorboard_log,tb_log_name,reset_num_timesteps get_system_info.print_info polyak_update.params,target_params,tau"
 )
 def helpers(lib: Library) -> Any:
-    kinds = ("box", "discrete", "multidiscrete", "multibinary", "dict")
-    is_vector = lib("common.utils", "is_vectorized_observation", *(f"is_vectorized_{k}_observation" for k in kinds))
+    space_names = ("box", "discrete", "multidiscrete", "multibinary", "dict")
+    is_vector = lib(
+        "common.utils", "is_vectorized_observation", *(f"is_vectorized_{k}_observation" for k in space_names)
+    )
     spaces = gym.spaces
     nested = spaces.Dict(a=BOX, b=THREE)
     examples = [BOX, THREE, spaces.MultiDiscrete([2, 3]), spaces.MultiBinary(3), nested]
-    found: list[Any] = []
+    results: list[Any] = []
     for i, space in enumerate(examples):
-        one = space.sample()
-        many = {k: np.stack([x, x]) for k, x in one.items()} if isinstance(one, dict) else np.stack([one, one])
-        found += [[bool(check(x, space)) for check in (is_vector[0], is_vector[1 + i])] for x in (one, many)]
+        sample = space.sample()
+        many = (
+            {k: np.stack([x, x]) for k, x in sample.items()} if isinstance(sample, dict) else np.stack([sample, sample])
+        )
+        results += [[bool(check(x, space)) for check in (is_vector[0], is_vector[1 + i])] for x in (sample, many)]
     seeds, nests = lib("common.utils", "set_random_seed"), lib("common.preprocessing", "check_for_nested_spaces")
     for space in (nested, spaces.Dict(a=nested), spaces.Tuple([nested])):
         try:
             nests(space)
-            found.append("")
+            results.append("")
         except NotImplementedError as error:
-            found.append(type(error).__name__)
+            results.append(type(error).__name__)
     seeds(7, using_cuda=False)
-    found.append(np.random.rand(2))
+    results.append(np.random.rand(2))
     process = lib("common.preprocessing", "preprocess_obs")
     image = spaces.Box(0, 255, (36, 36, 1), np.uint8)
     for space in (image, spaces.Discrete(3), spaces.MultiDiscrete([2, 3]), spaces.MultiBinary(2)):
         for normalizes in (True, False):
-            given = lib.tensor(np.array([space.high if space is image else (2 if space.shape == () else [1] * 2)]))
-            found.append(np.ravel(plain(process(given, space, normalize_images=normalizes)))[:6])
+            observation = lib.tensor(
+                np.array([space.high if space is image else (2 if space.shape == () else [1] * 2)])
+            )
+            results.append(np.ravel(plain(process(observation, space, normalize_images=normalizes)))[:6])
     configure = lib("common.utils", "configure_logger")
     for name in ("run_1", "run_3"):
         (Path("logs") / name).mkdir(parents=True, exist_ok=True)
     for verbose in (0, 1):
-        formats = [type(one).__name__ for one in configure(verbose, None).output_formats]
-        found.append(formats)
+        formats = [type(output_format).__name__ for output_format in configure(verbose, None).output_formats]
+        results.append(formats)
     with contextlib.redirect_stdout(io.StringIO()) as text:
         info = lib("common.utils", "get_system_info")(print_info=False)
-    found.append([text.getvalue(), type(info).__name__, len(info)])
+    results.append([text.getvalue(), type(info).__name__, len(info)])
     update = lib("common.utils", "polyak_update")
     ours, target = (lib.tensor(np.array([x, 2.0], np.float32)) for x in (1.0, 3.0))
     target = target if lib.is_original else np.array(target)
     update([ours], [target], 0.25)
-    return [*found, plain(target)]
+    return [*results, plain(target)]
 
 
 @case(
@@ -1427,16 +1443,18 @@ def helpers(lib: Library) -> Any:
 )
 def tuples(lib: Library) -> Any:
     names = ("RolloutBufferSamples", "ReplayBufferSamples", "DictRolloutBufferSamples", "DictReplayBufferSamples")
-    kinds = lib("common.type_aliases", *names, "RolloutReturn", "TrainFreq")
-    return [list(one._fields) for one in kinds]
+    tuple_types = lib("common.type_aliases", *names, "RolloutReturn", "TrainFreq")
+    return [list(tuple_type._fields) for tuple_type in tuple_types]
 
 
 @case("VecVideoRecorder.venv,video_folder,record_video_trigger,video_length,name_prefix")
 def video_recorder(lib: Library) -> Any:
-    kind = lib("common.vec_env", "VecVideoRecorder")
+    wrapper = lib("common.vec_env", "VecVideoRecorder")
     env = lib("common.env_util", "make_vec_env")("CartPole-v1", n_envs=1)
     asked: list[int] = []
-    env = kind(env, "videos", lambda step: bool(asked.append(step)) or step % 7 == 2, video_length=3, name_prefix="p")
+    env = wrapper(
+        env, "videos", lambda step: bool(asked.append(step)) or step % 7 == 2, video_length=3, name_prefix="p"
+    )
     env.reset()
     recording = []
     for _ in range(13):
@@ -1448,12 +1466,14 @@ def video_recorder(lib: Library) -> Any:
 
 @case("SubprocVecEnv.env_fns,start_method")
 def in_processes(lib: Library) -> Any:
-    kind = lib("common.vec_env", "SubprocVecEnv")
-    env = kind([partial(gym.make, "CartPole-v1"), partial(gym.make, "CartPole-v1")], start_method="forkserver")
+    subproc_vec_env = lib("common.vec_env", "SubprocVecEnv")
+    env = subproc_vec_env(
+        [partial(gym.make, "CartPole-v1"), partial(gym.make, "CartPole-v1")], start_method="forkserver"
+    )
     env.seed(3)
-    found = stepped(env, 4, np.zeros(2, int))
+    results = stepped(env, 4, np.zeros(2, int))
     env.close()
-    return found
+    return results
 
 
 @case(
@@ -1462,7 +1482,7 @@ def in_processes(lib: Library) -> Any:
 def verbose_callbacks(lib: Library) -> Any:
     names = ("EvalCallback", "StopTrainingOnRewardThreshold", "StopTrainingOnNoModelImprovement")
     evaluate, threshold, improvement, episodes = lib("common.callbacks", *names, "StopTrainingOnMaxEpisodes")
-    convert, found, rendered = lib("common.callbacks", "ConvertCallback"), [], []
+    convert, results, rendered = lib("common.callbacks", "ConvertCallback"), [], []
 
     class Shown(Constant):
         metadata = {"render_modes": ["human"]}
@@ -1480,30 +1500,30 @@ def verbose_callbacks(lib: Library) -> Any:
         ):
             with contextlib.redirect_stdout(io.StringIO()) as text:
                 small(lib, vec(lib, Line(THREE))).learn(20, callback=callback)
-            found.append(bool(text.getvalue()))
-        found.append(convert(lambda l, g: True, verbose=verbose).verbose)  # noqa: E741
+            results.append(bool(text.getvalue()))
+        results.append(convert(lambda l, g: True, verbose=verbose).verbose)  # noqa: E741
     shown = evaluate(vec(lib, Shown(THREE)), eval_freq=10, n_eval_episodes=1, render=True, warn=False, verbose=0)
     small(lib, vec(lib, Line(THREE))).learn(10, callback=shown)
-    return [found, rendered]
+    return [results, rendered]
 
 
 @case("DQN.stats_window_size,verbose,seed")
 def outputs_off_policy(lib: Library) -> Any:
-    found = []
+    results = []
     fast = {"learning_starts": 8, "buffer_size": 100, "batch_size": 4}
-    for name, given in (("DQN", fast), ("A2C", {})):
+    for name, options in (("DQN", fast), ("A2C", {})):
         for window in (2, 7):
             env = vec(lib, Line(THREE), monitored=True)
-            model = small(lib, env, name, stats_window_size=window, **given).learn(40)
-            found.append([len(model.ep_info_buffer), [one["l"] for one in model.ep_info_buffer]])
+            model = small(lib, env, name, stats_window_size=window, **options).learn(40)
+            results.append([len(model.ep_info_buffer), [episode["l"] for episode in model.ep_info_buffer]])
         for verbose in (0, 1):
             with contextlib.redirect_stdout(io.StringIO()) as text:
                 env = vec(lib, Line(THREE), monitored=True)
-                small(lib, env, name, verbose=verbose, **given).learn(100, log_interval=1)
-            found.append(bool(text.getvalue()))
-        same = [small(lib, vec(lib, Line(THREE)), name, seed=3, **given).learn(20) for _ in range(2)]
-        found.append(bool(np.array_equal(*(one.predict(LOOKS, deterministic=True)[0] for one in same))))
-    return found
+                small(lib, env, name, verbose=verbose, **options).learn(100, log_interval=1)
+            results.append(bool(text.getvalue()))
+        same = [small(lib, vec(lib, Line(THREE)), name, seed=3, **options).learn(20) for _ in range(2)]
+        results.append(bool(np.array_equal(*(agent.predict(LOOKS, deterministic=True)[0] for agent in same))))
+    return results
 
 
 @case("A2C.tensorboard_log DQN.tensorboard_log TensorBoardOutputFormat.folder")
@@ -1511,8 +1531,8 @@ def tensorboard(lib: Library) -> Any:
     writer = lib("common.logger", "TensorBoardOutputFormat")("by_hand")
     writer.write({"a": 1.0}, {"a": ()}, 3)
     writer.close()
-    for name, given in (("A2C", {}), ("DQN", {"learning_starts": 8, "buffer_size": 100, "batch_size": 4})):
-        model = small(lib, vec(lib, Line(THREE)), name, tensorboard_log="logs", **given)
+    for name, options in (("A2C", {}), ("DQN", {"learning_starts": 8, "buffer_size": 100, "batch_size": 4})):
+        model = small(lib, vec(lib, Line(THREE)), name, tensorboard_log="logs", **options)
         model.learn(10)
         model.learn(10, tb_log_name="own", reset_num_timesteps=False)
         model.learn(10, tb_log_name="own")
@@ -1522,7 +1542,7 @@ def tensorboard(lib: Library) -> Any:
 
 @case("check_env.warn,skip_render_check")
 def checker(lib: Library) -> Any:
-    check, found = lib("common.env_checker", "check_env"), []
+    check, results = lib("common.env_checker", "check_env"), []
 
     class Shown(Line):
         metadata = {"render_modes": ["rgb_array"]}
@@ -1533,13 +1553,13 @@ def checker(lib: Library) -> Any:
             return np.zeros((8, 8, 3), np.uint8)
 
     for space in (WIDE, BOX):
-        for given in ({}, {"warn": False}, {"skip_render_check": False}):
+        for options in ({}, {"warn": False}, {"skip_render_check": False}):
             rendered: list[int] = []
             with warnings.catch_warnings(record=True) as caught:
                 warnings.simplefilter("always")
-                check(Shown(space), **given)
-            found.append([bool(caught), bool(rendered)])
-    return found
+                check(Shown(space), **options)
+            results.append([bool(caught), bool(rendered)])
+    return results
 
 
 class Shares(Images):
@@ -1555,22 +1575,24 @@ class Shares(Images):
 
 @case("PPO.policy_kwargs.normalize_images DQN.policy_kwargs.normalize_images", 1e-4)
 def images(lib: Library) -> Any:
-    found = []
+    results = []
     for name in ("PPO", "DQN"):
         for normalizes in (True, False):
             env = vec(lib, Images((1, 36, 36)) if normalizes else Shares())
             kwargs = {"features_dim": 16, **({} if normalizes else {"normalized_image": True})}
             shape = {"net_arch": [4], "normalize_images": normalizes, "features_extractor_kwargs": kwargs}
-            given = {"buffer_size": 50} if name == "DQN" else {"n_steps": 16, "batch_size": 16}
-            model = lib.make(name, "CnnPolicy", env, f"{name}{normalizes}", policy_kwargs=shape, **given)
+            options = {"buffer_size": 50} if name == "DQN" else {"n_steps": 16, "batch_size": 16}
+            model = lib.make(name, "CnnPolicy", env, f"{name}{normalizes}", policy_kwargs=shape, **options)
             looks = np.random.default_rng(0).integers(0, 256, (3, 1, 36, 36))
             looks = looks.astype(np.uint8) if normalizes else (looks / 255).astype(np.float32)
             if name == "PPO":
                 values = model.policy.evaluate_actions(lib.tensor(looks), lib.tensor(np.arange(3)))
-                found += [plain(one) for one in values[:2]]
+                results += [plain(tensor) for tensor in values[:2]]
             else:
-                found.append(plain(model.policy.q_net(lib.tensor(looks))) if lib.is_original else model.q_values(looks))
-    return [np.ravel(one) for one in found]
+                results.append(
+                    plain(model.policy.q_net(lib.tensor(looks))) if lib.is_original else model.q_values(looks)
+                )
+    return [np.ravel(array) for array in results]
 
 
 class Same(Line):
@@ -1580,38 +1602,38 @@ class Same(Line):
         return np.ones(3, np.float32)
 
     def step(self, action: Any) -> Any:
-        obs, _, *rest = super().step(action)
-        return obs, 1.0, *rest
+        obs, _, *ends = super().step(action)
+        return obs, 1.0, *ends
 
 
 @case("PPO.batch_size TRPO.batch_size")
 def batches_on_policy(lib: Library) -> Any:
     """All steps are the same, with gamma=0 also in their advantages, so that only the number of minibatches counts."""
-    found = []
+    results = []
     for name, size in (("PPO", 4), ("PPO", 16), ("TRPO", 4), ("TRPO", 16)):
-        given = {**SMALL, **EPOCHS} if name != "TRPO" else {**SMALL, **ROLLOUT, "normalize_advantage": False}
+        settings = {**SMALL, **EPOCHS} if name != "TRPO" else {**SMALL, **ROLLOUT, "normalize_advantage": False}
         env = vec(lib, Same(THREE))
-        model = lib.make(name, "MlpPolicy", env, f"{name}{size}", **given | {"batch_size": size, "gamma": 0.0})
+        model = lib.make(name, "MlpPolicy", env, f"{name}{size}", **settings | {"batch_size": size, "gamma": 0.0})
         with constant_noise(lib):
             model.learn(16)
-        found.append(says(lib, name, model, THREE))
-    return found
+        results.append(says(lib, name, model, THREE))
+    return results
 
 
 @case("ARS.zero_policy,delta_std,n_eval_episodes,policy_kwargs")
 def first_candidates(lib: Library) -> Any:
-    found = []
-    for given in ({}, {"zero_policy": False}):
-        model = small(lib, vec(lib, Line(THREE, 3)), "ARS", n_delta=2, delta_std=0.0, policy_kwargs={}, **given)
-        own = model.policy.parameters_to_vector()
-        found.append([int(np.asarray(own).size), bool(np.abs(np.asarray(own)).max() > 0)])
+    results = []
+    for options in ({}, {"zero_policy": False}):
+        model = small(lib, vec(lib, Line(THREE, 3)), "ARS", n_delta=2, delta_std=0.0, policy_kwargs={}, **options)
+        weights = model.policy.parameters_to_vector()
+        results.append([int(np.asarray(weights).size), bool(np.abs(np.asarray(weights)).max() > 0)])
         model.learn(24)  # candidates that do not differ from the policy do not move it
-        found.append(bool(np.array_equal(own, model.policy.parameters_to_vector())))
+        results.append(bool(np.array_equal(weights, model.policy.parameters_to_vector())))
     for episodes in (1, 2):
         env = Line(THREE, 3)
         small(lib, vec(lib, env), "ARS", n_delta=2, n_eval_episodes=episodes, policy_kwargs={}).learn(12 * episodes)
-        found.append(len(env.actions))
-    return found
+        results.append(len(env.actions))
+    return results
 
 
 def run_side(name: str, folder: Path, only: list[str]) -> None:
@@ -1619,7 +1641,7 @@ def run_side(name: str, folder: Path, only: list[str]) -> None:
     update_cases()
     lib = Library(name, folder)
     warnings.simplefilter("ignore")
-    found: dict[str, Any] = {}
+    results: dict[str, Any] = {}
     out = sys.stdout
     for key, (_, program) in CASES.items():
         if only and not any(word in key for word in only):
@@ -1629,13 +1651,13 @@ def run_side(name: str, folder: Path, only: list[str]) -> None:
             back = Path.cwd()
             os.chdir(here)
             try:
-                found[key] = json.loads(json.dumps(program(lib), default=lambda x: np.asarray(x).tolist()))
+                results[key] = json.loads(json.dumps(program(lib), default=lambda x: np.asarray(x).tolist()))
             except Exception as error:
-                found[key] = {"error": f"{type(error).__name__}: {error}"[:300]}
+                results[key] = {"error": f"{type(error).__name__}: {error}"[:300]}
             finally:
                 os.chdir(back)
         print(key, file=sys.stderr, flush=True)
-    print(json.dumps(found), file=out)
+    print(json.dumps(results), file=out)
 
 
 def differs(a: Any, b: Any) -> float:
@@ -1651,7 +1673,7 @@ def differs(a: Any, b: Any) -> float:
 
 
 def both(peer: str, only: list[str]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Returns what the cases returned in the original and in rejeu."""
+    """Returns the results of the cases in the original and in rejeu."""
     with tempfile.TemporaryDirectory() as folder:
         sides = []
         for name, python in (("original", peer), ("rejeu", sys.executable)):
@@ -1735,31 +1757,31 @@ def signatures(packages: dict[str, str]) -> Iterator[tuple[str, str, str]]:
         module = importlib.import_module(package)
         for info in pkgutil.walk_packages(module.__path__, f"{package}."):
             try:
-                found = vars(importlib.import_module(info.name))
+                members = vars(importlib.import_module(info.name))
             except ImportError:  # of something optional
                 continue
-            for key, one in found.items():
-                if not callable(one) or key.startswith("_") or getattr(one, "__module__", "") != info.name:
+            for key, member in members.items():
+                if not callable(member) or key.startswith("_") or getattr(member, "__module__", "") != info.name:
                     continue
                 try:
-                    given = inspect.signature(one).parameters.values()
+                    parameters = inspect.signature(member).parameters.values()
                 except (TypeError, ValueError):
                     continue
-                for argument in given:
+                for argument in parameters:
                     if argument.kind not in (argument.VAR_POSITIONAL, argument.VAR_KEYWORD):
                         yield info.name, key, argument.name
 
 
 def compared(rows: list[dict[str, Any]]) -> dict[str, list[str]]:
     """Returns the results of the cases that compare each ``Class.argument``."""
-    found: dict[str, list[str]] = {}
+    results: dict[str, list[str]] = {}
     for row in rows:
-        for part in row["settings"].split():
-            owner, _, names = part.partition(".")
+        for group in row["settings"].split():
+            owner, _, names = group.partition(".")
             for name in names.split(","):
-                found.setdefault(f"{owner}.{name}", []).append(row["result"])
-                found.setdefault(f"{owner}.{name.removeprefix('policy_kwargs.')}", []).append(row["result"])
-    return found
+                results.setdefault(f"{owner}.{name}", []).append(row["result"])
+                results.setdefault(f"{owner}.{name.removeprefix('policy_kwargs.')}", []).append(row["result"])
+    return results
 
 
 ON_POLICY = ("A2C", "PPO", "TRPO", "ARS", "RecurrentPPO", "MaskablePPO", "OnPolicyAlgorithm", "ActorCritic", "ars")
@@ -1772,66 +1794,80 @@ def definition_of(module: str, owner: str, argument: str) -> str | None:
     The settings of algorithms are the fields of their configurations, each of which one class defines, or arguments of all
     agents; those of policies, that all go to ``policy_kwargs``, are the same for algorithms with replay and for those without.
     """
-    package, _, rest = module.partition(".")
-    kind = "on policy" if any(part in f"{rest}.{owner}" for part in ON_POLICY) else "off policy"
+    package, _, path = module.partition(".")
+    family = "on policy" if any(word in f"{path}.{owner}" for word in ON_POLICY) else "off policy"
     if owner.endswith("Algorithm"):
-        return f"{kind}, any {argument}"
+        return f"{family}, any {argument}"
     try:
-        found = getattr(importlib.import_module(f"{PACKAGES[package]}.{rest}".rstrip(".")), owner)
+        definition = getattr(importlib.import_module(f"{PACKAGES[package]}.{path}".rstrip(".")), owner)
     except (ImportError, AttributeError):
         return None
     from rejeu.algorithms.config import OffPolicyConfig
     from rejeu.sb3 import algorithms, arguments, policy
 
-    if isinstance(found, str):  # of a policy
-        return f"{kind}, policy_kwargs.{argument}"
-    if isinstance(found, type) and issubclass(found, algorithms.Original):
-        config = found.algorithm.Config
-        kind = "off policy" if issubclass(config, OffPolicyConfig) else "on policy"
-        places = [one for one in config.__mro__ if argument in vars(one).get("__annotations__", {})]
+    if isinstance(definition, str):  # of a policy
+        return f"{family}, policy_kwargs.{argument}"
+    if isinstance(definition, type) and issubclass(definition, algorithms.Original):
+        config = definition.algorithm.Config
+        family = "off policy" if issubclass(config, OffPolicyConfig) else "on policy"
+        places = [base for base in config.__mro__ if argument in vars(base).get("__annotations__", {})]
         if places:
-            place = places[-1].__module__.rpartition("rejeu.algorithms.")[2]
-            return f"{kind}, {'any' if place.endswith('config') else place} {argument}"
-        known = {*algorithms.AGENT_ARGUMENTS, *arguments.WITHOUT_EFFECT, "use_sde", "sde_sample_freq"}
-        return f"{kind}, {'any ' if argument in known else 'policy_kwargs.'}{argument}"
-    if isinstance(found, type) and issubclass(found, policy.BaseModel):
-        own = {
+            module_name = places[-1].__module__.rpartition("rejeu.algorithms.")[2]
+            return f"{family}, {'any' if module_name.endswith('config') else module_name} {argument}"
+        shared_arguments = {*algorithms.AGENT_ARGUMENTS, *arguments.WITHOUT_EFFECT, "use_sde", "sde_sample_freq"}
+        return f"{family}, {'any ' if argument in shared_arguments else 'policy_kwargs.'}{argument}"
+    if isinstance(definition, type) and issubclass(definition, policy.BaseModel):
+        prefixes = {
             "n_critics": "any ",
             "use_sde": "any ",
-            "n_quantiles": f"{rest.partition('.')[0]} ",
+            "n_quantiles": f"{path.partition('.')[0]} ",
         }  # not of policy_kwargs
-        return f"{kind}, {own.get(argument, 'policy_kwargs.')}{argument}"
-    if isinstance(found, type):
-        if issubclass(found, tuple):
-            return f"{found.__mro__[-3].__qualname__}.{argument}"
-        found = next((vars(one)["__init__"] for one in found.__mro__ if "__init__" in vars(one)), found)
-    names = inspect.signature(found).parameters
-    takes = argument in names or any(one.kind in (one.VAR_KEYWORD, one.VAR_POSITIONAL) for one in names.values())
-    return f"{getattr(found, '__module__', '')}.{getattr(found, '__qualname__', found)}.{argument}" if takes else None
+        return f"{family}, {prefixes.get(argument, 'policy_kwargs.')}{argument}"
+    if isinstance(definition, type):
+        if issubclass(definition, tuple):
+            return f"{definition.__mro__[-3].__qualname__}.{argument}"
+        definition = next(
+            (vars(base)["__init__"] for base in definition.__mro__ if "__init__" in vars(base)), definition
+        )
+    names = inspect.signature(definition).parameters
+    takes = argument in names or any(
+        parameter.kind in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL) for parameter in names.values()
+    )
+    return (
+        f"{getattr(definition, '__module__', '')}.{getattr(definition, '__qualname__', definition)}.{argument}"
+        if takes
+        else None
+    )
 
 
 def states_of(settings: list[tuple[str, str, str]], results: dict[str, list[str]]) -> list[str]:
-    """Returns what is known of each setting: compared itself, or by another one that the same code of ours takes.
+    """Returns the state of each setting: compared itself, or by another one that the same code of ours takes.
 
     Where that differs with one algorithm and is equal with another, the difference is not of this setting.
     """
-    codes = [definition_of(*one) for one in settings]
+    codes = [definition_of(*setting) for setting in settings]
     by_code: dict[str, set[str]] = {}
     modules = {owner: module for module, owner, _ in settings}
-    for key, found in results.items():
+    for key, outcomes in results.items():
         owner, _, argument = key.partition(".")
         if owner in modules and (code := definition_of(modules[owner], owner, argument)) is not None:
-            by_code.setdefault(code, set()).add("equal" if {*found} == {"equal"} else "different")
+            by_code.setdefault(code, set()).add("equal" if {*outcomes} == {"equal"} else "different")
     states = []
     for code, (module, owner, argument) in zip(codes, settings, strict=True):
-        found = {*results.get(f"{owner}.{argument}", ())}
-        places = [code] if owner != "BaseAlgorithm" else [f"{kind} policy, any {argument}" for kind in ("on", "off")]
-        same = {one for place in places for one in by_code.get(place, ())} if code is not None else set()
-        if found:
-            states.append("equal" if found == {"equal"} else "different")
+        outcomes = {*results.get(f"{owner}.{argument}", ())}
+        places = (
+            [code] if owner != "BaseAlgorithm" else [f"{family} policy, any {argument}" for family in ("on", "off")]
+        )
+        same = (
+            {result for place_code in places for result in by_code.get(place_code, ())} if code is not None else set()
+        )
+        if outcomes:
+            states.append("equal" if outcomes == {"equal"} else "different")
         elif same:
             states.append(f"{'equal' if 'equal' in same else 'different'}: by the same code")
-        elif reason := next((text for part, text in REASONS.items() if part in f"{module}.{owner}.{argument}"), ""):
+        elif reason := next(
+            (text for pattern, text in REASONS.items() if pattern in f"{module}.{owner}.{argument}"), ""
+        ):
             states.append(f"not comparable: {reason}")
         elif argument in NOT_COMPARABLE:
             states.append(f"not comparable: {NOT_COMPARABLE[argument]}")
@@ -1840,12 +1876,12 @@ def states_of(settings: list[tuple[str, str, str]], results: dict[str, list[str]
     return states
 
 
-def result_row(name: str, original: Any, own: Any) -> dict[str, Any]:
-    """Returns what a case found."""
-    gap = differs(original, own)
+def result_row(name: str, original: Any, ours: Any) -> dict[str, Any]:
+    """Returns the row of a case in the file of results."""
+    gap = differs(original, ours)
     same = gap <= TOLERANCES.get(name, TOLERANCE)
-    reason = "" if same else next((text for part, text in DIFFERENT.items() if part in name), "not explained yet")
-    errors = [side["error"] for side in (original, own) if isinstance(side, dict) and "error" in side]
+    reason = "" if same else next((text for pattern, text in DIFFERENT.items() if pattern in name), "not explained yet")
+    errors = [side["error"] for side in (original, ours) if isinstance(side, dict) and "error" in side]
     row = {"case": name, "settings": CASES[name][0], "result": "equal" if same else "different", "commit": commit()}
     return {
         **row,
@@ -1854,10 +1890,12 @@ def result_row(name: str, original: Any, own: Any) -> dict[str, Any]:
     }
 
 
-def report(peer: str, original: dict[str, Any], own: dict[str, Any], kept: list[dict[str, Any]]) -> dict[str, Any]:
+def report(
+    peer: str, original: dict[str, Any], ours: dict[str, Any], recorded_rows: list[dict[str, Any]]
+) -> dict[str, Any]:
     """Returns the content of the file of results, with the rows of cases that did not run now."""
-    earlier = {row["case"]: row for row in kept if row["case"] in CASES and row["case"] not in original}
-    rows = [result_row(name, original[name], own[name]) for name in original]
+    earlier = {row["case"]: row for row in recorded_rows if row["case"] in CASES and row["case"] not in original}
+    rows = [result_row(name, original[name], ours[name]) for name in original]
     rows = [
         earlier.get(name) or next(row for row in rows if row["case"] == name)
         for name in CASES
@@ -1871,13 +1909,13 @@ def report(peer: str, original: dict[str, Any], own: dict[str, Any], kept: list[
         for (_, owner, argument), state in zip(every_one, states_of(every_one, results), strict=True)
     ]
     by_state: dict[str, list[str]] = {}
-    for one in settings:
-        by_state.setdefault(one["state"], []).append(one["setting"])
+    for setting in settings:
+        by_state.setdefault(setting["state"], []).append(setting["setting"])
     every = {state: " ".join(names) for state, names in sorted(by_state.items())}
-    counts = Counter(one["state"].partition(":")[0] for one in settings)
+    counts = Counter(setting["state"].partition(":")[0] for setting in settings)
     cases = Counter(row["result"] for row in rows)
     return {
-        **provenance({one: "PATH" if one == peer else "FILE" for one in sys.argv[1:] if one[:2] != "--"}),
+        **provenance({word: "PATH" if word == peer else "FILE" for word in sys.argv[1:] if word[:2] != "--"}),
         "settings": dict(counts),
         "cases": dict(cases),
         "all": every,
@@ -1903,19 +1941,19 @@ def main() -> None:
         run_side(options.side, options.folder, options.only)
         return
     original: dict[str, Any] = {}
-    own: dict[str, Any] = {}
+    ours: dict[str, Any] = {}
     if options.raw:
         update_cases()
         for path in options.raw:
-            for all_of, some in zip((original, own), json.loads(path.read_text()), strict=True):
+            for all_of, some in zip((original, ours), json.loads(path.read_text()), strict=True):
                 all_of.update(some)
     else:
         update_cases()
-        original, own = both(options.peer, options.only)
+        original, ours = both(options.peer, options.only)
     if options.keep:
-        options.keep.write_text(json.dumps([original, own]))
-    kept = json.loads(RESULTS.read_text())["rows"] if options.join else []
-    content = report(options.peer, original, own, kept)
+        options.keep.write_text(json.dumps([original, ours]))
+    recorded_rows = json.loads(RESULTS.read_text())["rows"] if options.join else []
+    content = report(options.peer, original, ours, recorded_rows)
     for row in content["rows"]:
         print(f"{row['case']:45} {row['result']:10} {row['difference']} {row['why'][:150]}")
     print(content["settings"], content["cases"])

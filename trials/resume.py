@@ -54,10 +54,12 @@ def facts(agent: Any) -> dict[str, Any]:
     return {**agent.get_parameters(), **buffer, "history": rows, "counters": counters}
 
 
-def same(one: dict[str, Any], two: dict[str, Any]) -> bool:
+def same(first: dict[str, Any], second: dict[str, Any]) -> bool:
     import numpy as np
 
-    return one.keys() == two.keys() and all(np.array_equal(one[key], two[key], equal_nan=True) for key in one)
+    return first.keys() == second.keys() and all(
+        np.array_equal(first[key], second[key], equal_nan=True) for key in first
+    )
 
 
 class Rows:
@@ -100,16 +102,16 @@ def try_case(algorithm: str, env_id: str, n_envs: int, backend: str, cut: int) -
     from rejeu.callbacks import Checkpoint
     from tests.sharing import shared_learners
 
-    made = make(algorithm, env_id, n_envs, backend)
+    make_agent = make(algorithm, env_id, n_envs, backend)
     whole_rows, first, second = Rows(), Rows(), Rows()
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings(), shared_learners():
         warnings.simplefilter("ignore", UserWarning)
         stop = lambda agent, turn: turn.step < cut  # noqa: E731
-        broken = made().learn(STEPS, [stop, Checkpoint(folder, every=300)], log_interval=1, sinks=[first])
+        broken = make_agent().learn(STEPS, [stop, Checkpoint(folder, every=300)], log_interval=1, sinks=[first])
         again = rejeu.AGENTS[algorithm].resume(folder, vector(env_id, n_envs, backend))
         exact, equal_at_break = again.resumed.exact, same(facts(again), facts(broken))
         again.learn(sinks=[second])
-        whole = made().learn(STEPS, log_interval=1, sinks=[whole_rows]) if exact else None
+        whole = make_agent().learn(STEPS, log_interval=1, sinks=[whole_rows]) if exact else None
     result = {"algorithm": algorithm, "env": env_id, "n_envs": n_envs, "backend": backend, "cut": broken.num_timesteps}
     result |= {"exact": exact, "equal_at_the_break": equal_at_break, "steps": again.num_timesteps}
     if whole is not None:
@@ -122,7 +124,7 @@ def cases() -> list[tuple[str, str, int, str]]:
 
     import rejeu  # noqa: F401 - it registers the ball
 
-    found = []
+    gymnasium_cases = []
     for algorithm, env_ids in ALGORITHMS.items():
         for i, env_id in enumerate(env_ids):
             try:
@@ -130,8 +132,8 @@ def cases() -> list[tuple[str, str, int, str]]:
             except (gym.error.Error, ImportError) as error:
                 print(f"{env_id} is passed over: {error}")
                 continue
-            found.append((algorithm, env_id, 1 if i % 2 else 2, "gymnasium"))
-    return found + [(algorithm, env_id, 1, backend) for env_id, (algorithm, backend) in NOT_CARRIED.items()]
+            gymnasium_cases.append((algorithm, env_id, 1 if i % 2 else 2, "gymnasium"))
+    return gymnasium_cases + [(algorithm, env_id, 1, backend) for env_id, (algorithm, backend) in NOT_CARRIED.items()]
 
 
 def main() -> None:

@@ -96,10 +96,10 @@ def blocks_of(checkouts: list[Path]) -> dict[str, list[str]]:
     for checkout in checkouts:
         where = "contrib/" if (checkout / "sb3_contrib").is_dir() else ""
         for path in sorted(
-            page for kind in ("guide", "modules", "common") for page in checkout.glob(f"docs/{kind}/*.md")
+            page for section in ("guide", "modules", "common") for page in checkout.glob(f"docs/{section}/*.md")
         ):
-            found = [match[2] for match in FENCE.finditer(path.read_text(encoding="utf-8"))]
-            pages[f"{where}{path.parent.name}/{path.stem}"] = [dedented(code) for code in found]
+            blocks = [match[2] for match in FENCE.finditer(path.read_text(encoding="utf-8"))]
+            pages[f"{where}{path.parent.name}/{path.stem}"] = [dedented(code) for code in blocks]
     return pages
 
 
@@ -110,7 +110,7 @@ def dedented(code: str) -> str:
 
 
 def run(code: str, library: str, python: str, packages: list[str], limit: float) -> dict[str, Any]:
-    """Returns the error of code, None if it ran, and what it left."""
+    """Returns the error of code, None if it ran, and the names and files that it left."""
     for old, new in (*CHANGES, *(IMPORTS if library == "rejeu" else ())):
         code = re.sub(old, new, code)
     paths = [*([str(ROOT / "src")] if library == "rejeu" else []), *packages]
@@ -123,22 +123,24 @@ def run(code: str, library: str, python: str, packages: list[str], limit: float)
     }
     variables |= {"PYTHONPATH": os.pathsep.join(paths), "WANDB_MODE": "disabled", "PYTHONWARNINGS": "ignore"}
     with tempfile.TemporaryDirectory() as folder:
-        left, place = Path(folder, "left.json"), Path(folder, "place")
-        place.mkdir()
+        names_file, working_folder = Path(folder, "left.json"), Path(folder, "place")
+        working_folder.mkdir()
         script = Path(folder, "block.py")
-        text = BEFORE.format(caps=CAPS[library]) + code + AFTER.format(path=str(left))
+        text = BEFORE.format(caps=CAPS[library]) + code + AFTER.format(path=str(names_file))
         script.write_text(text, encoding="utf-8")
         try:
             done = subprocess.run(
-                [python, str(script)], cwd=place, env=os.environ | variables, capture_output=True, text=True,
+                [python, str(script)], cwd=working_folder, env=os.environ | variables, capture_output=True, text=True,
                 timeout=limit, check=False, stdin=subprocess.DEVNULL,
             )  # fmt: skip
         except subprocess.TimeoutExpired:
             return {"error": f"takes more than {limit:.0f} s", "names": {}, "files": []}
         lines = [line for line in done.stderr.strip().splitlines() if re.match(ERROR, line)]
         error = None if not done.returncode else (lines or done.stderr.strip().splitlines() or ["no message"])[-1]
-        files = sorted({file_kind(path.relative_to(place)) for path in place.rglob("*") if path.is_file()})
-        names = json.loads(left.read_text(encoding="utf-8")) if left.is_file() else {}
+        files = sorted(
+            {file_kind(path.relative_to(working_folder)) for path in working_folder.rglob("*") if path.is_file()}
+        )
+        names = json.loads(names_file.read_text(encoding="utf-8")) if names_file.is_file() else {}
     return {"error": error, "names": names, "files": files}
 
 
@@ -152,13 +154,13 @@ def class_of(error: str | None) -> str:
     return (error or "").partition(":")[0].rpartition(".")[2]
 
 
-def differences(original: dict[str, Any], own: dict[str, Any]) -> list[str]:
-    """Returns what two runs left that differs, or their errors."""
-    if class_of(original["error"]) != class_of(own["error"]):
-        return [f"{original['error'] or 'ran'} -> {own['error'] or 'ran'}"]
-    first, second = original["names"], own["names"]
+def differences(original: dict[str, Any], ours: dict[str, Any]) -> list[str]:
+    """Returns the differences between the names and files that two runs left, or their errors."""
+    if class_of(original["error"]) != class_of(ours["error"]):
+        return [f"{original['error'] or 'ran'} -> {ours['error'] or 'ran'}"]
+    first, second = original["names"], ours["names"]
     names = [name for name in sorted({*first, *second}) if first.get(name) != second.get(name)]
-    files = sorted({*original["files"]} ^ {*own["files"]})
+    files = sorted({*original["files"]} ^ {*ours["files"]})
     return [f"{name}: {first.get(name)} -> {second.get(name)}" for name in names] + [f"file {name}" for name in files]
 
 
@@ -196,8 +198,10 @@ def main() -> None:
             if row["original"]["error"] is None:
                 ran.append(block)
             if re.search(arguments.only, name):
-                own = row["rejeu"]["error"] or "ran" if "rejeu" in row else "-"
-                print(f"{name} | {row['original']['error'] or 'ran'} | {own} | {row.get('differs', '')}", flush=True)
+                outcome = row["rejeu"]["error"] or "ran" if "rejeu" in row else "-"
+                print(
+                    f"{name} | {row['original']['error'] or 'ran'} | {outcome} | {row.get('differs', '')}", flush=True
+                )
                 record([*rows.values()], arguments)
 
 

@@ -1,4 +1,4 @@
-"""Trains small agents with Stable-Baselines3 and its Contrib package, and compares what they do after rejeu has read them.
+"""Trains small agents with Stable-Baselines3 and its Contrib package, and compares their outputs after rejeu has read them.
 
 The two parts run in the environments of the two libraries::
 
@@ -14,7 +14,6 @@ deterministic actions, the values, and the log-probabilities of sampled actions.
 
 from __future__ import annotations
 
-import json
 import sys
 import time
 import warnings
@@ -30,8 +29,8 @@ RESULTS = Path(__file__).parent / "results" / "sb3_models.json"
 """What ``compare`` found: the largest differences of each algorithm, and of each version of Stable-Baselines3 and agent."""
 
 
-def make_env(kind: str) -> Any:
-    """Returns an environment with random observations of that kind: ``obs/action``."""
+def make_env(space_names: str) -> Any:
+    """Returns an environment with random observations; the names of its spaces are ``observation/action``."""
     if sys.modules.get("stable_baselines3") and sys.modules["stable_baselines3"].__version__ < "2":
         import gym
     else:
@@ -63,7 +62,7 @@ def make_env(kind: str) -> Any:
         """Random observations; the reward is that of small actions."""
 
         def __init__(self) -> None:
-            name, _, act = kind.partition("/")
+            name, _, act = space_names.partition("/")
             self.observation_space, self.action_space = observation[name], action[act]
             self.t = 0
 
@@ -85,7 +84,7 @@ def make_env(kind: str) -> Any:
             return -np.linalg.norm(np.asarray(achieved) - np.asarray(desired), axis=-1)
 
         def action_masks(self) -> np.ndarray:
-            n = {"discrete": 4, "multi": 5}.get(kind.partition("/")[2], 3)
+            n = {"discrete": 4, "multi": 5}.get(space_names.partition("/")[2], 3)
             mask = np.random.default_rng(self.t).random(n) < 0.6
             mask[[0, 3] if n == 5 else [0]] = True
             return mask
@@ -161,24 +160,24 @@ AGENTS: dict[str, tuple[str, str, dict[str, Any]]] = {
 
 
 def make(folder: Path, only: tuple[str, ...]) -> None:
-    """Trains the agents and writes what they do."""
+    """Trains the agents and records their actions and values."""
     import stable_baselines3
     import torch
 
     print("stable-baselines3", stable_baselines3.__version__)
     folder.mkdir(parents=True, exist_ok=True)
-    for name, (algorithm, kind, settings) in AGENTS.items():
+    for name, (algorithm, space_names, settings) in AGENTS.items():
         if only and name not in only:
             continue
         np.random.seed(0)  # noqa: NPY002 - of the spaces of old versions
         torch.manual_seed(0)
         try:
-            make_one(folder / name, algorithm, kind, dict(settings))
+            make_one(folder / name, algorithm, space_names, dict(settings))
         except (AttributeError, ImportError, TypeError, ValueError, AssertionError) as error:
             print(name, "is not possible in this version:", str(error)[:100])
 
 
-def make_one(path: Path, algorithm: str, kind: str, settings: dict[str, Any]) -> None:
+def make_one(path: Path, algorithm: str, space_names: str, settings: dict[str, Any]) -> None:
     """Trains one agent and writes its files."""
     import torch
     from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
@@ -192,11 +191,11 @@ def make_one(path: Path, algorithm: str, kind: str, settings: dict[str, Any]) ->
         from stable_baselines3 import HerReplayBuffer
 
         settings["replay_buffer_class"] = HerReplayBuffer
-    env: Any = DummyVecEnv([lambda: make_env(kind)])
+    env: Any = DummyVecEnv([lambda: make_env(space_names)])
     if settings.pop("normalize", False):
         env = VecNormalize(env, clip_obs=5.0)
     names = {"cnn": "CnnPolicy", "mlp": "MlpPolicy", "choice": "MlpPolicy"}
-    policy = names.get(kind.partition("/")[0], "MultiInputPolicy")
+    policy = names.get(space_names.partition("/")[0], "MultiInputPolicy")
     if algorithm == "RecurrentPPO":
         policy = policy.replace("Policy", "LstmPolicy")
     model = cls(policy, env, policy_kwargs=shape, device="cpu", seed=0, **settings)
@@ -204,39 +203,39 @@ def make_one(path: Path, algorithm: str, kind: str, settings: dict[str, Any]) ->
     model.save(str(path))
     if isinstance(env, VecNormalize):
         env.save(f"{path}.pkl")
-    record = recorded(model, algorithm, kind, env if isinstance(env, VecNormalize) else None)
+    record = recorded(model, algorithm, space_names, env if isinstance(env, VecNormalize) else None)
     if algorithm in ("DQN", "DDPG"):
         record |= updated(model)
     np.savez_compressed(f"{path}.npz", **record)
     print(path.name, "written")
 
 
-def recorded(model: Any, algorithm: str, kind: str, scaler: Any) -> dict[str, np.ndarray]:
-    """Returns observations and what the agent does with them."""
+def recorded(model: Any, algorithm: str, space_names: str, scaler: Any) -> dict[str, np.ndarray]:
+    """Returns observations with the actions, values and log-probabilities of the agent."""
     import torch
 
-    space = make_env(kind).observation_space
+    space = make_env(space_names).observation_space
     space.seed(1)
     samples = [space.sample() for _ in range(N)]
     flat = isinstance(samples[0], dict)
-    obs = {key: np.stack([one[key] for one in samples]) for key in samples[0]} if flat else np.stack(samples)
-    seen = obs if scaler is None else scaler.normalize_obs(obs)
+    obs = {key: np.stack([sample[key] for sample in samples]) for key in samples[0]} if flat else np.stack(samples)
+    policy_obs = obs if scaler is None else scaler.normalize_obs(obs)
     if flat:
-        seen = {key: x.transpose(0, 3, 1, 2) if x.ndim == 4 else x for key, x in seen.items()}
-    elif seen.ndim == 4:
-        seen = seen.transpose(0, 3, 1, 2)
+        policy_obs = {key: x.transpose(0, 3, 1, 2) if x.ndim == 4 else x for key, x in policy_obs.items()}
+    elif policy_obs.ndim == 4:
+        policy_obs = policy_obs.transpose(0, 3, 1, 2)
     result = {f"obs.{key}": value for key, value in obs.items()} if flat else {"obs": obs}
     policy = model.policy
     policy.set_training_mode(False)
-    tensor = policy.obs_to_tensor(seen)[0]
-    one = lambda i: {key: x[i : i + 1] for key, x in seen.items()} if flat else seen[i : i + 1]  # noqa: E731
+    tensor = policy.obs_to_tensor(policy_obs)[0]
+    row_of = lambda i: {key: x[i : i + 1] for key, x in policy_obs.items()} if flat else policy_obs[i : i + 1]  # noqa: E731
     with torch.no_grad():
         if algorithm == "RecurrentPPO":
             starts = np.arange(N) % 50 == 0
             state, actions, values, log_probs, sampled = None, [], [], [], []
             for i in range(N):
                 begin = torch.as_tensor(starts[i : i + 1]).float()
-                now = policy.obs_to_tensor(one(i))[0]
+                now = policy.obs_to_tensor(row_of(i))[0]
                 memory = policy_memory(policy, state)
                 distribution, _ = policy.get_distribution(now, memory[0], begin)
                 value = policy.predict_values(now, memory[1], begin)
@@ -252,11 +251,11 @@ def recorded(model: Any, algorithm: str, kind: str, scaler: Any) -> dict[str, np
         masks = None
         if algorithm == "MaskablePPO":
             rng = np.random.default_rng(2)
-            masks = rng.random((N, 4 if "discrete" in kind else 5)) < 0.6
-            masks[:, [0] if "discrete" in kind else [0, 3]] = True
+            masks = rng.random((N, 4 if "discrete" in space_names else 5)) < 0.6
+            masks[:, [0] if "discrete" in space_names else [0, 3]] = True
             result["masks"] = masks
         extra = {} if masks is None else {"action_masks": masks}
-        result["actions"] = model.predict(seen, deterministic=True, **extra)[0]
+        result["actions"] = model.predict(policy_obs, deterministic=True, **extra)[0]
         if algorithm in ("PPO", "A2C", "TRPO", "MaskablePPO"):
             if model.use_sde:
                 policy.reset_noise(N)
@@ -324,13 +323,13 @@ def RNN(memory: Any) -> Any:  # noqa: N802
 def compare(folder: Path, only: tuple[str, ...]) -> None:
     """Prints the largest differences of each agent, and adds them to ``RESULTS``."""
     sys.path.insert(0, str(Path(__file__).parents[1]))
-    from provenance import provenance, write
+    from provenance import provenance, read, write
 
     from tests.sb3_models import difference_from, loaded
 
     print(f"{'agent':20} {'actions':>9} {'values':>9} {'log-probs':>9}  optimizer, notes")
     worst, refused = 0.0, 0
-    results = json.loads(RESULTS.read_text())["agents"] if RESULTS.exists() else {}
+    results = read(RESULTS).get("agents", {})
     for path in sorted(folder.glob("*.npz")):
         if only and path.stem not in only:
             continue
@@ -340,15 +339,15 @@ def compare(folder: Path, only: tuple[str, ...]) -> None:
         result = results.setdefault(version, {})
         try:
             agent = loaded(path.with_suffix(""))
-            found = difference_from(agent, dict(np.load(path)))
+            differences = difference_from(agent, dict(np.load(path)))
         except ValueError as error:
             refused += 1
             result[path.stem] = {"refused": str(error).rpartition("Stable-Baselines3: ")[2]}
             print(f"{path.stem:20} refused: {error}")
             continue
-        worst = max(worst, *found.values())
-        result[path.stem] = {key: float(f"{value:.1e}") for key, value in found.items()} | {"notes": agent.notes}
-        shown = " ".join(f"{found.get(key, float('nan')):9.1e}" for key in ("actions", "values", "log_probs"))
+        worst = max(worst, *differences.values())
+        result[path.stem] = {key: float(f"{value:.1e}") for key, value in differences.items()} | {"notes": agent.notes}
+        shown = " ".join(f"{differences.get(key, float('nan')):9.1e}" for key in ("actions", "values", "log_probs"))
         steps = f"{agent.num_timesteps} steps, {agent.n_updates} updates"
         print(
             f"{path.stem:20} {shown}  {steps}, {time.perf_counter() - began:.1f} s; {'; '.join(agent.notes)}",
@@ -362,8 +361,8 @@ def compare(folder: Path, only: tuple[str, ...]) -> None:
 def by_algorithm(results: dict[str, Any]) -> dict[str, Any]:
     """Returns the number of files of each algorithm, and the largest differences among them."""
     largest: dict[str, Any] = {}
-    for found in results.values():
-        for name, differences in found.items():
+    for agents in results.values():
+        for name, differences in agents.items():
             row = largest.setdefault(AGENTS[name][0], {"files": 0, "actions": 0.0, "values": 0.0})
             row["files"] += 1
             for key in differences.keys() & {"actions", "values", "log_probs"}:

@@ -36,7 +36,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from provenance import commit, provenance, write
+from provenance import commit, provenance, read, write
 
 RESULTS = Path(__file__).parent / "results" / "sb3_suite.json"
 SOURCES = Path(__file__).resolve().parents[1] / "src"
@@ -59,7 +59,9 @@ CONFTEST = "import sys\nsys.path += {packages!r}\n"
 
 def kind_of(failure: str) -> str:
     """Returns the kind of a failure: ``failure`` is its last source line and its error."""
-    return next((kind for kind, pattern in KINDS if re.search(pattern, failure, re.MULTILINE)), "difference")
+    return next(
+        (failure_kind for failure_kind, pattern in KINDS if re.search(pattern, failure, re.MULTILINE)), "difference"
+    )
 
 
 def essence(node: ET.Element) -> str:
@@ -103,16 +105,16 @@ def run_file(folder: Path, name: str, limit: float, log: Path | None, n_tests: i
     if failed and not counts["passed"] and len(failed) == 1:  # an import, or the file's time
         counts["failed"], failed = n_tests, [["every test", failed[0][1]]]
     numbers = {outcome: counts[outcome] for outcome in ("passed", "failed", "skipped")}
-    kinds = Counter(kind for _, kind in failed)
+    failure_kinds = Counter(failure_kind for _, failure_kind in failed)
     if failed and failed[0][0] == "every test":
-        kinds[failed[0][1]] = n_tests
-    return {"file": name, **numbers, "kinds": kinds, "failures": failed}
+        failure_kinds[failed[0][1]] = n_tests
+    return {"file": name, **numbers, "kinds": failure_kinds, "failures": failed}
 
 
 def total_of(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Returns the sums over files."""
-    kinds = sum((Counter(row["kinds"]) for row in rows), Counter())
-    return {key: sum(row[key] for row in rows) for key in ("passed", "failed", "skipped")} | {"kinds": kinds}
+    failure_kinds = sum((Counter(row["kinds"]) for row in rows), Counter())
+    return {key: sum(row[key] for row in rows) for key in ("passed", "failed", "skipped")} | {"kinds": failure_kinds}
 
 
 def main() -> None:
@@ -128,7 +130,7 @@ def main() -> None:
     arguments = parser.parse_args()
     if arguments.log:
         arguments.log.mkdir(parents=True, exist_ok=True)
-    earlier = json.loads(arguments.output.read_text(encoding="utf-8")) if arguments.output.is_file() else {}
+    earlier = read(arguments.output)
     original = earlier.get("original", [])
     tests = {row["file"]: row["passed"] + row["failed"] for row in original}
     joined = [row for path in arguments.join for row in json.loads(path.read_text(encoding="utf-8"))["files"]]
@@ -166,8 +168,8 @@ def record(rows: list[dict[str, Any]], earlier: dict[str, Any], arguments: argpa
         counted = [{key: row[key] for key in ("file", "passed", "failed", "skipped")} for row in rows]
         content = {**earlier, "original": counted, "files": earlier.get("files", [])}
     else:
-        kept = [row for row in earlier.get("files", []) if row["file"] not in {row["file"] for row in rows}]
-        files = sorted(kept + rows, key=lambda row: str(row["file"]))
+        other_files = [row for row in earlier.get("files", []) if row["file"] not in {row["file"] for row in rows}]
+        files = sorted(other_files + rows, key=lambda row: str(row["file"]))
         original = earlier.get("original", [])
         content = {**provenance(names), "total": total_of(files), "original": original, "files": files}
     write(arguments.output, content, rows="files")

@@ -114,8 +114,8 @@ def start(words: list[str], log: Path) -> subprocess.Popen[bytes]:
 
 def processes(folder: Path) -> list[tuple[int, int, str]]:
     """Returns id, parent and run of the processes that train in a folder."""
-    found = subprocess.run(["ps", "-eo", "pid=,ppid=,args="], capture_output=True, text=True, check=True).stdout
-    rows = [line.split(None, 2) for line in found.splitlines()]
+    listing = subprocess.run(["ps", "-eo", "pid=,ppid=,args="], capture_output=True, text=True, check=True).stdout
+    rows = [line.split(None, 2) for line in listing.splitlines()]
     rows = [row for row in rows if len(row) == 3 and "-m rejeu" in row[2] and f"{folder}/" in row[2]]
     runs = [(int(pid), int(parent), run_of(args.rpartition(f"{folder}/")[2].split()[0])) for pid, parent, args in rows]
     return [row for row in runs if (folder / f"{row[2]}.log").is_file()]
@@ -148,24 +148,25 @@ def kill(pid: int) -> None:
 def disturb(
     sweep: subprocess.Popen[bytes], folder: Path, cluster: Cluster | None, rng: random.Random
 ) -> tuple[str, float | None] | None:
-    """Kills something; returns what, and the seconds of training that it costs its run. None if nothing trains."""
+    """Kills a process; returns the victim, and the seconds of training that it costs its run. None if nothing trains."""
     running = processes(folder)
     if not running or sweep.poll() is not None:
         return None
     pid, parent, name = rng.choice(running)
-    kind = rng.choices(["run", "worker", "node"] if cluster else ["run", "sweep"], [4, 3, 2] if cluster else [4, 1])[0]
+    weights = {"run": 4, "worker": 3, "node": 2} if cluster else {"run": 4, "sweep": 1}
+    victim = rng.choices([*weights], [*weights.values()])[0]
     lost = seconds_since_checkpoint(folder / name)
-    if kind == "run":
+    if victim == "run":
         kill(pid)
-        return kind, lost
-    if kind == "sweep":
+        return victim, lost
+    if victim == "sweep":
         kill(sweep.pid)
         sweep.wait()
-    elif kind == "worker":
+    elif victim == "worker":
         kill(parent)
     elif cluster is not None:
         cluster.replace_a_node(rng)
-    return kind, None
+    return victim, None
 
 
 def wait_for_end(folder: Path, seconds: float = 120.0) -> float:
@@ -181,24 +182,26 @@ def wait_for_end(folder: Path, seconds: float = 120.0) -> float:
 def models(folder: Path) -> dict[str, Any]:
     from safetensors.numpy import load_file
 
-    found = sorted(folder.rglob("agent.safetensors"))
-    return {str(path.parent.relative_to(folder)): load_file(path) for path in found}
+    paths = sorted(folder.rglob("agent.safetensors"))
+    return {str(path.parent.relative_to(folder)): load_file(path) for path in paths}
 
 
-def differing(one: dict[str, Any], other: dict[str, Any]) -> list[str]:
+def differing(expected: dict[str, Any], actual: dict[str, Any]) -> list[str]:
     """Returns the names of the models whose arrays are not the same bits."""
 
     def bits(arrays: dict[str, Any]) -> dict[str, tuple[Any, ...]]:
         return {key: (array.dtype, array.shape, array.tobytes()) for key, array in arrays.items()}
 
-    names = one.keys() | other.keys()
+    names = expected.keys() | actual.keys()
     return sorted(
-        name for name in names if name not in one or name not in other or bits(one[name]) != bits(other[name])
+        name
+        for name in names
+        if name not in expected or name not in actual or bits(expected[name]) != bits(actual[name])
     )
 
 
 def trial(
-    kind: str,
+    command_name: str,
     words: list[str],
     kills: int,
     pause: tuple[float, float],
@@ -207,17 +210,17 @@ def trial(
     cluster: Cluster | None,
     rng: random.Random,
 ) -> dict[str, Any]:
-    """Disturbs commands of a kind until there were so many kills."""
+    """Disturbs a command again and again until there were so many kills."""
     counts: Counter[str] = Counter()
     lost: list[float] = []
     ends: list[float] = []
     different: list[str] = []
     failed = rounds = 0
     options = ["--workers", "2"] + (["--ray", cluster.cluster.address] if cluster else [])
-    at_once = ["--jobs", "2"] if kind == "seeds" else options
+    at_once = ["--jobs", "2"] if command_name == "seeds" else options
     while counts.total() < kills:
         rounds += 1
-        folder, log = root / f"{kind}-{rounds}", root / "printed.log"
+        folder, log = root / f"{command_name}-{rounds}", root / "printed.log"
         sweep = start([*words, "--out", str(folder), *at_once], log)
         while sweep.poll() is None:
             time.sleep(rng.uniform(*pause))
@@ -228,7 +231,8 @@ def trial(
             counts[victim] += 1
             lost += [] if seconds is None else [seconds]
             print(
-                f"{kind}, kill {counts.total()}: {victim}" + (f", {seconds:.2f} s lost" if seconds is not None else ""),
+                f"{command_name}, kill {counts.total()}: {victim}"
+                + (f", {seconds:.2f} s lost" if seconds is not None else ""),
                 flush=True,
             )
             if victim == "sweep":
@@ -261,7 +265,7 @@ def main() -> None:
     parser.add_argument("--pause", type=float, nargs=2, default=PAUSE, help="least and most seconds between two kills")
     parser.add_argument("--out", type=Path, default=RESULT)
     arguments = parser.parse_args()
-    from provenance import provenance
+    from provenance import provenance, write
 
     rng = random.Random(arguments.seed)
     result: dict[str, Any] = {**provenance(), "checkpoint_interval_seconds": arguments.checkpoint_seconds}
@@ -271,21 +275,20 @@ def main() -> None:
         plan = root / "plan.toml"
         plan.write_text(PLAN.format(steps=arguments.steps, minutes=minutes), encoding="utf-8")
         values = {"plan": plan, "minutes": minutes, "steps": arguments.steps}
-        for kind in arguments.only:
-            words = [word.format(**values) for word in COMMANDS[kind]]
-            began, undisturbed = time.monotonic(), root / f"{kind}-undisturbed"
-            at_once = ["--jobs" if kind == "seeds" else "--workers", "2"]
+        for command_name in arguments.only:
+            words = [word.format(**values) for word in COMMANDS[command_name]]
+            began, undisturbed = time.monotonic(), root / f"{command_name}-undisturbed"
+            at_once = ["--jobs" if command_name == "seeds" else "--workers", "2"]
             command = start([*words, "--out", str(undisturbed), *at_once], root / "printed.log")
             if command.wait() != 0:
                 raise SystemExit((root / "printed.log").read_text(encoding="utf-8"))
-            known = models(undisturbed)
-            print(f"{kind}: {len(known)} runs took {time.monotonic() - began:.0f} s undisturbed", flush=True)
-            with new_cluster() if kind == "ray" else no_cluster() as cluster:
-                found = trial(kind, words, arguments.kills, arguments.pause, known, root, cluster, rng)
-            result["local" if kind == "sweep" else kind] = found
-            print(json.dumps(found, indent=1), flush=True)
-            arguments.out.parent.mkdir(parents=True, exist_ok=True)
-            arguments.out.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+            expected = models(undisturbed)
+            print(f"{command_name}: {len(expected)} runs took {time.monotonic() - began:.0f} s undisturbed", flush=True)
+            with new_cluster() if command_name == "ray" else no_cluster() as cluster:
+                kills = trial(command_name, words, arguments.kills, arguments.pause, expected, root, cluster, rng)
+            result["local" if command_name == "sweep" else command_name] = kills
+            print(json.dumps(kills, indent=1), flush=True)
+            write(arguments.out, result)
 
 
 if __name__ == "__main__":

@@ -90,18 +90,18 @@ def history() -> list[dict[str, np.ndarray]]:
     steps = []
     for _ in range(200):
         last, terminated = time + 1 == length, rng.random(ENVS) < 0.5
-        place = {"obs": 100 * episode + time, "next_obs": 100 * episode + time + 1, "goal": episode + 0.5}
+        numbers = {"obs": 100 * episode + time, "next_obs": 100 * episode + time + 1, "goal": episode + 0.5}
         ends = {"terminated": last & terminated, "truncated": last & ~terminated}
-        steps.append({**place, **ends, "action": rng.uniform(-1, 1, ENVS), "reward": rng.normal(size=ENVS)})
+        steps.append({**numbers, **ends, "action": rng.uniform(-1, 1, ENVS), "reward": rng.normal(size=ENVS)})
         episode, time = np.where(last, episode + ENVS, episode), np.where(last, 0, time + 1)
         length = np.where(last, rng.integers(1, 10, ENVS), length)
     return steps
 
 
-def goal_observation(place: np.ndarray, goal: np.ndarray) -> dict[str, np.ndarray]:
-    """Returns observations ``(n, 1)`` of places, with the goals that they achieve."""
-    parts = {"observation": place, "achieved_goal": -place, "desired_goal": goal}
-    return {key: part.astype(np.float32)[:, None] for key, part in parts.items()}
+def goal_observation(position: np.ndarray, goal: np.ndarray) -> dict[str, np.ndarray]:
+    """Returns observations ``(n, 1)`` of positions, with the goals that they achieve."""
+    parts = {"observation": position, "achieved_goal": -position, "desired_goal": goal}
+    return {key: values.astype(np.float32)[:, None] for key, values in parts.items()}
 
 
 def goal_space() -> Any:
@@ -122,10 +122,14 @@ HINDSIGHT, KEPT, DRAWS = ("future", "final", "episode"), 100, (100, 250)
 
 
 def table(*columns: Any) -> np.ndarray:
-    """Returns the rows of these arrays ``(n, 1)`` and observations, each once, in order; the first is the place."""
+    """Returns the rows of these arrays ``(n, 1)`` and observations, each once, in order; the first is the position."""
     keys = ("observation", "achieved_goal", "desired_goal")
-    parts = [part for one in columns for part in ([one[key] for key in keys] if isinstance(one, dict) else [one])]
-    return np.unique(np.concatenate([np.asarray(part, np.float32).reshape(-1, 1) for part in parts], axis=1), axis=0)
+    parts = [
+        array
+        for column in columns
+        for array in ([column[key] for key in keys] if isinstance(column, dict) else [column])
+    ]
+    return np.unique(np.concatenate([np.asarray(array, np.float32).reshape(-1, 1) for array in parts], axis=1), axis=0)
 
 
 # With Stable-Baselines3.
@@ -166,25 +170,25 @@ def record(folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for name, settings in (OFF | ON).items():
         torch.manual_seed(0)
-        kind = name.split(",")[0]
-        cls = getattr(sb3, kind, None) or getattr(sb3_contrib, kind)
+        algorithm_name = name.split(",")[0]
+        cls = getattr(sb3, algorithm_name, None) or getattr(sb3_contrib, algorithm_name)
         envs = DummyVecEnv([made_up(name)] * (1 if name in OFF else ENVS))
         shape: dict[str, Any] = {"net_arch": [5, 4]}
-        shape |= {"lstm_hidden_size": 6, "net_arch": [5]} if kind == "RecurrentPPO" else {}
-        shape |= {"n_quantiles": 7} if kind in ("QRDQN", "TQC") else {}
-        policy = "MlpLstmPolicy" if kind == "RecurrentPPO" else "MlpPolicy"
+        shape |= {"lstm_hidden_size": 6, "net_arch": [5]} if algorithm_name == "RecurrentPPO" else {}
+        shape |= {"n_quantiles": 7} if algorithm_name in ("QRDQN", "TQC") else {}
+        policy = "MlpLstmPolicy" if algorithm_name == "RecurrentPPO" else "MlpPolicy"
         model = cls(policy, envs, learning_rate=1e-2, gamma=0.9, seed=0, device="cpu", policy_kwargs=shape, **settings)
         model.set_logger(Logger(None, []))
         perturb(model, torch)
         model.save(folder / f"{name}.0.zip")
         data: dict[str, Any] = {}
-        if kind == "CrossQ":
+        if algorithm_name == "CrossQ":
             torch.Tensor.var = lambda self, dim=None: torch.var(self, dim, unbiased=False)
         for k in range(UPDATES):
-            found = (off_policy if name in OFF else on_policy)(model, kind, k, torch)
+            recorded = (off_policy if name in OFF else on_policy)(model, algorithm_name, k, torch)
             logged = {key.removeprefix("train/"): value for key, value in model.logger.name_to_value.items()}
-            found |= {key: np.float64(value) for key, value in logged.items() if key in LOSSES}
-            data |= {f"{k}.{key}": value for key, value in found.items()}
+            recorded |= {key: np.float64(value) for key, value in logged.items() if key in LOSSES}
+            data |= {f"{k}.{key}": value for key, value in recorded.items()}
             if k in (0, UPDATES - 1):
                 model.save(folder / f"{name}.{k + 1}.zip")
         np.savez_compressed(folder / f"{name}.npz", **data)
@@ -212,11 +216,11 @@ def perturb(model: Any, torch: Any) -> None:
             model.policy.log_std -= 0.7
 
 
-def off_policy(model: Any, kind: str, k: int, torch: Any) -> dict[str, Any]:
+def off_policy(model: Any, algorithm_name: str, k: int, torch: Any) -> dict[str, Any]:
     """Takes an update on a random batch, and returns the batch."""
     rng = np.random.default_rng(k)
     f32 = lambda *shape: rng.normal(size=shape).astype(np.float32)  # noqa: E731
-    is_box = kind in BOX
+    is_box = algorithm_name in BOX
     data = {
         "obs": 0.5 * f32(BATCH, OBS),
         "action": np.tanh(f32(BATCH, ACTIONS)) if is_box else rng.integers(CHOICES, size=BATCH),
@@ -226,8 +230,8 @@ def off_policy(model: Any, kind: str, k: int, torch: Any) -> dict[str, Any]:
         "actor_noise": f32(BATCH, ACTIONS),
         "target_noise": f32(BATCH, ACTIONS),
     }
-    order = ["target_noise", "actor_noise"] if kind == "CrossQ" else ["actor_noise", "target_noise"]
-    noises = iter([data[one] for one in order])
+    order = ["target_noise", "actor_noise"] if algorithm_name == "CrossQ" else ["actor_noise", "target_noise"]
+    noises = iter([data[noise_name] for noise_name in order])
     drawn = torch.distributions.normal._standard_normal, torch.Tensor.normal_
     torch.distributions.normal._standard_normal = lambda shape, dtype, device: torch.tensor(next(noises))
     torch.Tensor.normal_ = lambda self, mean=0.0, std=1.0: self.copy_(mean + std * torch.tensor(data["target_noise"]))
@@ -245,7 +249,7 @@ def off_policy(model: Any, kind: str, k: int, torch: Any) -> dict[str, Any]:
     return data
 
 
-def on_policy(model: Any, kind: str, k: int, torch: Any) -> dict[str, Any]:
+def on_policy(model: Any, algorithm_name: str, k: int, torch: Any) -> dict[str, Any]:
     """Collects a rollout, takes an update on it, and returns the rollout."""
     from stable_baselines3.common.callbacks import ConvertCallback
 
@@ -254,15 +258,17 @@ def on_policy(model: Any, kind: str, k: int, torch: Any) -> dict[str, Any]:
     callback = ConvertCallback(None)
     callback.init_callback(model)
     memory = getattr(model, "_last_lstm_states", None)
-    found = {}
+    recorded = {}
     if memory is not None:
         cells = [("pi", memory.pi), ("vf", memory.vf)]
-        found = {f"memory.{who}.{i}": part[0].numpy().copy() for who, both in cells for i, part in enumerate(both)}
+        recorded = {
+            f"memory.{who}.{i}": tensor[0].numpy().copy() for who, both in cells for i, tensor in enumerate(both)
+        }
     model.collect_rollouts(model.env, callback, model.rollout_buffer, model.n_steps)
     buffer = model.rollout_buffer
     starts = np.concatenate([buffer.episode_starts, model._last_episode_starts[None]]).astype(bool)
     obs = np.concatenate([buffer.observations, model._last_obs[None]])
-    found |= {
+    recorded |= {
         "obs": obs[:-1].copy(),
         "next_obs": obs[1:].copy(),
         "action": buffer.actions.copy(),
@@ -272,13 +278,13 @@ def on_policy(model: Any, kind: str, k: int, torch: Any) -> dict[str, Any]:
         "advantage": buffer.advantages.copy(),
         "target": buffer.returns.copy(),
     }
-    if kind == "MaskablePPO":
-        found["mask"] = buffer.action_masks.reshape(STEPS, ENVS, CHOICES).astype(bool)
+    if algorithm_name == "MaskablePPO":
+        recorded["mask"] = buffer.action_masks.reshape(STEPS, ENVS, CHOICES).astype(bool)
     with mock.patch(
         "numpy.random.randint", return_value=0
     ):  # RecurrentPPO's batches begin in the middle of an environment
         model.train()
-    return found
+    return recorded
 
 
 def parts(folder: Path) -> None:
@@ -313,9 +319,9 @@ def parts(folder: Path) -> None:
 
     envs = VecNormalize(DummyVecEnv([made_up("PPO")] * ENVS), gamma=0.9)
     envs.seed(0)
-    found: dict[str, list[Any]] = {name: [] for name in ("raw", "scaled", "reward", "scaled_reward", "ended")}
-    found["scaled"].append(envs.reset())
-    found["raw"].append(envs.get_original_obs())
+    recorded: dict[str, list[Any]] = {name: [] for name in ("raw", "scaled", "reward", "scaled_reward", "ended")}
+    recorded["scaled"].append(envs.reset())
+    recorded["raw"].append(envs.get_original_obs())
     for _ in range(200):
         scaled, reward, ended, _ = envs.step(np.zeros((ENVS, ACTIONS), np.float32))
         for name, value in {
@@ -325,8 +331,8 @@ def parts(folder: Path) -> None:
             "scaled_reward": reward,
             "ended": ended,
         }.items():
-            found[name].append(value.copy())
-    normalized = {f"normalized.{name}": np.array(values) for name, values in found.items()}
+            recorded[name].append(value.copy())
+    normalized = {f"normalized.{name}": np.array(values) for name, values in recorded.items()}
     n_step = {f"n_step.{name}": value for name, value in n_step.items()}
     others = {**ars, **n_step, **normalized, **hindsight()}
     np.savez_compressed(folder / "parts.npz", ends=ends, rewards=rewards, **others)
@@ -340,7 +346,7 @@ def hindsight() -> dict[str, np.ndarray]:
     env: Any = SimpleNamespace(env_method=lambda _, achieved, desired, infos, indices: [goal_reward(achieved, desired)])
     actions = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
     np.random.seed(0)  # noqa: NPY002
-    found = {}
+    transitions = {}
     for strategy in HINDSIGHT:
         buffer = HerReplayBuffer(KEPT * ENVS, goal_space(), actions, env, "cpu", ENVS, goal_selection_strategy=strategy)
         for step in history():
@@ -352,8 +358,8 @@ def hindsight() -> dict[str, np.ndarray]:
         for _ in range(DRAWS[0]):
             obs, action, next_obs, done, reward, *_ = buffer.sample(DRAWS[1])
             parts.append(table(obs, next_obs, action, reward, 1 - done))
-        found[f"hindsight.{strategy}"] = np.unique(np.concatenate(parts), axis=0)
-    return found
+        transitions[f"hindsight.{strategy}"] = np.unique(np.concatenate(parts), axis=0)
+    return transitions
 
 
 # With rejeu.
@@ -408,54 +414,59 @@ def compared(folder: Path, name: str) -> dict[str, Any]:
         data = dict(file)
     changes = {"target_kl": 0.01 * ACTIONS, "cg_damping": 0.1 * ACTIONS} if name == "TRPO" else {}
     agent, first, last = (load_zip(folder / f"{name}.{k}.zip", **changes) for k in (0, 1, UPDATES))
-    kind = name.split(",")[0]
+    algorithm_name = name.split(",")[0]
     algorithm = agent.algorithm.make(agent.config, *spaces_of(name))
-    state, found = agent.state, {"losses": 0.0, "gradients": 0.0, "weights": 0.0, "weights after 3": 0.0}
+    state, differences = agent.state, {"losses": 0.0, "gradients": 0.0, "weights": 0.0, "weights after 3": 0.0}
     normal = jax.random.normal
     for k in range(UPDATES):
-        one = {key.removeprefix(f"{k}."): value for key, value in data.items() if key.startswith(f"{k}.")}
+        recorded = {key.removeprefix(f"{k}."): value for key, value in data.items() if key.startswith(f"{k}.")}
         if name in OFF:
-            noises = iter(
-                [one[which] for which in (("target_noise",) if kind == "TD3" else ("target_noise", "actor_noise"))]
-            )
+            noise_names = ("target_noise",) if algorithm_name == "TD3" else ("target_noise", "actor_noise")
+            noises = iter([recorded[noise_name] for noise_name in noise_names])
             jax.random.normal = lambda key, shape=(), dtype=None, noises=noises: jax.numpy.array(next(noises))
-            batch = transition(one, kind)
+            batch = transition(recorded, algorithm_name)
         else:
-            batch = rollout(one, kind, agent)
-            if kind != "RecurrentPPO":
+            batch = rollout(recorded, algorithm_name, agent)
+            if algorithm_name != "RecurrentPPO":
                 ours = steps.samples(state.network, batch, agent.config.gae_lambda)
                 for field in ("advantage", "target"):
-                    given = np.asarray(getattr(ours, field)).reshape(STEPS, ENVS)
-                    found["advantages"] = max(found.get("advantages", 0.0), difference(given, one[field]))
+                    computed = np.asarray(getattr(ours, field)).reshape(STEPS, ENVS)
+                    differences["advantages"] = max(
+                        differences.get("advantages", 0.0), difference(computed, recorded[field])
+                    )
         try:
             with jax.disable_jit():
                 state, metrics = algorithm.update(state, batch, clock(k))
         finally:
             jax.random.normal = normal
         for loss in LOSSES:
-            if loss in metrics and loss in one and (kind, loss) not in UNLIKE:
-                factor = 2.0 if (kind, loss) == ("TQC", "critic_loss") else 1.0
-                found["losses"] = max(found["losses"], difference(float(metrics[loss]), factor * float(one[loss])))
+            if loss in metrics and loss in recorded and (algorithm_name, loss) not in UNLIKE:
+                factor = 2.0 if (algorithm_name, loss) == ("TQC", "critic_loss") else 1.0
+                differences["losses"] = max(
+                    differences["losses"], difference(float(metrics[loss]), factor * float(recorded[loss]))
+                )
         if k in (0, UPDATES - 1):
-            given, theirs = tree_to_arrays(state), tree_to_arrays((first if k == 0 else last).state)
+            updated, theirs = tree_to_arrays(state), tree_to_arrays((first if k == 0 else last).state)
             for key, value in theirs.items():
                 if value.dtype != np.float32 or key in ("actor_loss", "entropy"):
                     continue
                 if "optimizer" in key:
                     if k == 0 and ".mu." in f"{key}.":
-                        factor = 2.0 if kind == "TQC" and key.startswith("critics") else 1.0
-                        decay = 0.5 if kind == "CrossQ" and "alpha" not in key else 0.9
-                        apart = difference(given[key] / (1 - decay), factor * value / (1 - decay))
-                        found["gradients"] = max(found["gradients"], apart)
+                        factor = 2.0 if algorithm_name == "TQC" and key.startswith("critics") else 1.0
+                        decay = 0.5 if algorithm_name == "CrossQ" and "alpha" not in key else 0.9
+                        apart = difference(updated[key] / (1 - decay), factor * value / (1 - decay))
+                        differences["gradients"] = max(differences["gradients"], apart)
                 else:
-                    which = "weights" if k == 0 else "weights after 3"
-                    found[which] = max(found[which], difference(given[key], value))
-    return found | {"note": NOTES.get(name, "")}
+                    measure = "weights" if k == 0 else "weights after 3"
+                    differences[measure] = max(differences[measure], difference(updated[key], value))
+    return differences | {"note": NOTES.get(name, "")}
 
 
-UNLIKE = {(kind, loss) for kind in ("PPO", "RecurrentPPO", "MaskablePPO") for loss in ("loss", "approx_kl")} | {
-    ("TRPO", "kl_divergence_loss")
-}
+UNLIKE = {
+    (algorithm_name, loss)
+    for algorithm_name in ("PPO", "RecurrentPPO", "MaskablePPO")
+    for loss in ("loss", "approx_kl")
+} | {("TRPO", "kl_divergence_loss")}
 """Metrics that are something else there: those of the last minibatch or epoch, and the divergence in the other direction."""
 
 
@@ -466,43 +477,43 @@ def clock(k: int) -> Any:
     return Clock(np.uint32(1), np.uint32(0), np.float32(0.0))
 
 
-def difference(one: Any, two: Any) -> float:
+def difference(value: Any, reference: Any) -> float:
     """Returns the largest difference, relative to numbers above 1."""
-    one, two = np.float64(one), np.float64(two)
-    return float(np.max(np.abs(one - two) / np.maximum(1.0, np.abs(two)), initial=0.0))
+    value, reference = np.float64(value), np.float64(reference)
+    return float(np.max(np.abs(value - reference) / np.maximum(1.0, np.abs(reference)), initial=0.0))
 
 
-def transition(one: dict[str, Any], kind: str) -> Any:
+def transition(recorded: dict[str, Any], algorithm_name: str) -> Any:
     """Returns a recorded batch."""
     from rejeu.core.algorithm import Transition
 
-    discount = np.where(one["terminated"], 0.0, 0.9).astype(np.float32)
-    action = one["action"].astype(np.float32 if kind in BOX else np.int32)
-    return Transition(one["obs"], action, one["reward"], one["next_obs"], discount)
+    discount = np.where(recorded["terminated"], 0.0, 0.9).astype(np.float32)
+    action = recorded["action"].astype(np.float32 if algorithm_name in BOX else np.int32)
+    return Transition(recorded["obs"], action, recorded["reward"], recorded["next_obs"], discount)
 
 
-def rollout(one: dict[str, Any], kind: str, agent: Any) -> Any:
+def rollout(recorded: dict[str, Any], algorithm_name: str, agent: Any) -> Any:
     """Returns a recorded rollout."""
     from rejeu.core.algorithm import Masked, Rollout
 
     memory: Any = ()
-    if kind == "RecurrentPPO":
-        memory = tuple(tuple(one[f"memory.{who}.{i}"] for i in (0, 1)) for who in ("pi", "vf"))
-    obs, next_obs = one["obs"], one["next_obs"]
-    if "mask" in one:
-        obs, next_obs = Masked(obs, one["mask"]), Masked(next_obs, np.ones_like(one["mask"]))
+    if algorithm_name == "RecurrentPPO":
+        memory = tuple(tuple(recorded[f"memory.{who}.{i}"] for i in (0, 1)) for who in ("pi", "vf"))
+    obs, next_obs = recorded["obs"], recorded["next_obs"]
+    if "mask" in recorded:
+        obs, next_obs = Masked(obs, recorded["mask"]), Masked(next_obs, np.ones_like(recorded["mask"]))
     return Rollout(
         obs=obs,
-        action=one["action"]
-        if kind in BOX and one["action"].shape[-1] == ACTIONS
-        else one["action"][..., 0].astype(np.int32),
-        reward=one["reward"],
+        action=recorded["action"]
+        if algorithm_name in BOX and recorded["action"].shape[-1] == ACTIONS
+        else recorded["action"][..., 0].astype(np.int32),
+        reward=recorded["reward"],
         next_obs=next_obs,
-        discount=np.where(one["ended"], 0.0, 0.9).astype(np.float32),
-        ended=one["ended"],
+        discount=np.where(recorded["ended"], 0.0, 0.9).astype(np.float32),
+        ended=recorded["ended"],
         valid=np.ones((STEPS, ENVS), bool),
         running_return=np.zeros((STEPS, ENVS), np.float32),
-        started=one["started"],
+        started=recorded["started"],
         carry=memory,
     )
 
@@ -541,9 +552,9 @@ def compared_parts(folder: Path) -> list[dict[str, Any]]:
     plus, minus = jnp.asarray(data["ars.returns"].reshape(2, 8), jnp.float32)
     weight, _ = ars.weights(plus, minus, 5)
     weight = np.float64(weight) / np.sqrt(10 / 9)  # the deviation of 10 returns, divided by 10 and not by 9
-    found = [{"algorithm": "ARS", "weights": difference(0.02 * weight @ data["ars.deltas"], data["ars.step"])}]
-    found[0]["note"] = "with the unbiased deviation of the returns, which is biased here"
-    found += [{"algorithm": "n-step returns", "numbers": max(apart), "note": "NStepReplayBuffer"}]
+    results = [{"algorithm": "ARS", "weights": difference(0.02 * weight @ data["ars.deltas"], data["ars.step"])}]
+    results[0]["note"] = "with the unbiased deviation of the returns, which is biased here"
+    results += [{"algorithm": "n-step returns", "numbers": max(apart), "note": "NStepReplayBuffer"}]
 
     recorded = {key.removeprefix("normalized."): value for key, value in data.items() if key.startswith("normalized.")}
     normalizer = Normalizer([0], {0: (OBS,)}, NormalizationConfig(), 1.0)
@@ -563,8 +574,8 @@ def compared_parts(folder: Path) -> list[dict[str, Any]]:
                 apart.append(difference(ours, recorded["scaled_reward"][t - 1]))
             running[recorded["ended"][t - 1]] = 0.0
     note = "VecNormalize, from the 100th step on: its statistics begin with a count of 1e-4"
-    found += [{"algorithm": "normalization", "numbers": max(apart), "note": note}]
-    return [*found, compared_hindsight(data), compared_priorities()]
+    results += [{"algorithm": "normalization", "numbers": max(apart), "note": note}]
+    return [*results, compared_hindsight(data), compared_priorities()]
 
 
 def filled(buffer: Any, steps: list[dict[str, np.ndarray]]) -> Any:
@@ -600,11 +611,11 @@ def compared_hindsight(data: dict[str, Any]) -> dict[str, Any]:
         ring = goal_ring(KEPT * 13 // 10, counters(config))  # there, final observations take no rows
         buffer = filled(HerReplayBuffer(ring, 0.9, config, GoalFunctions(goal_reward)), history())
         drawn = [buffer.sample(rng, DRAWS[1:]) for _ in range(DRAWS[0])]
-        parts = [table(one.obs, one.next_obs, one.action, one.reward, one.discount > 0) for one in drawn]
+        parts = [table(batch.obs, batch.next_obs, batch.action, batch.reward, batch.discount > 0) for batch in drawn]
         theirs = data[f"hindsight.{strategy}"]
-        given = np.unique(np.concatenate(parts), axis=0)
-        given = given[np.isin(given[:, 0], theirs[:, 0])]
-        apart.append(difference(given, theirs) if given.shape == theirs.shape else np.inf)
+        ours = np.unique(np.concatenate(parts), axis=0)
+        ours = ours[np.isin(ours[:, 0], theirs[:, 0])]
+        apart.append(difference(ours, theirs) if ours.shape == theirs.shape else np.inf)
         n_compared += len(theirs)
     note = (
         f"HerReplayBuffer: the {n_compared} transitions with their own and all possible goals, by future, final and episode, "
@@ -629,19 +640,23 @@ def compared_priorities() -> dict[str, Any]:
         for env, over in enumerate(step["terminated"] | step["truncated"]):
             rows[env] += [largest, 0.0] if over else [largest]
         p = np.zeros(KEPT * ENVS)
-        at = {KEPT * env + i % KEPT: (env, i) for env, one in enumerate(rows) for i in range(len(one))[1 - KEPT :]}
+        at = {
+            KEPT * env + i % KEPT: (env, i)
+            for env, priorities in enumerate(rows)
+            for i in range(len(priorities))[1 - KEPT :]
+        }
         for position, (env, i) in at.items():
             p[position] = rows[env][i]
         n_steps = np.count_nonzero(p)
         p /= p.sum()
         batch, drawn = buffer.draw(rng, (size,))
-        chosen = np.searchsorted(np.cumsum(p), (np.arange(size) + again.random(size)) / size, side="right")
-        again.shuffle(chosen)
-        weight = (n_steps * p[chosen]) ** -beta
-        apart += [difference(drawn.position, chosen), difference(batch.weight, weight / weight.max())]
-        td_error = np.abs(np.sin(chosen + ring.head[0]))
+        expected = np.searchsorted(np.cumsum(p), (np.arange(size) + again.random(size)) / size, side="right")
+        again.shuffle(expected)
+        weight = (n_steps * p[expected]) ** -beta
+        apart += [difference(drawn.position, expected), difference(batch.weight, weight / weight.max())]
+        td_error = np.abs(np.sin(expected + ring.head[0]))
         buffer.update_priorities([(drawn, td_error)])
-        for position, new in zip(chosen, (td_error + epsilon) ** alpha, strict=True):
+        for position, new in zip(expected, (td_error + epsilon) ** alpha, strict=True):
             env, i = at[position]
             rows[env][i], largest = new, max(largest, new)
     note = "the equations of the paper in NumPy: choices, importance weights and new priorities; neither library has it"

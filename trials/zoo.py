@@ -14,7 +14,6 @@ between the two libraries, and of either from the original's policy evaluated in
 from __future__ import annotations
 
 import contextlib
-import json
 import pickle
 import re
 import sys
@@ -28,6 +27,7 @@ from unittest import mock
 
 import gymnasium as gym
 import numpy as np
+from provenance import read, write
 
 from rejeu.agents.zoo import statistics_beside
 from rejeu.envs.make import make_vector
@@ -59,22 +59,22 @@ def original(path: Path) -> Any:
     replaced |= {"replay_buffer_class": None, "replay_buffer_kwargs": {}}
     name = path.parent.parent.name.upper()
     name = "SAC" if name == "HER" else name
-    kind = getattr(stable_baselines3, name, None) or getattr(sb3_contrib, name)
-    return kind.load(path, custom_objects=replaced, device="cpu")
+    algorithm = getattr(stable_baselines3, name, None) or getattr(sb3_contrib, name)
+    return algorithm.load(path, custom_objects=replaced, device="cpu")
 
 
 def scaler_of(path: Path) -> Any:
     """Returns the ``VecNormalize`` of a zip file as Stable-Baselines3 unpickles it; None if it has none."""
     import stable_baselines3.common.vec_env.vec_normalize  # noqa: F401
 
-    found = statistics_beside(path)
-    return None if found is None else pickle.loads(found.read_bytes())
+    statistics_file = statistics_beside(path)
+    return None if statistics_file is None else pickle.loads(statistics_file.read_bytes())
 
 
 def samples(space: gym.Space, moments: Any, rng: np.random.Generator) -> Any:
     """Returns observations that the statistics, or the bounds of a space, make likely."""
     if isinstance(space, gym.spaces.Dict):
-        return {key: samples(part, moments and moments[key], rng) for key, part in space.spaces.items()}
+        return {key: samples(subspace, moments and moments[key], rng) for key, subspace in space.spaces.items()}
     drawn = rng.normal(size=(N, *space.shape))
     if moments is not None:
         return (moments.mean + np.sqrt(moments.var + 1e-8) * drawn).astype(space.dtype)
@@ -89,8 +89,10 @@ def scaled(scaler: Any, obs: Any, exact: bool) -> Any:
         return obs
     if not exact:
         return scaler.normalize_obs(obs)
-    one = lambda x, m: np.clip((x - m.mean) / np.sqrt(m.var + scaler.epsilon), -scaler.clip_obs, scaler.clip_obs)  # noqa: E731
-    return {k: one(x, scaler.obs_rms[k]) for k, x in obs.items()} if isinstance(obs, dict) else one(obs, scaler.obs_rms)
+    normalized = lambda x, m: np.clip((x - m.mean) / np.sqrt(m.var + scaler.epsilon), -scaler.clip_obs, scaler.clip_obs)  # noqa: E731
+    if isinstance(obs, dict):
+        return {k: normalized(x, scaler.obs_rms[k]) for k, x in obs.items()}
+    return normalized(obs, scaler.obs_rms)
 
 
 @contextlib.contextmanager
@@ -112,7 +114,7 @@ def joined(obs: Any, model: Any) -> Any:
 
 
 def compared(path: Path) -> dict[str, Any]:
-    """Returns how the actions of a zip file in rejeu compare with those in Stable-Baselines3."""
+    """Returns the differences between the actions of a zip file in rejeu and in Stable-Baselines3."""
     ours = load_zip(path)
     theirs, scaler = original(path), scaler_of(path)
     moments = None if scaler is None or not getattr(scaler, "norm_obs", True) else scaler.obs_rms
@@ -120,25 +122,25 @@ def compared(path: Path) -> dict[str, Any]:
     obs = samples(space, moments, np.random.default_rng(0))
     action = ours.predict(obs, deterministic=True)[0]
     expected = theirs.predict(joined(scaled(scaler, obs, exact=False), theirs), deterministic=True)[0]
-    about = {"algorithm": ours.name, "normalized": moments is not None, "notes": ours.notes}
+    description = {"algorithm": ours.name, "normalized": moments is not None, "notes": ours.notes}
     if action.dtype.kind != "f":
-        return {**about, "kind": "discrete", "differing": int((action != expected).sum())}
+        return {**description, "kind": "discrete", "differing": int((action != expected).sum())}
     with in_float64(theirs):
         exact = theirs.predict(joined(scaled(scaler, obs, exact=True), theirs), deterministic=True)[0]
     half = 0.5 * (ours.action_space.high - ours.action_space.low)
-    far = lambda one, other: float((np.abs(one.astype(np.float64) - other) / half).max())  # noqa: E731
+    far = lambda x, y: float((np.abs(x.astype(np.float64) - y) / half).max())  # noqa: E731
     differences = {"difference": far(action, expected), "ours": far(action, exact), "theirs": far(expected, exact)}
-    return {**about, "kind": "continuous", **differences}
+    return {**description, "kind": "continuous", **differences}
 
 
 def exported(path: Path) -> dict[str, Any]:
-    """Returns how the agent of a zip file compares with ``predict`` as ONNX and C."""
-    agent, found = load_zip(path), {}
+    """Returns the differences of the agent of a zip file from ``predict`` as ONNX and C."""
+    agent, comparisons = load_zip(path), {}
     with tempfile.TemporaryDirectory() as folder:
         for to in ("onnx", "c"):
             check = agent.export(Path(folder) / "policy", to).check
-            found[to] = {"difference": check.difference, "ties": check.ties, "allowed": check.allowed}
-    return found
+            comparisons[to] = {"difference": check.difference, "ties": check.ties, "allowed": check.allowed}
+    return comparisons
 
 
 def played(path: Path, published: dict[tuple[str, str], str]) -> dict[str, Any] | None:
@@ -155,34 +157,34 @@ def played(path: Path, published: dict[tuple[str, str], str]) -> dict[str, Any] 
         print(error)
         return None
     with contextlib.closing(env):
-        found = agent.evaluate(20, env=env)
+        evaluation = agent.evaluate(20, env=env)
     figure = published.get((path.parent.parent.name, env_id), "")
-    return {"env_id": proxy, "mean": found.mean_return, "std": found.std_return, "published": figure}
+    return {"env_id": proxy, "mean": evaluation.mean_return, "std": evaluation.std_return, "published": figure}
 
 
 def main() -> None:
     """Runs one of the commands."""
     warnings.simplefilter("ignore")
-    command, collection, *rest = sys.argv[1:]
-    results = json.loads(RESULTS.read_text(encoding="utf-8")) if RESULTS.exists() else {}
+    command, collection, *options = sys.argv[1:]
+    results = read(RESULTS)
     published = {}
     if command == "returns":
-        for row in re.findall(r"^\|\s*(\w+)\s*\|\s*([\w-]+)\s*\|\s*([^|]+?)\s*\|", Path(rest[0]).read_text(), re.M):
+        for row in re.findall(r"^\|\s*(\w+)\s*\|\s*([\w-]+)\s*\|\s*([^|]+?)\s*\|", Path(options[0]).read_text(), re.M):
             published[row[0], row[1]] = row[2]
     root = Path(collection)
     for path in sorted(root.glob("*/*/*.zip")):
         name, start = path.relative_to(root).as_posix(), time.time()
         try:
-            given = (path, published) if command == "returns" else (path,)
-            found: Any = {"actions": compared, "exports": exported, "returns": played}[command](*given)  # type: ignore[operator]
+            inputs = (path, published) if command == "returns" else (path,)
+            result: Any = {"actions": compared, "exports": exported, "returns": played}[command](*inputs)  # type: ignore[operator]
         except (AssertionError, OSError, RuntimeError, TypeError, ValueError) as error:
-            found = {"error": str(error)}
-        if found is not None:
-            if "notes" in found:
-                found["notes"] = [note.replace(f"{root}/", "") for note in found["notes"]]
-            results.setdefault(name, {})[command] = found
-        RESULTS.write_text(json.dumps(dict(sorted(results.items())), indent=1) + "\n", encoding="utf-8")
-        print(name, f"{time.time() - start:.1f} s", found, flush=True)
+            result = {"error": str(error)}
+        if result is not None:
+            if "notes" in result:
+                result["notes"] = [note.replace(f"{root}/", "") for note in result["notes"]]
+            results.setdefault(name, {})[command] = result
+        write(RESULTS, dict(sorted(results.items())))
+        print(name, f"{time.time() - start:.1f} s", result, flush=True)
 
 
 if __name__ == "__main__":
