@@ -213,6 +213,17 @@ def test_a_damaged_checkpoint_is_passed_over_for_the_one_before_it(tmp_path):
     assert newest.with_name(f"{newest.name}.damaged").exists()  # nothing is thrown away
 
 
+def test_newer_checkpoints_stay_as_they_are_where_an_older_one_is_resumed(tmp_path):
+    cut_run(tmp_path)
+    files = {path.name: path.read_bytes() for path in tmp_path.glob("*.safetensors")}
+    agent = rejeu.SAC.resume(checkpoint_files(tmp_path)[-1])
+    with pytest.raises(FileExistsError, match=r"is newer than the agent, which is at step 20; continue .* another fol"):
+        agent.learn(callback=Checkpoint(tmp_path, every=10))
+    assert {path.name: path.read_bytes() for path in tmp_path.glob("*.safetensors")} == files
+    assert agent.learn(callback=Checkpoint(tmp_path / "other", every=10)).num_timesteps == 60
+    assert rejeu.SAC.resume(tmp_path / "other").num_timesteps == 60
+
+
 def test_rows_that_are_missing_or_damaged_are_noticed(tmp_path):
     with pytest.raises(FileNotFoundError, match="no checkpoint"):
         rejeu.SAC.resume(tmp_path)

@@ -113,7 +113,7 @@ class CheckpointFolder:
 
         Raises:
             RunInUseError: if another process holds the lock.
-            FileExistsError: if the folder contains the checkpoints of another run.
+            FileExistsError: if the folder contains the checkpoints of another run, or newer ones that resume did not skip.
         """
         self.lock()
         try:
@@ -121,7 +121,7 @@ class CheckpointFolder:
             for path in self.folder.glob(".*.tmp"):  # of a process that died while it wrote
                 path.unlink(missing_ok=True)
             for path in checkpoint_files(self.folder):
-                if step_of(path) > self.agent.run.step:  # a damaged one, which resume has skipped
+                if step_of(path) > self.agent.run.step:  # one that resume has skipped
                     path.replace(path.with_name(f"{path.name}.damaged"))
         except BaseException:
             self.close()
@@ -170,6 +170,7 @@ class CheckpointFolder:
         return path
 
     def _check_owner(self) -> None:
+        step, resumed = self.agent.run.step, self.agent.resumed
         for path in checkpoint_files(self.folder):
             try:
                 header = checkpoint.read_header(path, "run")
@@ -179,6 +180,11 @@ class CheckpointFolder:
                 raise FileExistsError(
                     f"{self.folder} contains the checkpoints of another run; continue it with "
                     f"{self.agent.name}.resume(folder), or give Checkpoint another folder"
+                )
+            if step_of(path) > step and not (resumed and resumed.skipped):
+                raise FileExistsError(
+                    f"{path} is newer than the agent, which is at step {step}; continue from it with "
+                    f"{self.agent.name}.resume(folder), or give Checkpoint another folder to train on from step {step}"
                 )
             return
 
