@@ -40,9 +40,9 @@ class Good(gym.Env):
         return self.time >= 3
 
 
-def seeing(name: str, seen: Callable[[Good], Any], space: spaces.Space = Good.observation_space) -> type[Good]:
+def seeing(name: str, observe: Callable[[Good], Any], space: spaces.Space = Good.observation_space) -> type[Good]:
     """Returns an environment of ``space`` whose observations are ``seen(env)``."""
-    return type(name, (Good,), {"observe": seen, "observation_space": space, "__module__": __name__})
+    return type(name, (Good,), {"observe": observe, "observation_space": space, "__module__": __name__})
 
 
 def later(name: str, bad: Any) -> type[Good]:
@@ -82,29 +82,29 @@ OutOfBounds = seeing(
 )
 
 
-def answering(name: str, answer: Callable[..., tuple]) -> type[Good]:
+def answering(name: str, change: Callable[..., tuple]) -> type[Good]:
     """Returns an environment whose steps return ``answer(obs, reward, terminated, truncated, info)`` from the third on."""
 
     def step(self: Good, action: Any) -> Any:
-        given = Good.step(self, action)
-        return answer(*given) if self.late else given
+        result = Good.step(self, action)
+        return change(*result) if self.late else result
 
     return type(name, (Good,), {"step": step, "__module__": __name__})
 
 
 FourValues = answering("FourValues", lambda obs, reward, ended, cut, info: (obs, reward, ended or cut, info))
-NoReward = answering("NoReward", lambda obs, reward, *rest: (obs, None, *rest))
-NanReward = answering("NanReward", lambda obs, reward, *rest: (obs, float("nan"), *rest))
-HugeReward = answering("HugeReward", lambda obs, reward, *rest: (obs, 1e300, *rest))
-EndlessReward = answering("EndlessReward", lambda obs, reward, *rest: (obs, 10**400, *rest))
-RewardArray = answering("RewardArray", lambda obs, reward, *rest: (obs, np.array([reward, reward]), *rest))
-RewardOfOne = answering("RewardOfOne", lambda obs, reward, *rest: (obs, np.array([reward]), *rest))
-RewardText = answering("RewardText", lambda obs, reward, *rest: (obs, str(reward), *rest))
-TerminatedNone = answering("TerminatedNone", lambda obs, reward, ended, *rest: (obs, reward, None, *rest))
+NoReward = answering("NoReward", lambda obs, reward, *others: (obs, None, *others))
+NanReward = answering("NanReward", lambda obs, reward, *others: (obs, float("nan"), *others))
+HugeReward = answering("HugeReward", lambda obs, reward, *others: (obs, 1e300, *others))
+EndlessReward = answering("EndlessReward", lambda obs, reward, *others: (obs, 10**400, *others))
+RewardArray = answering("RewardArray", lambda obs, reward, *others: (obs, np.array([reward, reward]), *others))
+RewardOfOne = answering("RewardOfOne", lambda obs, reward, *others: (obs, np.array([reward]), *others))
+RewardText = answering("RewardText", lambda obs, reward, *others: (obs, str(reward), *others))
+TerminatedNone = answering("TerminatedNone", lambda obs, reward, ended, *others: (obs, reward, None, *others))
 TruncatedText = answering("TruncatedText", lambda obs, reward, ended, cut, info: (obs, reward, ended, "no", info))
 TerminatedInfo = answering("TerminatedInfo", lambda obs, reward, ended, cut, info: (obs, reward, cut, info, {}))
 Zeros = answering("Zeros", lambda obs, reward, ended, cut, info: (obs, reward, int(ended), np.float32(cut), info))
-NoInfo = answering("NoInfo", lambda *given: (*given[:4], None))
+NoInfo = answering("NoInfo", lambda *result: (*result[:4], None))
 
 
 class OnlyObservation(Good):
@@ -256,9 +256,9 @@ class RewardCounts(Line):
 class RewardInPlace(Line):
     def step(self, action):
         position = self.position + action
-        answer = super().step(action)
+        result = super().step(action)
         self.position = position
-        return self._observe(), *answer[1:]
+        return self._observe(), *result[1:]
 
     def compute_reward(self, achieved, desired, info):
         achieved -= desired

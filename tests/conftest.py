@@ -210,8 +210,8 @@ def browser() -> Iterator[Any]:
 
 def memory(field: str) -> int:
     """Returns a size of this process in bytes: ``VmRSS`` is what it takes, ``VmHWM`` the most that it took. 0 if unknown."""
-    found = re.search(rf"^{field}:\s+(\d+) kB", STATUS.read_text() if STATUS.exists() else "", re.MULTILINE)
-    return int(found[1]) * 1024 if found else 0
+    match = re.search(rf"^{field}:\s+(\d+) kB", STATUS.read_text() if STATUS.exists() else "", re.MULTILINE)
+    return int(match[1]) * 1024 if match else 0
 
 
 @pytest.fixture(autouse=True)
@@ -230,5 +230,5 @@ def memory_is_limited() -> Iterator[None]:
         gc.collect()
         with suppress(AttributeError, OSError):  # another C library than GNU's
             ctypes.CDLL(None).malloc_trim(0)
-    most = memory("VmHWM")
-    assert most <= MOST_MEMORY or before > MOST_MEMORY, f"the tests of this process took {most / 1e9:.1f} GB of memory"
+    peak = memory("VmHWM")
+    assert peak <= MOST_MEMORY or before > MOST_MEMORY, f"the tests of this process took {peak / 1e9:.1f} GB of memory"

@@ -14,10 +14,10 @@ class FullDisk:
         self.failures = 0
         opened = pathlib.Path.open
 
-        def open_(path, mode="r", *rest, **keywords):
+        def open_(path, mode="r", *arguments, **keywords):
             if self.full and mode in ("xb", "r+b"):
                 return _Half(path, mode, self)
-            return (open if "opener" in keywords else opened)(path, mode, *rest, **keywords)
+            return (open if "opener" in keywords else opened)(path, mode, *arguments, **keywords)
 
         monkeypatch.setattr(pathlib.Path, "open", open_)
         monkeypatch.setattr("rejeu.core.atomic.open", open_, raising=False)

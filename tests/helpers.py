@@ -19,8 +19,8 @@ def small_sac(env: Any, **settings: Any) -> rejeu.SAC:
 
     Agents with equal settings and spaces share their compiled functions.
     """
-    given = env.observation_space if isinstance(env, gym.Env) else getattr(env, "observation_space", None)
-    nested = isinstance(given, gym.spaces.Dict | gym.spaces.Tuple)
+    space = env.observation_space if isinstance(env, gym.Env) else getattr(env, "observation_space", None)
+    nested = isinstance(space, gym.spaces.Dict | gym.spaces.Tuple)
     settings = {
         "learning_starts": 8,
         "batch_size": 4,
@@ -45,17 +45,17 @@ def count_updates(agent: rejeu.SAC) -> list[int]:
     return calls
 
 
-def assert_same_parameters(one: rejeu.SAC, two: rejeu.SAC) -> None:
+def assert_same_parameters(agent: rejeu.SAC, other_agent: rejeu.SAC) -> None:
     """Asserts that all parameters are equal, bit for bit."""
-    first, second = Agent.get_parameters(one), Agent.get_parameters(two)  # those of rejeu.sb3 are nested
+    first, second = Agent.get_parameters(agent), Agent.get_parameters(other_agent)  # those of rejeu.sb3 are nested
     assert list(first) == list(second)
     for name, value in first.items():
         np.testing.assert_array_equal(value, second[name], err_msg=name)
 
 
-def same_parameters(one: rejeu.SAC, two: rejeu.SAC) -> bool:
+def same_parameters(agent: rejeu.SAC, other_agent: rejeu.SAC) -> bool:
     """Returns whether all parameters are equal, bit for bit."""
-    first, second = Agent.get_parameters(one), Agent.get_parameters(two)  # those of rejeu.sb3 are nested
+    first, second = Agent.get_parameters(agent), Agent.get_parameters(other_agent)  # those of rejeu.sb3 are nested
     return all(np.array_equal(value, second[name]) for name, value in first.items())
 
 

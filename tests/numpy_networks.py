@@ -12,7 +12,7 @@ Layers = list[list[np.ndarray]]
 def layers(network: Any, index: Any = ...) -> Layers:
     """Copies the weights of a network, or of its optimizer's moments; ``index`` selects a member of an ensemble."""
     parts = [*network.torso.layers, network.head]
-    return [[np.array(np.float64(part.weight)[index]), np.array(np.float64(part.bias)[index])] for part in parts]
+    return [[np.array(np.float64(layer.weight)[index]), np.array(np.float64(layer.bias)[index])] for layer in parts]
 
 
 def forward(network: Layers, x: Any) -> np.ndarray:
@@ -57,12 +57,12 @@ def gradient(network: Layers, loss: Callable[[], float], width: float = 1e-6) ->
     for layer, slope in zip(network, slopes, strict=True):
         for array, along in zip(layer, slope, strict=True):
             for i in np.ndindex(array.shape):
-                kept = array[i]
-                array[i] = kept + width
+                original = array[i]
+                array[i] = original + width
                 above = loss()
-                array[i] = kept - width
+                array[i] = original - width
                 along[i] = (above - loss()) / (2.0 * width)
-                array[i] = kept
+                array[i] = original
     return slopes
 
 
@@ -96,14 +96,14 @@ def follow(target: Layers, online: Layers, tau: float) -> None:
             t[...] = (1.0 - tau) * t + tau * o
 
 
-def assert_equal_layers(given: Layers, expected: Layers, what: str, atol: float = 2e-5, rtol: float = 0.0) -> None:
+def assert_equal_layers(actual: Layers, expected: Layers, label: str, atol: float = 2e-5, rtol: float = 0.0) -> None:
     """Asserts that all weights and biases agree."""
-    for i, (one, two) in enumerate(zip(given, expected, strict=True)):
-        for kind, a, b in zip(("weight", "bias"), one, two, strict=True):
-            np.testing.assert_allclose(a, b, atol=atol, rtol=rtol, err_msg=f"{what}: {kind} {i}")
+    for i, (layer, expected_layer) in enumerate(zip(actual, expected, strict=True)):
+        for field, a, b in zip(("weight", "bias"), layer, expected_layer, strict=True):
+            np.testing.assert_allclose(a, b, atol=atol, rtol=rtol, err_msg=f"{label}: {field} {i}")
 
 
-def largest_difference(one: Layers, two: Layers) -> float:
+def largest_difference(first: Layers, second: Layers) -> float:
     """Returns the maximum absolute difference of corresponding values."""
-    pairs = zip(one, two, strict=True)
+    pairs = zip(first, second, strict=True)
     return max(float(np.abs(a - b).max()) for p, q in pairs for a, b in zip(p, q, strict=True))

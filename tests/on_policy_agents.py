@@ -28,8 +28,8 @@ class Kind(NamedTuple):
 
     def envs(self, probe: type[Probe], n_envs: int = 1) -> InProcess:
         """Returns a vector environment of ``n_envs`` probes with such actions."""
-        made = [probe() for _ in range(n_envs)]
-        return InProcess([one if self.wrapper is None else self.wrapper(one) for one in made])
+        probes = [probe() for _ in range(n_envs)]
+        return InProcess([probe if self.wrapper is None else self.wrapper(probe) for probe in probes])
 
     def small(self, env: Any, **settings: Any) -> agents.Agent:
         """Returns a small agent of this kind."""
@@ -40,8 +40,8 @@ class Kind(NamedTuple):
         """Converts a batch of actions to the probe's numbers, from 0 to 2."""
         if self.wrapper is None:
             return actions[:, 0]
-        made = self.wrapper(Probe())
-        return np.array([made.action(action)[0] for action in actions])
+        wrapped = self.wrapper(Probe())
+        return np.array([wrapped.action(action)[0] for action in actions])
 
 
 LEARNING = {"learning_rate": rejeu.Linear(2e-2, 1e-3), "gamma": 0.5, "policy_kwargs": {"net_arch": [16]}, "seed": 0}

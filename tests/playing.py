@@ -51,8 +51,8 @@ class Steps(Lever):
     action_space = gym.spaces.Discrete(4)
 
 
-for kind in (Lever, Dark, Switches, Steps):
-    gym.register(f"rejeu-play-test/{kind.__name__}-v0", f"{__name__}:{kind.__name__}")
+for env_class in (Lever, Dark, Switches, Steps):
+    gym.register(f"rejeu-play-test/{env_class.__name__}-v0", f"{__name__}:{env_class.__name__}")
 gym.register("rejeu-play-test/Class-v0", Lever)
 LEVER = "rejeu-play-test/Lever-v0"
 
@@ -92,14 +92,14 @@ def lever(game):
     return game.players[0].env.unwrapped
 
 
-def hold(names, steps, read, found):
+def hold(names, steps, read, readings):
     """Returns a script that holds some keys for some steps and then appends ``read(env)`` to ``found``."""
 
     def script(window, game):
         down(*(names or ["p"]))
         for _ in range(steps):
             yield
-        found.append(read(game.players[0].env.unwrapped))
+        readings.append(read(game.players[0].env.unwrapped))
 
     return script
 

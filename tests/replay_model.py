@@ -42,24 +42,24 @@ class Model:
         """Returns all (environment, index) whose step and next observation are stored."""
         return [(env, i) for env in range(self.n_envs) for i in self.kept(env) if self.frames[env][i].step is not None]
 
-    def episode(self, env: int, place: int) -> list[int]:
+    def episode(self, env: int, index: int) -> list[int]:
         """Returns the stored indices of the episode of (env, place) in order, including the final observation."""
-        mine = self.frames[env][place].episode
+        mine = self.frames[env][index].episode
         return [i for i in self.kept(env) if self.frames[env][i].episode == mine]
 
-    def n_step(self, env: int, place: int, n: int, gamma: float) -> tuple[float, int, float]:
+    def n_step(self, env: int, index: int, n: int, gamma: float) -> tuple[float, int, float]:
         """Returns the return, the index to bootstrap from, and the discount, by iterating over the episode."""
         total, weight = 0.0, 1.0
         for _ in range(n):
-            frame = self.frames[env][place]
+            frame = self.frames[env][index]
             if frame.step is None:
                 break
             total += weight * frame.step[1]
             weight *= gamma
-            place += 1
+            index += 1
             if frame.step[2]:
-                return total, place, 0.0
-        return total, place, weight
+                return total, index, 0.0
+        return total, index, weight
 
     def begin(self, envs: list[int]) -> None:
         for env in envs:
@@ -85,13 +85,13 @@ class Turn:
     """Environments whose running episode is discarded after the step."""
 
 
-def turns(n_envs: int, most: int = 40) -> st.SearchStrategy[list[Turn]]:
+def turns(n_envs: int, max_size: int = 40) -> st.SearchStrategy[list[Turn]]:
     """Random histories with both kinds of episode ends, and discarded episodes."""
     each = lambda values: st.lists(values, min_size=n_envs, max_size=n_envs)  # noqa: E731
     end = st.sampled_from(["no"] * 6 + ["terminated", "truncated"])
     restart = st.sampled_from([False] * 9 + [True])
     turn = st.builds(Turn, each(end), each(restart))
-    return st.lists(turn, min_size=1, max_size=most)
+    return st.lists(turn, min_size=1, max_size=max_size)
 
 
 OBSERVATION = gym.spaces.Dict(
@@ -114,14 +114,14 @@ def histories(draw: Any) -> tuple[int, int, list[Turn]]:
 
 def observe(n_envs: int, places: list[int]) -> Any:
     """Observations that contain environment and index in every leaf."""
-    where = np.array([[env, place] for env, place in enumerate(places)], np.float32)
-    coded = np.array([10 * place + env for env, place in enumerate(places)])
+    where = np.array([[env, index] for env, index in enumerate(places)], np.float32)
+    coded = np.array([10 * index + env for env, index in enumerate(places)])
     return {"where": where, "more": (coded.astype(np.int32), (coded % 256).astype(np.uint8)[:, None])}
 
 
 def observe_goal(n_envs: int, places: list[int]) -> Any:
     """The achieved goal contains environment and index. The desired goal is (-1, -1), which is never achieved."""
-    where = np.array([[env, place] for env, place in enumerate(places)], np.float32)
+    where = np.array([[env, index] for env, index in enumerate(places)], np.float32)
     return {"observation": where, "achieved_goal": where, "desired_goal": np.full((n_envs, 2), -1.0, np.float32)}
 
 

@@ -40,9 +40,9 @@ def difference_from(agent: Any, data: Any) -> dict[str, float]:
     if "starts" in data:
         memory, actions, values, log_probs = None, [], [], []
         for i, start in enumerate(data["starts"]):
-            one = jax.tree.map(lambda x, i=i: x[i : i + 1], obs)
-            values.append(agent.value(one, memory, [start]))
-            action, after = agent.predict(one, memory, [start], deterministic=True)
+            row = jax.tree.map(lambda x, i=i: x[i : i + 1], obs)
+            values.append(agent.value(row, memory, [start]))
+            action, after = agent.predict(row, memory, [start], deterministic=True)
             distribution = learner.network.policy(after)
             log_probs.append(distribution.log_prob(jnp.asarray(unit(space, data["sampled"][i : i + 1]))))
             actions.append(action)
@@ -55,34 +55,34 @@ def difference_from(agent: Any, data: Any) -> dict[str, float]:
         if is_on_policy:
             values = agent.value(obs)
         else:
-            given = None if isinstance(space, spaces.Discrete) else data["actions"]
-            values = agent.q_values(obs, given, "all")
+            box_actions = None if isinstance(space, spaces.Discrete) else data["actions"]
+            values = agent.q_values(obs, box_actions, "all")
             values = values[0] if isinstance(space, spaces.Discrete) else values
         log_prob = None
         if "log_probs" in data:
             actor = agent.learner.algorithm.actor(state)
-            actor, seen = (actor[0], scaled(agent, actor[1], obs)) if isinstance(actor, tuple) else (actor, obs)
-            seen = seen if masks is None else Masked(seen, masks)
+            actor, policy_obs = (actor[0], scaled(agent, actor[1], obs)) if isinstance(actor, tuple) else (actor, obs)
+            policy_obs = policy_obs if masks is None else Masked(policy_obs, masks)
             if is_on_policy:
-                distribution = actor.policy(seen)
+                distribution = actor.policy(policy_obs)
                 squashes = agent.config.policy_kwargs.squash_output
                 sampled = data["sampled"] if squashes else unit(space, data["sampled"])
             else:
-                distribution, sampled = squashed_normal(actor, seen), data["sampled"]
+                distribution, sampled = squashed_normal(actor, policy_obs), data["sampled"]
             if isinstance(distribution, TanhNormal):
                 distribution = Normal(distribution.mean, distribution.log_std)
             log_prob = np.asarray(distribution.log_prob(jnp.asarray(sampled)))
     recorded = clipped(space, data["actions"])
-    found = {"values": float(np.abs(values - data["values"]).max())}
+    differences = {"values": float(np.abs(values - data["values"]).max())}
     if isinstance(space, spaces.Box):
-        found["actions"] = float(np.abs(acts - recorded).max())
+        differences["actions"] = float(np.abs(acts - recorded).max())
     else:
-        found["actions"] = float((acts != recorded).mean())
+        differences["actions"] = float((acts != recorded).mean())
     if log_prob is not None:
         squashed = getattr(agent.config.policy_kwargs, "squash_output", True)
         shift = 0.0 if squashed or not isinstance(space, spaces.Box) else np.log((space.high - space.low) / 2).sum()
-        found["log_probs"] = float(np.abs(np.asarray(log_prob) - shift - data["log_probs"]).max())
-    return found
+        differences["log_probs"] = float(np.abs(np.asarray(log_prob) - shift - data["log_probs"]).max())
+    return differences
 
 
 def scaled(agent: Any, statistics: Any, obs: Any) -> Any:

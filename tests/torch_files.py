@@ -36,13 +36,13 @@ class Tensor:
 
 
 def pickled(
-    content: Any, stream: io.BytesIO, place: Callable[[str, int], tuple[Any, ...]], **options: Any
+    content: Any, stream: io.BytesIO, name_storage: Callable[[str, int], tuple[Any, ...]], **options: Any
 ) -> list[bytes]:
     """Pickles ``content`` as PyTorch does and returns the storages of its ``Tensor`` objects, each with one of its own.
 
-    ``place`` returns how a storage is named in the file, by its number and its size.
+    ``name_storage`` returns the name of a storage in the file, by its number and its size.
     """
-    found: list[bytes] = []
+    storages: list[bytes] = []
 
     class Writer(pickle.Pickler):
         def persistent_id(self, obj: Any) -> Any:
@@ -52,24 +52,24 @@ def pickled(
             if not isinstance(obj, Tensor):
                 return NotImplemented
             array = obj.array
-            storage = ("a storage", place(str(len(found)), array.size))
-            found.append(array.tobytes())
+            storage = ("a storage", name_storage(str(len(storages)), array.size))
+            storages.append(array.tobytes())
             strides = tuple(n // 4 for n in array.strides)
             arguments = (storage, 0, array.shape, strides, False, OrderedDict())
             return sys.modules["torch._utils"]._rebuild_tensor_v2, arguments
 
     Writer(stream, **options).dump(content)
-    return found
+    return storages
 
 
 def torch_file(content: Any, storages: Mapping[str, bytes] | None = None) -> bytes:
     """Returns a file of PyTorch; ``storages`` replaces those of the ``Tensor`` objects in ``content``, by number."""
     stream, modules = io.BytesIO(), torch_modules()
-    place = lambda key, size: ("storage", modules["torch"].FloatStorage, key, "cpu", size)  # noqa: E731
+    name_storage = lambda key, size: ("storage", modules["torch"].FloatStorage, key, "cpu", size)  # noqa: E731
     with mock.patch.dict(sys.modules, modules):
-        found = pickled(content, stream, place, protocol=2)
+        tensors = pickled(content, stream, name_storage, protocol=2)
     members = {"data.pkl": stream.getvalue(), "byteorder": b"little"}
-    members |= {f"data/{i}": storage for i, storage in enumerate(found)}
+    members |= {f"data/{i}": storage for i, storage in enumerate(tensors)}
     members |= {f"data/{key}": storage for key, storage in (storages or {}).items()}
     return zipped({f"archive/{name}": value for name, value in members.items()}, zipfile.ZIP_STORED)
 
@@ -102,17 +102,17 @@ def serialized(value: Any) -> dict[str, str]:
     return {":type:": str(type(value)), ":serialized:": base64.b64encode(content).decode()}
 
 
-def old_torch_file(content: Any, kind: str = "FloatStorage", size: int | None = None) -> bytes:
+def old_torch_file(content: Any, storage_type: str = "FloatStorage", size: int | None = None) -> bytes:
     """Returns a file of PyTorch before 1.6 with the arrays of a dict; ``size`` replaces the number of values of storages."""
     stream, modules = io.BytesIO(), torch_modules()
-    modules["torch"].__dict__[kind] = type(kind, (), {"__module__": "torch"})
-    place = lambda key, n: ("storage", getattr(modules["torch"], kind), key, "cpu", size or n, None)  # noqa: E731
+    modules["torch"].__dict__[storage_type] = type(storage_type, (), {"__module__": "torch"})
+    name_storage = lambda key, n: ("storage", getattr(modules["torch"], storage_type), key, "cpu", size or n, None)  # noqa: E731
     with mock.patch.dict(sys.modules, modules):
         for value in (0x1950A86A20F9469CFC6C, 1001, {"protocol_version": 1001, "little_endian": True}):
             pickle.dump(value, stream, protocol=2)
-        found = pickled(content, stream, place, protocol=2)
-        pickle.dump([str(key) for key in range(len(found))], stream, protocol=2)
-    return stream.getvalue() + b"".join(struct.pack("<q", len(one) // 4) + one for one in found)
+        storages = pickled(content, stream, name_storage, protocol=2)
+        pickle.dump([str(key) for key in range(len(storages))], stream, protocol=2)
+    return stream.getvalue() + b"".join(struct.pack("<q", len(storage) // 4) + storage for storage in storages)
 
 
 def vecnormalize_file(obs_rms: Any, protocol: int = 4, **attributes: Any) -> bytes:
@@ -120,21 +120,23 @@ def vecnormalize_file(obs_rms: Any, protocol: int = 4, **attributes: Any) -> byt
     names = ["stable_baselines3", "stable_baselines3.common", "stable_baselines3.common.running_mean_std"]
     names += ["stable_baselines3.common.vec_env", "stable_baselines3.common.vec_env.vec_normalize"]
     modules = {name: types.ModuleType(name) for name in names}
-    kinds = {}
+    classes = {}
     for name, module in (("RunningMeanStd", names[2]), ("VecNormalize", names[4])):
-        kinds[name] = type(name, (), {"__module__": module})
-        setattr(modules[module], name, kinds[name])
+        classes[name] = type(name, (), {"__module__": module})
+        setattr(modules[module], name, classes[name])
 
     def rms(value: Any) -> Any:
-        made = kinds["RunningMeanStd"]()
-        made.mean, made.var = (np.asarray(one, np.float64) for one in value[:2])
-        made.count = value[2]
-        return made
+        statistics = classes["RunningMeanStd"]()
+        statistics.mean, statistics.var = (np.asarray(moment, np.float64) for moment in value[:2])
+        statistics.count = value[2]
+        return statistics
 
-    scaler = kinds["VecNormalize"]()
-    found = {key: rms(one) for key, one in obs_rms.items()} if isinstance(obs_rms, dict) else rms(obs_rms)
+    scaler = classes["VecNormalize"]()
+    obs_statistics = (
+        {key: rms(moments) for key, moments in obs_rms.items()} if isinstance(obs_rms, dict) else rms(obs_rms)
+    )
     defaults = {"norm_obs": True, "norm_reward": True, "clip_obs": 10.0, "clip_reward": 10.0, "epsilon": 1e-8}
-    more = {"gamma": 0.99, "training": True, "obs_rms": found, "ret_rms": rms((0.5, 4.0, 100.0))}
+    more = {"gamma": 0.99, "training": True, "obs_rms": obs_statistics, "ret_rms": rms((0.5, 4.0, 100.0))}
     scaler.__dict__.update({**defaults, **more, **attributes})
     with mock.patch.dict(sys.modules, modules):
         return pickle.dumps(scaler, protocol)

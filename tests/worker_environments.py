@@ -122,13 +122,13 @@ class Rules(gym.Env):
         return obs, reward, over and self.taken % 2 == 0, over and self.taken % 2 == 1, self.info()
 
     def see(self):
-        parts = []
+        masks = []
         for n in sizes(self.action_space):
-            part = self.np_random.random(n) < 0.4
+            mask = self.np_random.random(n) < 0.4
             if not isinstance(self.action_space, spaces.MultiBinary):
-                part[self.np_random.integers(n)] = True
-            parts.append(part)
-        self.mask = np.concatenate(parts)
+                mask[self.np_random.integers(n)] = True
+            masks.append(mask)
+        self.mask = np.concatenate(masks)
         self.masks.append(self.mask)
         return self.np_random.normal(size=2).astype(np.float32)
 
@@ -145,9 +145,9 @@ class Rules(gym.Env):
         assert space.contains(action) or space.contains(np.asarray(action, space.dtype)), action
         if isinstance(space, spaces.MultiBinary):
             return bool(np.all(self.mask | (np.asarray(action) == 0)))
-        chosen = np.atleast_1d(action) - (space.start if isinstance(space, spaces.Discrete) else 0)
+        choices = np.atleast_1d(action) - (space.start if isinstance(space, spaces.Discrete) else 0)
         ends = np.cumsum([0, *sizes(space)])[:-1]
-        return bool(self.mask[ends + chosen].all())
+        return bool(self.mask[ends + choices].all())
 
 
 class Silent(Rules):

@@ -50,7 +50,7 @@ ON_POLICY = ("PPO", "A2C", "TRPO", "ARS", "RecurrentPPO", "MaskablePPO")
 KINDS = [
     *((name, "Box") for name in CONTINUOUS),
     *((name, "Discrete") for name in DISCRETE),
-    *((name, kind) for name in ON_POLICY for kind in ("Box", "Discrete") if (name, kind) != ("MaskablePPO", "Box")),
+    *((name, space) for name in ON_POLICY for space in ("Box", "Discrete") if (name, space) != ("MaskablePPO", "Box")),
 ]
 """Every algorithm with every kind of action that matters to its policy."""
 SMALL: dict[str, dict[str, Any]] = {
@@ -92,7 +92,9 @@ def made(name: str, policy: str, env: Any, **settings: Any) -> agents.Agent:
     """
 
     def zeros(function: Any) -> Any:
-        return lambda *given: jax.tree.map(lambda one: np.zeros(one.shape, one.dtype), jax.eval_shape(function, *given))
+        return lambda *arguments: jax.tree.map(
+            lambda leaf: np.zeros(leaf.shape, leaf.dtype), jax.eval_shape(function, *arguments)
+        )
 
     with shared_learners(), mock.patch.object(xla, "run_once", zeros):
         agent = agents.AGENTS[name](policy, env, **{"seed": 0, **settings})

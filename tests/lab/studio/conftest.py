@@ -19,9 +19,9 @@ class Served:
     def __init__(self, folder, *options, env=None):
         self.folder = Path(folder)
         command = [sys.executable, "-m", "rejeu", "studio", str(folder), "--port", "0", "--no-browser", *options]
-        own = {**os.environ, "PYTHONUNBUFFERED": "1", **(env or {})}
+        environment = {**os.environ, "PYTHONUNBUFFERED": "1", **(env or {})}
         self.process = subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=own, encoding="utf-8"
+            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment, encoding="utf-8"
         )
         self.lines = [self.process.stdout.readline()]
         assert self.lines[0].startswith("http://127.0.0.1:"), self.lines[0] + self.process.stdout.read()
@@ -110,5 +110,5 @@ def common(tmp_path_factory):
     argv = ["train", "CartPole-v1", "--algo", "PPO", "--steps", "128", "--out", str(folder / "trained"), "--seed", "0"]
     argv += ["--evaluate-episodes", "2", "--no-report", "--no-video", "--backend", "gymnasium"]
     assert main([*argv, "--set", "n_steps=64", "policy_kwargs.net_arch=[8]"]) == 0
-    with serving(folder) as one:
-        yield one
+    with serving(folder) as studio:
+        yield studio

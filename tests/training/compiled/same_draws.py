@@ -89,7 +89,9 @@ def use_same_draws(run: Run) -> None:
         if len(shape) > 1:  # the device draws one batch after the other
             batches, drawn = zip(*(announced_draw(rng, shape[1:], progress) for _ in range(shape[0])), strict=True)
             if drawn[0] is not None:
-                position, time = (np.concatenate(parts) for parts in zip(*(one[:2] for one in drawn), strict=True))
+                position, time = (
+                    np.concatenate(parts) for parts in zip(*(indices[:2] for indices in drawn), strict=True)
+                )
                 drawn = (Draw(position, time, drawn[0].version),)
             return jax.tree.map(lambda *leaves: np.stack(leaves), *batches), drawn[0]
         k = buffer.config.n_sampled_goal if isinstance(buffer, HerReplayBuffer) else 0
@@ -108,13 +110,13 @@ def use_same_draws(run: Run) -> None:
         buffer.goal_index = announced_goals
 
 
-def assert_same_learning(one: Any, two: Any, tolerance: float, counters: tuple[str, ...] = ()) -> None:
+def assert_same_learning(agent: Any, other_agent: Any, tolerance: float, counters: tuple[str, ...] = ()) -> None:
     """Asserts that two agents have the same parameters, replay or rollout, episodes and counters."""
-    arrays = ((agent.get_parameters(), agent.run.replay.arrays()) for agent in (one, two))
+    arrays = ((learned.get_parameters(), learned.run.replay.arrays()) for learned in (agent, other_agent))
     for ours, theirs in zip(*arrays, strict=True):
         for name, values in ours.items():
             np.testing.assert_allclose(values, theirs[name], rtol=tolerance, atol=tolerance, err_msg=name)
-    assert len(one.history) == len(two.history)
-    np.testing.assert_allclose(one.history.table()[:, :4], two.history.table()[:, :4], rtol=tolerance)
+    assert len(agent.history) == len(other_agent.history)
+    np.testing.assert_allclose(agent.history.table()[:, :4], other_agent.history.table()[:, :4], rtol=tolerance)
     for name in ("step", "episode", "n_updates", *counters):
-        assert getattr(one.run, name) == getattr(two.run, name), name
+        assert getattr(agent.run, name) == getattr(other_agent.run, name), name
