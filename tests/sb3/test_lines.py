@@ -382,6 +382,29 @@ def test_small_functions(tmp_path):
     assert utils.configure_logger(0).output_formats == []
 
 
+def test_a_row_is_written_without_what_tensorboard_cannot_show(tmp_path):
+    accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    formats = ["stdout", "log", "csv", "json", "tensorboard"]
+    logger = loggers.configure(str(tmp_path), formats)
+    unusual = {"none": None, "dict": {"a": 1}, "ragged": [[1], [1, 2]], "list": [np.zeros(2)], "words": np.array(["a"])}
+    unusual |= {
+        "objects": np.array([None]),
+        "empty": np.zeros(0),
+        "nan": np.full(2, np.nan),
+        "complex": np.complex64(1),
+    }
+    for name, value in unusual.items():
+        logger.record(name, value, exclude="json" if name in ("complex", "ragged") else None)
+    logger.record("some", np.array([1.0, np.nan]))
+    logger.record("flag", np.bool_(True))
+    logger.dump(1)
+    logger.close()
+    row = loggers.read_json(tmp_path / "progress.json")[0]
+    assert (row["none"], row["dict"], row["list"]) == (None, {"a": 1}, [[0.0, 0.0]])
+    seen = accumulator.EventAccumulator(str(tmp_path)).Reload()
+    assert (seen.Tags()["scalars"], seen.Tags()["histograms"]) == (["flag"], ["some"])
+
+
 def test_what_tensorboard_shows(tmp_path):
     accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
     from matplotlib import pyplot

@@ -212,7 +212,7 @@ class TensorBoardOutputFormat(KVWriter):
 
 
 def _add(summary: Any, key: str, value: Any) -> None:
-    """Adds a value to a summary of TensorBoard's."""
+    """Adds a value to a summary of TensorBoard's; None, dicts and lists are left out, as there is no way to show them."""
     if isinstance(value, HParam):
         from tensorboard.plugins.hparams import api_pb2, metadata, plugin_data_pb2  # their summary needs TensorFlow
 
@@ -244,11 +244,10 @@ def _add(summary: Any, key: str, value: Any) -> None:
         _add_image(summary, key, [*np.asarray(value.frames)[0].transpose(0, 2, 3, 1)], value.fps)
     elif isinstance(value, str):
         add_text(summary, key, value)
-    elif np.ndim(value) or (hasattr(value, "dtype") and not isinstance(value, np.generic)):
-        if not isinstance(value, list | tuple):
-            _add_histogram(summary, key, np.asarray(value, np.float64).ravel())
-    else:
+    elif isinstance(value, int | float | np.number | np.bool_) and not isinstance(value, np.complexfloating):
         summary.value.add(tag=key, simple_value=float(value))
+    elif hasattr(value, "dtype") and (array := np.asarray(value)).dtype.kind in "biuf" and np.isfinite(array).any():
+        _add_histogram(summary, key, array[np.isfinite(array)].astype(np.float64))
 
 
 def _add_image(summary: Any, key: str, frames: Sequence[np.ndarray], fps: float = 1.0) -> None:
