@@ -224,6 +224,27 @@ def test_a_logger_that_keeps_values_gets_those_of_the_last_row():
     assert sac.learn(12).logger.name_to_value["train/n_updates"] == 4
 
 
+@pytest.mark.parametrize("algorithm", [sb3.DQN, sb3.A2C])
+def test_a_callback_reads_the_losses_of_the_latest_update(algorithm):
+    env = envs.IdentityEnv(2, ep_length=5)
+    settings = {"learning_starts": 5, "batch_size": 4} if algorithm is sb3.DQN else {}
+    before, after = [], []
+
+    def look(locals_, globals_):
+        logger = locals_["self"].logger
+        (after if locals_["self"]._n_updates else before).append(dict(logger.name_to_value))
+        logger.record("mine/x", 1.0)
+        return True
+
+    model = algorithm("MlpPolicy", env, **settings, **SMALL).learn(30, callback=look)
+    name = "train/loss" if algorithm is sb3.DQN else "train/value_loss"
+    assert name not in before[0]
+    assert np.isfinite(after[-1][name])
+    assert after[-1]["mine/x"] == 1.0
+    assert model.logger.name_to_value["train/n_updates"] == model._n_updates
+    assert model.logger.name_to_value["unknown"] == 0.0
+
+
 class Console(gym.Env):
     """Has what Atari wrappers ask a game: lives, the meanings of actions, frames."""
 

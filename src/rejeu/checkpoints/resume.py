@@ -242,7 +242,7 @@ def restore_counters(agent: AnyAgent, saved: SavedRun) -> None:
     run.seconds = {key: saved.seconds[key] for key in run.seconds}
     agent.call.reset_seconds = number("before", saved.seconds["before"], least=0, most=run.seconds["total"])
     values, agent.logger.name_to_count = saved.logger
-    agent.logger.name_to_value = {key: number(key, value) for key, value in values.items()}
+    agent.logger.values.update({key: number(key, value) for key, value in values.items()})
     agent.n_predictions = saved.n_predictions
 
 

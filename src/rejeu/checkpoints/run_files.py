@@ -325,7 +325,7 @@ def content(agent: AnyAgent, reason: str) -> tuple[JsonObject, dict[str, np.ndar
         "buffer": buffer_content(run),
         "history": agent.record.history.table(),
         "best": best,
-        "logger": [dict(agent.logger.name_to_value), dict(agent.logger.name_to_count)],
+        "logger": [dict(agent.logger.values), dict(agent.logger.name_to_count)],
         "n_predictions": agent.n_predictions,
         "call": None if agent.call.training_call is None else agent.call.training_call.to_json(),
         "callbacks": [[type(callback).__name__, callback.state_dict()] for callback in agent.call.callbacks],

@@ -13,6 +13,7 @@ import socket
 import threading
 import time
 import warnings
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -318,7 +319,7 @@ class Logger:
     def __init__(self) -> None:
         self.outputs: list[Sink] = []
         """The outputs of the current ``learn``."""
-        self.name_to_value: dict[str, float] = {}
+        self.values: dict[str, float] = defaultdict(float)
         """Metrics recorded since the last row."""
         self.name_to_count: dict[str, int] = {}
         """Number of values in each mean since the last row."""
@@ -334,19 +335,19 @@ class Logger:
         Raises:
             TypeError: if the value is not a number.
         """
-        self.name_to_value[key] = _number(key, value)
+        self.values[key] = _number(key, value)
 
     def record_mean(self, key: str, value: object, exclude: str | tuple[str, ...] | None = None) -> None:
         """Records the mean of the values since the last row; None is ignored."""
         if value is None:
             return
         n = self.name_to_count[key] = self.name_to_count.get(key, 0) + 1
-        mean = self.name_to_value.get(key, 0.0)
-        self.name_to_value[key] = mean + (_number(key, value) - mean) / n
+        mean = self.values.get(key, 0.0)
+        self.values[key] = mean + (_number(key, value) - mean) / n
 
     def take(self) -> dict[str, float]:
         """Returns and clears the recorded metrics."""
-        values, self.name_to_value, self.name_to_count = self.name_to_value, {}, {}
+        values, self.values, self.name_to_count = self.values, defaultdict(float), {}
         return values
 
     def dump(self, step: int = 0) -> None:

@@ -493,17 +493,15 @@ class Original(Agent):
             self.logger = logger
             if only and not logger.output_formats:  # statistics that nothing shows need not be computed
                 logger.outputs = []
+        if isinstance(self.logger, loggers.Logger):  # where scripts look for what the last update said
+            self.logger.latest = self.statistics
         self.exploration_rate_set = None
         if reset_num_timesteps:
             self.ep_info_buffer.clear()
             self.ep_success_buffer.clear()
         callbacks = [as_callback(original) for original in callback_list]
         flags = (reset_num_timesteps, progress_bar)
-        super().learn(total_timesteps, callbacks, interval, tb_log_name, *flags, **limits)
-        if isinstance(self.logger, loggers.Logger):  # where scripts look for what the last updates said
-            self.logger.left |= {k: v for k, v in self.statistics().items() if k.startswith("train/")}
-            self.logger.name_to_value |= self.logger.left
-        return self
+        return super().learn(total_timesteps, callbacks, interval, tb_log_name, *flags, **limits)
 
     def get_parameters(self) -> dict[str, dict[str, utils.Tensor]]:  # type: ignore[override]
         """Returns a copy of the algorithm's state: for the networks and for each optimizer the arrays by name.

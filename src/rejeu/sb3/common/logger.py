@@ -286,7 +286,7 @@ class _Rows:
         for key, value in metrics.items():
             self.logger.record(key, value, self.logger.exclusions.pop(key, None))
         self.logger.dump(step)
-        self.logger.left = dict(self.logger.name_to_value)
+        self.logger.left = dict(self.logger.values)
 
     def close(self) -> None:
         """Does nothing: the user closes the logger."""
@@ -309,8 +309,18 @@ class Logger(logging.Logger):
         self.name_to_excluded: dict[str, str | tuple[str, ...] | None] = {}
         self.exclusions: dict[str, str | tuple[str, ...] | None] = {}
         """The ``name_to_excluded`` of the row that :meth:`take` returned."""
+        self.latest: Callable[[], Mapping[str, float]] = dict
+        """Returns the statistics of the agent that trains."""
         self.left: dict[str, float] = {}
         """Values of the last row that a ``dump`` of one's own did not clear."""
+
+    @property
+    def name_to_value(self) -> dict[str, Any]:
+        """The values recorded since the last row, and the ``train/`` statistics of the agent's latest update."""
+        for key, value in self.latest().items():
+            if key.startswith("train/") and (key not in self.values or self.values[key] is self.left.get(key)):
+                self.values[key] = self.left[key] = value
+        return self.values
 
     def record(self, key: str, value: Any, exclude: str | tuple[str, ...] | None = None) -> None:
         """Records a value for the next row, and replaces an earlier one.
@@ -320,7 +330,7 @@ class Logger(logging.Logger):
             value: a number, text, array, :class:`Figure`, :class:`Image`, :class:`Video` or :class:`HParam`.
             exclude: formats that leave it out.
         """
-        self.name_to_value[key], self.name_to_excluded[key] = value, exclude
+        self.values[key], self.name_to_excluded[key] = value, exclude
 
     def record_mean(self, key: str, value: Any, exclude: str | tuple[str, ...] | None = None) -> None:
         """Records the mean of the values since the last row; None is ignored."""
@@ -329,8 +339,8 @@ class Logger(logging.Logger):
 
     def take(self) -> dict[str, Any]:
         """Returns and clears the recorded values."""
-        for key in [key for key, value in self.left.items() if self.name_to_value.get(key) is value]:
-            del self.name_to_value[key]
+        for key in [key for key, value in self.left.items() if self.values.get(key) is value]:
+            del self.values[key]
         self.left = {}
         self.exclusions, self.name_to_excluded = self.name_to_excluded, {}
         return super().take()
