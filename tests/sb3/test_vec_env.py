@@ -381,6 +381,33 @@ def test_statistics_are_saved_without_pickle(tmp_path):
     np.testing.assert_allclose(env.unnormalize_obs(env.normalize_obs(obs)), obs, rtol=1e-5)
 
 
+class Partly(VecNormalize):
+    """Leaves the last number of an observation as it is, and takes halves of rewards into account."""
+
+    def _normalize_obs(self, obs, obs_rms):
+        return np.concatenate([super()._normalize_obs(obs, obs_rms)[..., :-1], obs[..., -1:]], axis=-1)
+
+    def _unnormalize_obs(self, obs, obs_rms):
+        return np.concatenate([super()._unnormalize_obs(obs, obs_rms)[..., :-1], obs[..., -1:]], axis=-1)
+
+    def _update_reward(self, reward):
+        super()._update_reward(reward / 2)
+
+
+def test_subclasses_decide_how_values_are_normalized(tmp_path):
+    env, plain = Partly(walks()), VecNormalize(walks())
+    for wrapper in (env, plain):
+        wrapper.seed(0)
+        wrapper.reset()
+    obs, full = env.step([0, 0])[0], plain.step([0, 0])[0]
+    np.testing.assert_array_equal(obs[:, :-1], full[:, :-1])
+    np.testing.assert_array_equal(obs[:, -1], env.get_original_obs()[:, -1])
+    np.testing.assert_allclose(env.unnormalize_obs(obs), env.get_original_obs(), rtol=1e-5)
+    np.testing.assert_allclose(env.returns, plain.returns / 2)
+    loaded = Partly.load(env.save(tmp_path / "statistics"), walks())
+    np.testing.assert_array_equal(loaded.normalize_obs(env.get_original_obs()), obs)
+
+
 def test_statistics_without_clipping_are_saved(tmp_path):
     env = VecNormalize(walks(), clip_obs=math.inf, clip_reward=math.inf)
     env.reset()

@@ -10,8 +10,9 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 import msgspec
 import numpy as np
@@ -38,13 +39,11 @@ KIND = "vec_normalize"
 """Kind of its files."""
 PICKLES = (b"\x80\x02c", b"\x80\x03c", b"\x80\x04\x95", b"\x80\x05\x95")
 """How the files of Stable-Baselines3 begin."""
-BOUNDS = ("clip_obs", "clip_reward")
-"""Settings that may be infinite, for no clipping. A file then has null, since JSON has no infinity."""
 NonNegative = Annotated[float, Meta(ge=0, le=1e300)]
 
 
 class Settings(msgspec.Struct):
-    """The settings of a wrapper in the header of its file."""
+    """The settings of a wrapper in the header of its file; null for infinity, which JSON does not have."""
 
     clip_obs: NonNegative | None
     clip_reward: NonNegative | None
@@ -134,15 +133,18 @@ class VecNormalize(VecEnvWrapper):
                 raise ValueError(
                     f"norm_obs_keys contains {key!r}, but the observations have the keys {', '.join(parts)}"
                 )
-            _check_box(parts[key], key)
+            if not isinstance(parts[key], spaces.Box):
+                where = f" under {key!r}" if key else ""
+                raise ValueError(
+                    f"VecNormalize only supports Box observations, got {parts[key]}{where}; explicitly pass the "
+                    "observation keys to normalize as norm_obs_keys, or set norm_obs=False"
+                )
         moments = {key: RunningMeanStd(shape=parts[key].shape or ()) for key in keys}
-        normalized = {key: self._box(member) if key in keys else member for key, member in parts.items()}
+        box = partial(spaces.Box, -self.clip_obs, self.clip_obs, dtype=np.float32)
+        normalized = {key: box(member.shape) if key in keys else member for key, member in parts.items()}
         self.norm_obs_keys = keys if is_dict else None
         self.obs_rms = moments if is_dict else moments[""]
         self.observation_space = spaces.Dict(normalized) if is_dict else normalized[""]
-
-    def _box(self, space: spaces.Space) -> spaces.Box:
-        return spaces.Box(-self.clip_obs, self.clip_obs, space.shape, np.float32)
 
     def set_venv(self, venv: VecEnv) -> None:
         """Replaces the wrapped vector environment by another with the same spaces; keeps the statistics.
@@ -173,8 +175,7 @@ class VecNormalize(VecEnvWrapper):
         self.old_obs, self.old_reward = obs, rewards
         self._update(obs)
         if self.training:
-            self.returns = self.returns * self.gamma + rewards
-            self.ret_rms.update(self.returns)
+            self._update_reward(rewards)
         self.old_finals = {
             i: infos[i][TERMINAL_OBSERVATION]
             for i in np.flatnonzero(dones).tolist()
@@ -185,6 +186,10 @@ class VecNormalize(VecEnvWrapper):
         self.returns[dones] = 0.0
         return self.normalize_obs(obs), self.normalize_reward(rewards), dones, infos
 
+    def _update_reward(self, reward: np.ndarray) -> None:
+        self.returns = self.returns * self.gamma + reward
+        self.ret_rms.update(self.returns)
+
     def _update(self, obs: Observation) -> None:
         if self.training and self.norm_obs:
             for key, moments in by_key(self.obs_rms).items():
@@ -192,11 +197,11 @@ class VecNormalize(VecEnvWrapper):
 
     def normalize_obs(self, obs: Observation) -> Any:
         """Returns normalized observations; does not update the statistics."""
-        return self._map(obs, self._scale)
+        return self._map(obs, self._normalize_obs)
 
     def unnormalize_obs(self, obs: Observation) -> Any:
         """Returns the original observations, except where they were clipped."""
-        return self._map(obs, self._unscale)
+        return self._map(obs, self._unnormalize_obs)
 
     def normalize_reward(self, reward: np.ndarray) -> np.ndarray:
         """Returns normalized rewards, ``float32``; does not update the statistics."""
@@ -224,16 +229,21 @@ class VecNormalize(VecEnvWrapper):
         mapped = {**parts, **{key: function(np.asarray(parts[key]), m) for key, m in by_key(self.obs_rms).items()}}
         return mapped.get("", mapped)
 
-    def _scale(self, obs: np.ndarray, moments: RunningMeanStd) -> np.ndarray:
+    def _normalize_obs(self, obs: np.ndarray, moments: RunningMeanStd) -> np.ndarray:
         z = (obs - moments.mean) / np.sqrt(moments.var + self.epsilon)
         return np.clip(z, -self.clip_obs, self.clip_obs).astype(np.float32)
 
-    def _unscale(self, obs: np.ndarray, moments: RunningMeanStd) -> np.ndarray:
+    def _unnormalize_obs(self, obs: np.ndarray, moments: RunningMeanStd) -> np.ndarray:
         return obs * np.sqrt(moments.var + self.epsilon) + moments.mean
 
     def statistics(self) -> dict[str, np.ndarray]:
         """Returns the statistics as arrays by name."""
-        return {f"{name}.{field}": a for name, m in self._moments().items() for field, a in _arrays(m).items()}
+        fields = ("mean", "var", "count")
+        return {
+            f"{name}.{key}": np.array(getattr(m, key), np.float64)
+            for name, m in self._moments().items()
+            for key in fields
+        }
 
     def put_statistics(self, arrays: Mapping[str, np.ndarray], path: str | Path = "the statistics") -> None:
         """Restores what :meth:`statistics` returned; ``path`` names the source in messages.
@@ -262,13 +272,13 @@ class VecNormalize(VecEnvWrapper):
         """
         arrays = self.statistics()
         header = {
-            "settings": {key: _written(key, getattr(self, key)) for key in Settings.__struct_fields__},
+            "settings": {key: _written(getattr(self, key)) for key in Settings.__struct_fields__},
             "keys": None if not isinstance(self.obs_rms, dict) else list(self.obs_rms),
         }
         return checkpoint.write(save_path, KIND, arrays, header)
 
-    @staticmethod
-    def load(load_path: str | Path, venv: VecEnv) -> VecNormalize:
+    @classmethod
+    def load(cls, load_path: str | Path, venv: VecEnv) -> Self:
         """Returns ``venv`` wrapped with the statistics and settings of a file written by :meth:`save`.
 
         A file of Stable-Baselines3 itself is read too, without executing its code.
@@ -280,34 +290,33 @@ class VecNormalize(VecEnvWrapper):
         path = checkpoint.existing(load_path)
         with path.open("rb") as pickle_file:
             if pickle_file.read(3) in PICKLES:
-                return of_original(path, venv)
+                return cls.of_original(path, venv)
         with checkpoint.opened(load_path, KIND) as file:
             try:
                 header = convert(file.header, Header)
-                settings = msgspec.structs.asdict(header.settings)
-                for key in BOUNDS:
-                    settings[key] = math.inf if settings[key] is None else settings[key]
-                new = VecNormalize(venv, **settings, norm_obs_keys=header.keys)
+                named = msgspec.structs.asdict(header.settings).items()
+                settings: Any = {key: math.inf if value is None else value for key, value in named}
+                new = cls(venv, **settings, norm_obs_keys=header.keys)
             except (LookupError, TypeError, ValueError) as error:
                 raise CheckpointError(f"{load_path} does not fit {venv.observation_space}: {error}") from None
             checkpoint.match(new.statistics(), file.specs, load_path)
             new.put_statistics(file.read(), load_path)
         return new
 
-
-def of_original(path: Path, venv: VecEnv) -> VecNormalize:
-    """Returns ``venv`` wrapped with the statistics and settings of a file of Stable-Baselines3 itself."""
-    with explained(path):
-        state = read_normalization(path)
-        settings = {key: state[key] for key in Settings.__struct_fields__}
-        new, arrays = VecNormalize(venv, **settings, norm_obs_keys=state.get("norm_obs_keys")), {}
-        for name in new.statistics():
-            moments_name, *index, field = name.split(".")
-            moments = state["ret_rms" if moments_name == "returns" else "obs_rms"]
-            moments = moments[[*new.obs_rms][int(index[0])]] if index else moments
-            arrays[name] = np.asarray(array_of(moments.state[field]), np.float64)
-        new.put_statistics(arrays, path)
-    return new
+    @classmethod
+    def of_original(cls, path: Path, venv: VecEnv) -> Self:
+        """Returns ``venv`` wrapped with the statistics and settings of a file of Stable-Baselines3 itself."""
+        with explained(path):
+            state = read_normalization(path)
+            settings = {key: state[key] for key in Settings.__struct_fields__}
+            new, arrays = cls(venv, **settings, norm_obs_keys=state.get("norm_obs_keys")), {}
+            for name in new.statistics():
+                moments_name, *index, field = name.split(".")
+                moments = state["ret_rms" if moments_name == "returns" else "obs_rms"]
+                moments = moments[[*new.obs_rms][int(index[0])]] if index else moments
+                arrays[name] = np.asarray(array_of(moments.state[field]), np.float64)
+            new.put_statistics(arrays, path)
+        return new
 
 
 def unwrap_vec_normalize(env: VecEnv) -> VecNormalize | None:
@@ -337,20 +346,5 @@ def sync_envs_normalization(env: VecEnv, eval_env: VecEnv) -> None:
         env, eval_env = env.venv, eval_env.venv
 
 
-def _arrays(moments: RunningMeanStd) -> dict[str, np.ndarray]:
-    return {"mean": moments.mean, "var": moments.var, "count": np.array(moments.count, np.float64)}
-
-
-def _written(key: str, value: float) -> float | bool | None:
-    if key in ("training", "norm_obs", "norm_reward"):
-        return bool(value)
-    return None if value == math.inf else float(value)
-
-
-def _check_box(space: spaces.Space, key: str) -> None:
-    if not isinstance(space, spaces.Box):
-        where = f" under {key!r}" if key else ""
-        raise ValueError(
-            f"VecNormalize only supports Box observations, got {space}{where}; explicitly pass the observation keys "
-            "to normalize as norm_obs_keys, or set norm_obs=False"
-        )
+def _written(value: float) -> float | bool | None:
+    return None if value == math.inf else np.asarray(value).item()
