@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import rejeu
+import rejeu.sb3
 from rejeu.logs.logging import CsvFile, Logger
 from rejeu.sb3.common.callbacks import (
     BaseCallback,
@@ -54,6 +55,37 @@ def test_a_callback_stops_training_and_knows_the_agent():
     assert note.training_env is agent.get_env()
     agent.learn(2, callback=note, reset_num_timesteps=False)
     assert note.seen[-1] == (4, 4)
+
+
+def test_the_total_of_steps_counts_those_before():
+    note = Note(lambda self: (self.num_timesteps, self.locals["total_timesteps"], self.model._total_timesteps))
+    agent = rejeu.sb3.DQN("MlpPolicy", Walk(), learning_starts=1000, policy_kwargs={"net_arch": [4]})
+    assert agent._total_timesteps == 0
+    agent.learn(2, callback=note)
+    agent.learn(3, callback=[note, ProgressBarCallback()], reset_num_timesteps=False)
+    assert note.seen == [(1, 2, 2), (2, 2, 2), (3, 5, 5), (4, 5, 5), (5, 5, 5)]
+    assert agent._total_timesteps == 5
+
+
+def test_a_variable_that_the_loop_does_not_have_is_explained():
+    note = Note(lambda self: (self.locals.get("obs_tensor"), self.locals["clipped_actions"] is self.locals["actions"]))
+    dqn().learn(1, callback=note)
+    assert note.seen == [(None, True)]
+    with pytest.raises(KeyError, match=r"locals has no 'obs_tensor', but .*new_obs.*rollout_buffer"):
+        dqn().learn(1, callback=Note(lambda self: self.locals["obs_tensor"]))
+
+
+def test_a_subclass_of_the_evaluation_sees_every_step():
+    class Seeing(EvalCallback):
+        n_seen = 0
+
+        def _log_success_callback(self, locals_, globals_):
+            super()._log_success_callback(locals_, globals_)
+            self.n_seen += 1
+
+    evaluate = Seeing(Walk(0), eval_freq=4, n_eval_episodes=2, verbose=0)
+    dqn().learn(4, callback=evaluate)
+    assert evaluate.n_seen == 6  # two episodes of three steps
 
 
 @pytest.mark.parametrize("callback", [Note(goes_on=lambda self: None), ConvertCallback(lambda _locals, _globals: None)])

@@ -207,6 +207,9 @@ class Original(Agent):
             return getattr(self.policy, name)
         if name in RUN:
             return getattr(self.run, RUN[name])
+        if name == "_total_timesteps":
+            call = self.call.training_call
+            return 0 if call is None or call.n_steps is None else call.steps_before + call.n_steps
         if name in ("_logger", "_vec_normalize_env"):
             return self.logger if name == "_logger" else self.get_vec_normalize_env()
         if name in ("log_ent_coef", "ent_coef_tensor") and hasattr(self.learner.shapes, "log_alpha"):

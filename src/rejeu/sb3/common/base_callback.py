@@ -27,6 +27,13 @@ from rejeu.sb3.common.vec_env.base_vec_env import TERMINAL_OBSERVATION, TIME_LIM
 from rejeu.training.run import Progress
 
 
+class Locals(dict[str, Any]):
+    """The variables of the loop by name."""
+
+    def __missing__(self, name: str) -> Any:
+        raise KeyError(f"locals has no {name!r}, but {', '.join(self)}; model.rollout_buffer has values and log_probs")
+
+
 class BaseCallback(TrainingCallback):
     """Base class of the callbacks of ``learn``. Abstract: subclasses implement ``_on_step``.
 
@@ -58,7 +65,7 @@ class BaseCallback(TrainingCallback):
         self.num_timesteps = 0
         """Number of environment steps, as ``model.num_timesteps``."""
         self.locals: Variables = {}
-        """Variables of the loop: ``actions``, ``new_obs``, ``rewards``, ``dones``, ``infos``, ``self`` and ``env``."""
+        """Variables of the loop, such as ``actions``, ``new_obs``, ``rewards``, ``dones``, ``infos``, ``self`` and ``env``."""
         self.globals: Variables = {}
         self.parent: BaseCallback | None = None
         """The callback that calls this one, if there is one."""
@@ -68,14 +75,14 @@ class BaseCallback(TrainingCallback):
         call = agent.call.training_call
         assert call is not None
         self.init_callback(agent)
-        attributes = {
-            "self": agent,
-            "env": agent.get_env(),
-            "callback": self,
-            "total_timesteps": None if call.last_step is None else call.last_step - agent.run.step,
-            "log_interval": call.log_interval,
-            "reset_num_timesteps": call.steps_before == 0,
-        }
+        attributes = Locals(
+            self=agent,
+            env=agent.get_env(),
+            callback=self,
+            total_timesteps=None if call.n_steps is None else call.steps_before + call.n_steps,
+            log_interval=call.log_interval,
+            reset_num_timesteps=call.steps_before == 0,
+        )
         self.on_training_start(attributes, globals())
         self.on_rollout_start()
 
@@ -88,6 +95,7 @@ class BaseCallback(TrainingCallback):
             {
                 "progress": progress,
                 "actions": progress.action,
+                "clipped_actions": progress.action,
                 "new_obs": agent.run.obs,
                 "rewards": result.reward,
                 "dones": result.terminated | result.truncated,

@@ -176,7 +176,7 @@ class EvalCallback(EventCallback):
         if self.model.get_vec_normalize_env() is not None:
             sync_envs_normalization(self.training_env, self.eval_env)
         self._is_success_buffer = []
-        settings = self.n_eval_episodes, self.deterministic, self.render, self._record_success
+        settings = self.n_eval_episodes, self.deterministic, self.render, self._log_success_callback
         returns, lengths = evaluate_policy(self.model, self.eval_env, *settings, return_episode_rewards=True)
         assert isinstance(returns, list)
         assert isinstance(lengths, list)
@@ -194,7 +194,7 @@ class EvalCallback(EventCallback):
                 continues = self.callback_on_new_best.on_step()
         return continues and self._on_event()
 
-    def _record_success(self, locals_: Variables, globals_: Variables) -> None:
+    def _log_success_callback(self, locals_: Variables, globals_: Variables) -> None:
         if locals_["done"] and (success := locals_["info"].get("is_success")) is not None:
             self._is_success_buffer.append(bool(success))
 
@@ -301,7 +301,7 @@ class ProgressBarCallback(BaseCallback):
         self._bar: Any = None
 
     def _on_training_start(self) -> None:
-        self._bar = ProgressBar(self.locals["total_timesteps"], None)
+        self._bar = ProgressBar.of(self.locals["self"].call.training_call)
 
     def _on_step(self) -> bool:
         self._bar(self.model, self.locals["progress"])
