@@ -85,6 +85,17 @@ def test_a_step_is_added():
     assert (buffer.actions[-1, 0], buffer.next_observations[-1, 0].tolist()) == (0.5, [1.0] * 3)
 
 
+def test_a_step_without_the_axis_of_environments_is_added():
+    buffer = SAC("MlpPolicy", gym.make("Pendulum-v1"), learning_starts=100, **TINY).learn(5).replay_buffer
+    buffer.add(np.array([1.0, 2.0, 3.0]), np.array([4.0, 5.0, 6.0]), np.array([0.5]), 2.0, True, [{}])
+    assert buffer.observations[-1, 0].tolist() == [1.0, 2.0, 3.0]
+    assert buffer.next_observations[-1, 0].tolist() == [4.0, 5.0, 6.0]
+    assert (buffer.rewards[-1, 0], buffer.dones[-1, 0]) == (2.0, 1.0)
+    model = DQN("MlpPolicy", gym.make("FrozenLake-v1"), learning_starts=100, **TINY).learn(5)
+    model.replay_buffer.add(3, np.array([[7]]), 1, 1, False, [{}])
+    assert (model.replay_buffer.observations[-1].item(), model.replay_buffer.next_observations[-1].item()) == (3, 7)
+
+
 def test_a_replay_buffer_draws_what_vec_normalize_scales():
     model = made(buffers.ReplayBuffer)
     env = VecNormalize(dummy(lambda: gym.make("Pendulum-v1")), norm_obs=False)

@@ -17,7 +17,7 @@ from rejeu.core.algorithm import unmasked
 from rejeu.core.types import Observation
 from rejeu.replay.hindsight import GoalSelectionStrategy
 from rejeu.replay.ring import LAST, TERMINATED
-from rejeu.sb3.common.preprocessing import get_action_dim, get_obs_shape
+from rejeu.sb3.common.preprocessing import get_action_dim, get_obs_shape, maybe_transpose
 from rejeu.sb3.common.type_aliases import (
     DictReplayBufferSamples,
     DictRolloutBufferSamples,
@@ -157,7 +157,7 @@ class ReplayBuffer(BaseBuffer):
         """Adds one step of every environment to the buffer of the agent, whose running episodes end.
 
         Args:
-            obs: observations before the step, ``(n_envs, ...)``.
+            obs: observations before the step, ``(n_envs, ...)``; of one environment also without this axis.
             next_obs: those after it, the final ones where an episode ended.
             action: ``(n_envs, action_dim)``, in [-1, 1].
             reward: ``(n_envs,)``.
@@ -165,7 +165,9 @@ class ReplayBuffer(BaseBuffer):
             infos: one dict for each environment; ``TimeLimit.truncated`` says whether only a time limit ended it.
         """
         timeouts = np.array([bool(info.get(TIME_LIMIT_TRUNCATED, False)) for info in infos])
-        terminated, reward = np.asarray(done, bool) & ~timeouts, np.asarray(reward, np.float32)
+        terminated, reward = np.ravel(done).astype(bool) & ~timeouts, np.ravel(reward).astype(np.float32)
+        rows = lambda leaf, space: maybe_transpose(np.asarray(leaf), space).reshape(self.n_envs, *space.shape)  # noqa: E731
+        obs, next_obs = (by_leaf(rows, tree, self.observation_space) for tree in (obs, next_obs))
         # Methods of the class take what is given, also behind those of VecNormalize.
         ring, buffer_class = self.core.ring, type(self.core)
         buffer_class.begin(self.core, obs)
