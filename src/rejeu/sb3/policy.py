@@ -130,17 +130,11 @@ class BaseModel:
     def set_training_mode(self, mode: bool) -> None:
         """Does nothing: no layer of rejeu computes otherwise while it acts."""
 
-    def train(self, mode: bool = True) -> Self:
-        """Returns itself."""
+    def to(self, device: object = None) -> Self:
+        """Returns itself: an agent stays on the device that it was made for, and is not told when it is trained."""
         return self
 
-    def eval(self) -> Self:
-        """Returns itself."""
-        return self
-
-    def to(self, device: object) -> Self:
-        """Returns itself: an agent stays on the device that it was made for."""
-        return self
+    train = eval = to
 
     def is_vectorized_observation(self, observation: Observation) -> bool:
         """Returns whether an observation is a batch; images may have their channels first or last."""
@@ -273,7 +267,7 @@ class BasePolicy(BaseModel):
             if has:
                 module_class = Actor if "actor" in name else ContinuousCritic if "critic" in name else QNetwork
                 return module_class.of(self.model, frozenset(has))
-        raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
+        raise AttributeError(f"{type(self).__name__} has no {name!r}; see state_dict() and model.learning_rate")
 
     def scale_action(self, action: np.ndarray) -> np.ndarray:
         """Returns actions of the environment's range in [-1, 1]."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import glob
 import os
 import platform
 import random
@@ -57,8 +56,9 @@ class FloatSchedule:
     def __init__(self, value_schedule: Any) -> None:
         if isinstance(value_schedule, FloatSchedule):
             value_schedule = value_schedule.value_schedule
-        is_schedule = callable(value_schedule)
-        self.value_schedule: Any = value_schedule if is_schedule else ConstantSchedule(float(value_schedule))
+        self.value_schedule: Any = (
+            value_schedule if callable(value_schedule) else ConstantSchedule(float(value_schedule))
+        )
 
     def __call__(self, progress_remaining: float) -> float:
         return float(self.value_schedule(progress_remaining))
@@ -90,19 +90,7 @@ class LinearSchedule:
         return Linear(self.start, self.end, self.end_fraction)
 
 
-def get_linear_fn(start: float, end: float, end_fraction: float) -> LinearSchedule:
-    """Returns a linear schedule from ``start`` to ``end``, which is reached after the fraction ``end_fraction`` of the run."""
-    return LinearSchedule(start, end, end_fraction)
-
-
-def constant_fn(val: float) -> ConstantSchedule:
-    """Returns a schedule that is constant."""
-    return ConstantSchedule(val)
-
-
-def get_schedule_fn(value_schedule: object) -> FloatSchedule:
-    """Returns a number or a function of the remaining progress as a function of the remaining progress."""
-    return FloatSchedule(value_schedule)
+get_linear_fn, constant_fn, get_schedule_fn = LinearSchedule, ConstantSchedule, FloatSchedule
 
 
 def of_progress(value: object) -> Any:
@@ -135,8 +123,7 @@ class Device(str):
     @property
     def type(self) -> str:
         """``"cpu"`` or ``"cuda"``; of ``"auto"`` JAX's default."""
-        name = jax.default_backend() if self == "auto" else str(self)
-        return "cuda" if name in ("gpu", "cuda") else "cpu"
+        return "cuda" if (jax.default_backend() if self == "auto" else self) in ("gpu", "cuda") else "cpu"
 
 
 def get_device(device: object = "auto") -> Device:
@@ -168,17 +155,11 @@ class Tensor(np.ndarray):
         """Returns a plain array."""
         return self.view(np.ndarray)
 
-    def detach(self) -> Tensor:
-        """Returns itself."""
-        return self
-
-    def cpu(self) -> Tensor:
-        """Returns itself."""
-        return self
-
     def to(self, *args: object, **kwargs: Any) -> Tensor:
         """Returns itself."""
         return self
+
+    detach = cpu = to
 
     def mean(self, axis: Any = None, *args: Any, dim: Any = None, **kwargs: Any) -> Any:
         """Returns means over an axis, which PyTorch calls ``dim``."""
@@ -188,9 +169,7 @@ class Tensor(np.ndarray):
         """Returns sums over an axis, which PyTorch calls ``dim``."""
         return super().sum(axis if dim is None else dim, *args, **kwargs)
 
-    def clone(self) -> Tensor:
-        """Returns a copy."""
-        return self.copy()
+    clone = np.ndarray.copy
 
     @classmethod
     def __torch_function__(
@@ -212,8 +191,7 @@ def explained_variance(y_pred: np.ndarray, y_true: np.ndarray) -> float:
 def get_latest_run_id(log_path: str | Path = "", log_name: str = "") -> int:
     """Returns the highest k of the folders ``{log_name}_{k}`` in ``log_path``, 0 if there is none."""
     name = re.compile(re.escape(log_name) + r"_(\d+)")
-    paths = glob.glob(os.path.join(glob.escape(str(log_path)), "*"))
-    run_ids = (name.fullmatch(os.path.basename(path)) for path in paths)
+    run_ids = (name.fullmatch(path.name) for path in Path(log_path).glob("*"))
     return max((int(match[1]) for match in run_ids if match), default=0)
 
 
