@@ -95,7 +95,7 @@ def assert_same_batches(replay: DeviceReplay, buffer: Any, stops: bool, exact: b
             np.testing.assert_array_equal(rows.time, drawn.time)
         del buffer.draw
         if isinstance(buffer, HerReplayBuffer):
-            del buffer.goal_index
+            del buffer.goal_index, buffer.chosen_by
         for one, two in zip(jax.tree.leaves(batch), jax.tree.leaves(expected), strict=True):
             assert one.dtype == two.dtype
             np.testing.assert_allclose(one, two, rtol=0, atol=0 if exact else 1e-6)

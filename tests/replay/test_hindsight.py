@@ -240,6 +240,21 @@ def test_strategies_have_their_shares_of_every_batch_and_desired_takes_that_of_a
     assert stats.chisquare(counts).pvalue > 1e-3
 
 
+def test_a_subclass_chooses_the_goals_of_whole_batches_also_of_a_mix():
+    class Counted(HerReplayBuffer):
+        sizes = []
+
+        def goal_index(self, rng, env, time, step):
+            self.sizes.append(len(env))
+            return super().goal_index(rng, env, time, step)
+
+    replay, _ = filled(1, 16, [turn("no", "no")] * 10, MIXES[0])
+    counted = Counted(replay.ring, GAMMA, replay.config, replay.goals)
+    goals = counted.sample(np.random.default_rng(0), (50,)).obs["desired_goal"]
+    assert Counted.sizes == [40]
+    assert np.array_equal(goals, replay.sample(np.random.default_rng(0), (50,)).obs["desired_goal"])
+
+
 def test_a_mix_reads_the_counters_that_any_of_its_strategies_needs():
     for strategy, expected in zip(MIXES, [("until_end",), ("since_start", "until_end"), ()], strict=True):
         assert counters(HindsightConfig(goal_selection_strategy=strategy)) == expected

@@ -378,9 +378,7 @@ class HerReplayBuffer(BaseReplayBuffer):
         reward, terminated = self.goals
         return GoalFunctions(partial(reward, infos=infos), terminated and partial(terminated, infos=infos))
 
-    def goal_index(
-        self, rng: np.random.Generator, env: np.ndarray, time: np.ndarray, step: np.ndarray, strategy: Any = None
-    ) -> np.ndarray:
+    def goal_index(self, rng: np.random.Generator, env: np.ndarray, time: np.ndarray, step: np.ndarray) -> np.ndarray:
         """Returns the positions ``(n,)`` of the rows whose goals are new ones: achieved goals, desired ones by ``desired``.
 
         Args:
@@ -388,10 +386,15 @@ class HerReplayBuffer(BaseReplayBuffer):
             env: environments of the relabeled rows, ``(n,)``.
             time: their times, as in :data:`GoalStrategy`, ``(n,)``.
             step: their records, ``(n,)``, with the :func:`counters` of the strategy, as :class:`Ring` keeps them.
-            strategy: None for that of the settings.
         """
-        if isinstance(strategy := strategy or self.config.goal_selection_strategy, MixedStrategies):
-            return np.asarray(strategy.joined(np, lambda _, *rows: self.goal_index(rng, *rows), env, time, step))
+        if isinstance(strategy := self.config.goal_selection_strategy, MixedStrategies):
+            return np.asarray(strategy.joined(np, lambda _, *rows: self.chosen_by(rng, *rows), env, time, step))
+        return self.chosen_by(rng, env, time, step, strategy)
+
+    def chosen_by(
+        self, rng: np.random.Generator, env: np.ndarray, time: np.ndarray, step: np.ndarray, strategy: Any
+    ) -> np.ndarray:
+        """Returns the positions that one strategy chooses; the other arguments are those of :meth:`goal_index`."""
         ring, newest = self.ring, self.ring.head[env]
 
         def begin(times: np.ndarray) -> np.ndarray:

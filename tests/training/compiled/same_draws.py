@@ -83,7 +83,7 @@ def use_same_draws(run: Run) -> None:
     rng: Any = SameDraws(run)
     run.rng = rng
     buffer = run.replay
-    draw, goal_index = buffer.draw, getattr(buffer, "goal_index", None)
+    draw = buffer.draw
 
     def announced_draw(rng: Any, shape: tuple[int, ...], progress: float = 1.0) -> Any:
         if len(shape) > 1:  # the device draws one batch after the other
@@ -98,16 +98,21 @@ def use_same_draws(run: Run) -> None:
         rng.begin_batch(shape[0], int(shape[0] * k / (k + 1)))
         return draw(rng, shape, progress)
 
-    def announced_goals(rng: Any, env: np.ndarray, time: np.ndarray, step: np.ndarray, strategy: Any = None) -> Any:
-        if strategy is None:
-            rng.begin_goals()
-        elif len(env) < rng.sizes[1]:  # one of several strategies
-            rng.begin_strategy(len(env))
-        return goal_index(rng, env, time, step, strategy)
-
     buffer.draw = announced_draw
-    if goal_index is not None:
-        buffer.goal_index = announced_goals
+    if not isinstance(buffer, HerReplayBuffer):
+        return
+    goal_index, chosen_by = buffer.goal_index, buffer.chosen_by
+
+    def announced_goals(*arguments: Any) -> Any:
+        rng.begin_goals()
+        return goal_index(*arguments)
+
+    def announced_choice(same_rng: Any, env: np.ndarray, *arguments: Any) -> Any:
+        if len(env) < rng.sizes[1]:  # one of several strategies
+            rng.begin_strategy(len(env))
+        return chosen_by(same_rng, env, *arguments)
+
+    buffer.goal_index, buffer.chosen_by = announced_goals, announced_choice
 
 
 def assert_same_learning(agent: Any, other_agent: Any, tolerance: float, counters: tuple[str, ...] = ()) -> None:
