@@ -55,6 +55,19 @@ def test_hindsight_is_searched_where_it_is_used():
     assert plans.make("parking-v0").search_space["replay_buffer_kwargs.n_sampled_goal"] == Integers(1, 5)
 
 
+def test_the_first_trial_may_have_the_choices_of_the_default():
+    mix = {"future": 2, "desired": 2}
+    fetch = presets.find("FetchPickAndPlace-v4")
+    for preset, name, value in (
+        (fetch, "replay_buffer_kwargs.goal_selection_strategy", mix),
+        (fetch, "policy_kwargs.net_arch", [128, 128, 128]),
+        (presets.find("CartPole-v1", "PPO"), "clip_range", 0.2),  # the start of a schedule, which is a choice already
+    ):
+        space = plans.make(preset.env_id, preset=preset).search_space
+        assert value in space[name].values
+        assert space[name].values.count(value) == 1
+
+
 @pytest.mark.parametrize(
     ("changes", "error", "message"),
     [

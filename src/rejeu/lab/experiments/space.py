@@ -107,17 +107,10 @@ def suggested(trial: BaseTrial, space: SearchSpace) -> Settings:
 
 
 def parameters(space: SearchSpace, config: Mapping[str, object]) -> Settings:
-    """Returns Optuna's parameters for those hyperparameters of a configuration, as JSON, that lie in the space.
-
-    The value of a schedule is its start.
-    """
+    """Returns Optuna's parameters for those hyperparameters of a configuration, as JSON, that lie in the space."""
     params: Settings = {}
     for name, dimension in space.items():
-        value: Any = config
-        for key in name.split("."):
-            value = value.get(key) if isinstance(value, Mapping) else None
-        if isinstance(value, Mapping) and "schedule" in value:
-            value = value["start"]
+        value: Any = value_of(config, name)
         if not dimension.contains(value):
             continue
         if isinstance(dimension, Choice):
@@ -127,6 +120,18 @@ def parameters(space: SearchSpace, config: Mapping[str, object]) -> Settings:
         else:
             params[name] = value
     return params
+
+
+def value_of(config: Mapping[str, object], name: str) -> object:
+    """Returns the value of a dotted name in a configuration as JSON, the start of a schedule; None if there is none.
+
+    >>> value_of({"policy_kwargs": {"net_arch": [8]}}, "policy_kwargs.net_arch")
+    [8]
+    """
+    value: object = config
+    for key in name.split("."):
+        value = value.get(key) if isinstance(value, Mapping) else None
+    return value["start"] if isinstance(value, Mapping) and "schedule" in value else value
 
 
 def label(value: object) -> str | int | float | bool | None:

@@ -15,7 +15,7 @@ from msgspec import Meta
 from rejeu.agents import AGENTS, agent_of_file, find_agent, presets
 from rejeu.agents.presets import Preset
 from rejeu.algorithms import config as configs
-from rejeu.algorithms.search import HINDSIGHT, Dimension, SearchSpace
+from rejeu.algorithms.search import HINDSIGHT, Choice, Dimension, SearchSpace
 from rejeu.core import validation
 from rejeu.core.errors import CheckpointError
 from rejeu.core.records import Seed, convert, json_text
@@ -174,14 +174,22 @@ def choose_space(
 ) -> SearchSpace:
     """Returns the search space of a study, in which every extreme value is known to be valid.
 
+    A choice that the algorithm declares gets the value of the default as well, so that the first trial has it.
+
     Raises:
         ValueError: if nothing is left to search, or a value is out of range.
         TypeError: for a name that the algorithm does not have.
     """
     config_class = AGENTS[algorithm].algorithm.Config
+    config = validation.build(config_class, values)
     declared: dict[str, Dimension] = dict(getattr(config_class, "search_space", {}))
-    if getattr(validation.build(config_class, values), "hindsight", None) is not None:
+    if getattr(config, "hindsight", None) is not None:
         declared |= HINDSIGHT
+    defaults = configs.to_json(config)
+    for name, dimension in declared.items():
+        default = spaces.value_of(defaults, name)
+        if isinstance(dimension, Choice) and default is not None and not dimension.contains(default):
+            declared[name] = Choice((*dimension.values, default))
     space = {name: dimension for name, dimension in declared.items() if not is_set(fixed, name)} | dict(search)
     for name in only:
         if name not in space:
