@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import rejeu
-from rejeu.lab.cli import main
-from rejeu.logs.evaluation import Evaluation
+from rejeu.lab.cli import courses, main
+from rejeu.logs.evaluation import Evaluation, evaluate
 from rejeu.teaching.courses import leaderboard
 
 pytestmark = pytest.mark.usefixtures("learners_are_shared")
@@ -75,6 +75,23 @@ def test_models_are_ranked_and_other_files_get_one_line_each(folder, tmp_path, c
     assert "cut: " in printed.err
     board = run(folder, tmp_path / "board.json", "--env", "MountainCar-v0")
     assert [model["name"] for model in board["models"]] == ["other"]
+
+
+def test_many_episodes_are_played_in_few_environments_and_are_the_same(folder, tmp_path, monkeypatch):
+    numbers_of_envs = []
+
+    def counted(choose, env, *arguments):
+        numbers_of_envs.append(env.n_envs)
+        return evaluate(choose, env, *arguments)
+
+    monkeypatch.setattr(leaderboard, "evaluate", counted)
+    options = ("--seed", "7", "--episodes", "5")
+    at_once = run(folder, tmp_path / "at_once.json", *options)["models"][0]
+    monkeypatch.setattr(courses, "MOST_ENVS", 2)
+    in_turns = run(folder, tmp_path / "in_turns.json", *options)["models"][0]
+    assert numbers_of_envs == [5, 5, 2, 2, 2, 2, 2, 2]  # two models
+    assert sorted(in_turns["returns"]) == sorted(at_once["returns"])
+    assert in_turns["mean_length"] == at_once["mean_length"]
 
 
 def test_the_places_of_a_model_are_those_that_the_intervals_allow():

@@ -7,6 +7,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+from rejeu.agents.policy import MOST_ENVS
 from rejeu.core import atomic
 from rejeu.core.language import chosen, said
 from rejeu.core.types import JsonObject
@@ -68,7 +69,7 @@ def run_class(arguments: Class) -> tuple[int, JsonObject]:
     echo(said("{}, {} episodes of each of {} models", environment, episodes, len(paths), language=language))
     settings = episodes, arguments.seed, 60 * arguments.minutes, arguments.success_threshold
     results = {}
-    with closing(environment.vector(episodes, "gymnasium", arguments.seed)) as env:
+    with closing(environment.vector(min(episodes, MOST_ENVS), "gymnasium", arguments.seed)) as env:
         for path in paths:
             name = leaderboard.name_of(path, arguments.folder, paths)
             results[path] = result = leaderboard.result_of(path, name, environment.env_id, env, *settings)

@@ -226,7 +226,7 @@ def result_of(
         path: the model.
         name: its name on the leaderboard.
         env_id: the environment that it must have been trained on.
-        env: as many environments as episodes.
+        env: the environments, at most as many as episodes, which play them in turns. Each episode has a seed of its own.
         episodes: number of episodes.
         seed: seed of the environments, the same for all models.
         seconds: time of the model, without compilation.
@@ -251,7 +251,14 @@ def result_of(
                 raise Unranked("it needs more than {:g} seconds for {} episodes", seconds, episodes)
             return choose(obs, started)
 
-        result = evaluate(within_budget, env, episodes, success_threshold, seed)
+        evaluations = list[Evaluation]()
+        for n_done in range(0, episodes, env.n_envs):
+            n = min(env.n_envs, episodes - n_done)  # which the last n environments play
+            of_first = seed + n_done + n - env.n_envs
+            evaluations.append(evaluate(within_budget, env, n, success_threshold, of_first))
+        columns = ("returns", "lengths", "successes")
+        arrays = [np.concatenate([getattr(evaluation, column) for evaluation in evaluations]) for column in columns]
+        result = Evaluation(arrays[0], arrays[1], arrays[2], sum(evaluation.cut for evaluation in evaluations))
         if not np.isfinite(result.returns).all():
             return Unranked("the return of an episode is not a finite number")
         return Entrant(name, agent.name, agent.num_timesteps, agent.seed, result)
