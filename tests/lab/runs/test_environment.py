@@ -134,6 +134,14 @@ def test_a_file_in_a_folder_with_py_in_its_name_and_one_that_registers_a_class(h
     assert main(["check", "drift_env.py", "--wrapper", "drift_env:Double"]) == 0  # imported for its wrapper first
 
 
+@pytest.mark.parametrize("name", ["drift.env", ".drift"])
+def test_a_file_whose_name_no_module_can_have_is_to_be_renamed(here, capsys, name):
+    (here / "drift_env.py").rename(here / f"{name}.py")
+    advice = f"the name of a module has no dot; rename {name}.py to {name.replace('.', '_')}.py"
+    assert advice in error_of(capsys, "check", f"{name}.py:Drift-v0")
+    assert advice in error_of(capsys, "check", "CartPole-v1", "--import", f"{name}.py")
+
+
 @pytest.mark.parametrize(
     ("source", "message"),
     [

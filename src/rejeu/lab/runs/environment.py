@@ -130,10 +130,12 @@ def import_file(path: Path) -> Any:
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ImportError: if another module has its name.
+        ImportError: if another module has its name, or no module can have it.
     """
     if not path.is_file():
         raise FileNotFoundError(f"there is no file {path}")
+    if "." in path.stem:
+        raise ImportError(f"the name of a module has no dot; rename {path} to {path.stem.replace('.', '_')}.py")
     folder = str(path.resolve().parent)
     if folder not in sys.path:
         sys.path.append(folder)
