@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import rejeu
+from rejeu.demonstrations import Demonstrations, clone
 from rejeu.envs.make import make_vector
 from tests import jax_environments
 from tests.environments import Counter, Reach
@@ -168,6 +169,12 @@ def test_what_does_not_fit_the_actions_is_refused() -> None:
     with pytest.raises(ValueError, match="action_repeat=2 holds an action that later masks may forbid"):
         rejeu.DQN("MlpPolicy", "CartPole-v1", action_masks=True, action_repeat=2)
     agent = held_sac(Counter())
+    whole = held_sac(Counter(), action_share=1.0)
+    shown = Demonstrations((), whole.observation_space, whole.action_space)
+    with pytest.raises(
+        ValueError, match=r"was made for .*, limited by action_share=0\.5; leave it out to use all actions"
+    ):
+        clone(agent, shown)
     for name in ("action_repeat", "action_share"):
         with pytest.raises(ValueError, match=f"{name} cannot be set on a SAC"):
             setattr(agent, name, 1)

@@ -293,7 +293,9 @@ class AnyAgent(Protocol):
         for name in ("observation", "action"):
             ours, theirs = getattr(self, f"{name}_space"), getattr(vector, f"{name}_space")
             if not spaces.same(ours, theirs, bounds=name == "action"):
-                raise ValueError(f"{source} has the {name} space {theirs}, and this agent was made for {ours}")
+                share = self.config.action_share if name == "action" else 1.0
+                limit = "" if share == 1.0 else f", limited by action_share={share}; leave it out to use all actions"
+                raise ValueError(f"{source} has the {name} space {theirs}, and this agent was made for {ours}{limit}")
 
     @abstractmethod
     def gradient_batch_size(self, n_envs: int) -> int:
