@@ -131,7 +131,7 @@ def test_the_paths_of_this_machine_stay_on_it(run, tmp_path):
         np.testing.assert_array_equal(pushed.get_parameters()[name], array)
 
 
-def test_models_of_stable_baselines3_are_pulled(server, capsys):
+def test_models_of_stable_baselines3_are_pulled(server, capsys, tmp_path, monkeypatch):
     server["me/theirs"] = {
         f"{name}{suffix}": (SB3 / f"ppo-normalized{suffix}").read_bytes()
         for name, suffix in (("model", ".zip"), ("vecnormalize", ".pkl"))
@@ -139,6 +139,10 @@ def test_models_of_stable_baselines3_are_pulled(server, capsys):
     assert main(["pull", "me/theirs", "--out", "here"]) == 0
     assert sorted(path.name for path in Path("here").rglob("*")) == ["model.zip", "vecnormalize.pkl"]
     assert "rejeu import" in capsys.readouterr().out
+    (tmp_path / "empty").mkdir()
+    monkeypatch.chdir(tmp_path / "empty")
+    assert main(["pull", "me/theirs", "--out", "."]) == 0
+    assert sorted(path.name for path in Path().iterdir()) == ["model.zip", "vecnormalize.pkl"]
 
 
 def test_refusals_are_one_line_and_leave_nothing(server, run, tmp_path, monkeypatch):

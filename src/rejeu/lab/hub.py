@@ -154,9 +154,9 @@ def pull(repo: str, out: str | Path | None = None) -> Path:
         for path in room.glob("*.zip"):
             with pickled.explained(path):
                 zip_files.read(path)
-        if out.exists():
-            out.rmdir()
-        room.rename(out)
+        out.mkdir(exist_ok=True)  # which may be the current folder, or a link to one
+        for path in room.iterdir():
+            path.rename(out / path.name)
     return out
 
 
