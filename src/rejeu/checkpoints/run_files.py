@@ -176,15 +176,14 @@ class CheckpointFolder:
                 header = checkpoint.read_header(path, "run")
             except CheckpointError:
                 continue
-            if header.get("run_id") != self.agent.identity.run_id:
-                raise FileExistsError(
-                    f"{self.folder} contains the checkpoints of another run; continue it with "
-                    f"{self.agent.name}.resume(folder), or give Checkpoint another folder"
+            is_other = header.get("run_id") != self.agent.identity.run_id
+            if is_other or (step_of(path) > step and not (resumed and resumed.skipped)):
+                checkpoints = (
+                    "the checkpoints of another run" if is_other else f"checkpoints after the agent's step {step}"
                 )
-            if step_of(path) > step and not (resumed and resumed.skipped):
                 raise FileExistsError(
-                    f"{path} is newer than the agent, which is at step {step}; continue from it with "
-                    f"{self.agent.name}.resume(folder), or give Checkpoint another folder to train on from step {step}"
+                    f"{self.folder} contains {checkpoints}; continue it with {self.agent.name}.resume(folder), or give "
+                    "Checkpoint another folder"
                 )
             return
 
