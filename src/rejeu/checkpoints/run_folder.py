@@ -124,9 +124,9 @@ def create(out: Path | None, env_id: str, algorithm: str, seed: int) -> RunFolde
 
 
 def check_free(out: Path | None) -> None:
-    """Raises ``FileExistsError`` if a run or a model may not be written there: nothing is ever overwritten."""
+    """Raises ``FileExistsError`` unless a folder is new or empty: nothing is ever overwritten."""
     if out is not None and out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise FileExistsError(f"--out {out} exists and is not an empty folder; name another, or remove it first")
+        raise FileExistsError(f"{out} exists and is not an empty folder; name another, or remove it first")
 
 
 def find_model(run: str | Path, which: Literal["best", "last"] = "best") -> Path:

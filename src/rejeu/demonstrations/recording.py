@@ -14,6 +14,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
+from rejeu.checkpoints.run_folder import check_free
 from rejeu.core import atomic
 from rejeu.core.errors import requires
 from rejeu.core.failed_writes import FailedWrites
@@ -55,8 +56,7 @@ class Recording:
         if fps is not None:
             ffmpeg()
         self.folder = as_path(folder).absolute()
-        if self.folder.exists() and (not self.folder.is_dir() or any(self.folder.iterdir())):
-            raise FileExistsError(f"{folder} exists and is not an empty folder; choose another one")
+        check_free(Path(folder))
         self.dataset_id = re.sub(r"[^\w/-]", "-", id_of(env)) + f"/{by}-v0"
         self.episodes = 0
         """Number of recorded episodes."""

@@ -9,6 +9,7 @@ from importlib.machinery import PathFinder
 from importlib.resources.abc import Traversable
 from pathlib import Path
 
+from rejeu.checkpoints.run_folder import check_free
 from rejeu.core import atomic
 from rejeu.core.types import JsonObject
 from rejeu.lab.cli.commands import New
@@ -21,8 +22,7 @@ NAME = "my_project"
 def run_new(arguments: New) -> tuple[int, JsonObject]:
     """Writes the project to a new folder and prints what to do next."""
     folder = arguments.folder
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise FileExistsError(f"{folder} exists and is not an empty folder; name a new one")
+    check_free(folder)
     paths = write(resources.files("rejeu.lab.cli") / "project", folder, package_name(folder))
     for path in paths:
         echo(str(path))
