@@ -49,6 +49,22 @@ class Counting:
         self.n = state["n"]
 
 
+def test_the_error_that_ended_training_is_told_with_a_later_one():
+    class Failing(Noting):
+        def after_training(self, agent, error):
+            super().after_training(agent, error)
+            raise OSError("no room")
+
+    notes = []
+    with pytest.raises(OSError, match="no room") as raised:
+        small_sac(BALL).learn(30, [Failing(notes, "a", raise_at=2), Noting(notes, "b")])
+    assert str(raised.value.__context__) == "stopped by the test"
+    assert [note for note in notes if "after" in note] == [
+        ("a", "after", "RuntimeError"),
+        ("b", "after", "RuntimeError"),
+    ]
+
+
 def test_callbacks_are_called_in_the_given_order_and_those_that_run_last_after_the_others():
     notes = []
     small_sac(BALL).learn(

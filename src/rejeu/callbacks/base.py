@@ -140,11 +140,11 @@ def listening(agent: Any, callbacks: Sequence[Callback]) -> Iterator[None]:
         yield
     except BaseException as raised:
         error = raised
-        raise
-    finally:
-        with ExitStack() as ends:
-            for training_callback in reversed(started):
-                ends.callback(training_callback.after_training, agent, error)
+    with ExitStack() as ends:
+        for training_callback in reversed(started):
+            ends.callback(training_callback.after_training, agent, error)
+        if error is not None:
+            raise error  # here, so that it is the context of an error in one of these
 
 
 def restore(agent: Any, callbacks: Sequence[Callback]) -> None:
