@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from rejeu.agents import Agent, load
 from rejeu.agents.exporting import export
+from rejeu.agents.policy import MOST_ENVS
 from rejeu.checkpoints.run_folder import RunFolder, find_model
 from rejeu.core import checkpoint, devices
 from rejeu.core.errors import CheckpointError
@@ -29,12 +30,10 @@ def run_evaluate(arguments: Evaluate) -> tuple[int, JsonObject]:
     """Evaluates an agent on whole episodes and prints the result."""
     devices.start_with("--device", arguments.device)
     episodes, minutes = arguments.episodes, arguments.minutes
-    if minutes is None and episodes is None:
-        episodes = 100
     model = find_model(arguments.run, arguments.best_or_last)
     environment = environment_of(model, arguments)
     agent = load(model, device=arguments.device)
-    n_envs = 16 if episodes is None else min(episodes, 16)
+    n_envs = min(episodes or MOST_ENVS, MOST_ENVS)
     with closing(environment.vector(n_envs, arguments.backend, arguments.seed)) as env:
         echo(f"{environment} on {env.backend}, {model}")
         evaluation = agent.evaluate(episodes, env=env, success_threshold=arguments.success_threshold, minutes=minutes)
