@@ -236,11 +236,7 @@ def normalizer_of(leaves: tuple[Leaf, ...], config: NormalizationConfig, gamma: 
 
 
 def normalized(
-    algorithm: Algorithm,
-    explorer: Explorer,
-    leaves: tuple[Leaf, ...],
-    config: NormalizationConfig,
-    gamma: float = 1.0,
+    algorithm: Algorithm, explorer: Explorer, leaves: tuple[Leaf, ...], config: NormalizationConfig, gamma: float = 1.0
 ) -> Algorithm:
     """Returns an algorithm on raw observations and rewards that keeps the statistics in its state.
 

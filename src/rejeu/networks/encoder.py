@@ -85,12 +85,7 @@ class CNN(eqx.Module):
     """Divisor of pixels."""
 
     def __init__(
-        self,
-        key: Array,
-        shape: tuple[int, ...],
-        design: Convolutions,
-        layer_norm: bool = False,
-        scale: float = 255.0,
+        self, key: Array, shape: tuple[int, ...], design: Convolutions, layer_norm: bool = False, scale: float = 255.0
     ) -> None:
         *layer_keys, linear_key = jax.random.split(key, len(design.layers) + 1)
         height, width, channels = image_shape(shape)

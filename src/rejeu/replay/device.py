@@ -271,18 +271,12 @@ class DeviceReplay:
             shape = jnp.broadcast_shapes(jnp.shape(low), jnp.shape(high))
             return low + below(jax.random.bits(jax.random.fold_in(key, next(numbers)), shape, jnp.uint32), high - low)
 
+        begin = lambda times: jnp.maximum(ring.begins[episode(times)], steps.oldest)  # noqa: E731
+        end = lambda times: jnp.minimum(ring.ends[episode(times)], newest)  # noqa: E731
+        goals_at = [ring.obs[leaf].__getitem__ for leaf in (self.achieved, self.desired)]
+        drawn = lambda: self.draw_rows(ring, key, len(rows.time))  # noqa: E731
         steps = HindsightSteps(
-            jnp,
-            rows.env,
-            rows.time,
-            newest,
-            self.rows,
-            lambda times: jnp.maximum(ring.begins[episode(times)], steps.oldest),
-            lambda times: jnp.minimum(ring.ends[episode(times)], newest),
-            integers,
-            lambda: self.draw_rows(ring, key, len(rows.time)),
-            self.positions,
-            (ring.obs[self.achieved].__getitem__, ring.obs[self.desired].__getitem__),
+            jnp, rows.env, rows.time, newest, self.rows, begin, end, integers, drawn, self.positions, goals_at
         )
         positions: Array = steps.chosen_by(strategy)
         return positions

@@ -133,11 +133,7 @@ class Ring:
         self._write_obs(index, obs, envs)
 
     def add(
-        self,
-        action: np.ndarray,
-        reward: np.ndarray,
-        terminated: np.ndarray,
-        next_obs: Observation,
+        self, action: np.ndarray, reward: np.ndarray, terminated: np.ndarray, next_obs: Observation
     ) -> tuple[np.ndarray, np.ndarray]:
         """Records one step of each environment, ``(n_envs, ...)``.
 

@@ -109,12 +109,7 @@ def untuned(algorithm: str, n_envs: int, observations: gym.Space) -> Mapping[str
 
 
 def make_config(
-    arguments: Train,
-    environment: Environment,
-    preset: Preset | None,
-    env: VectorEnv,
-    seed: int,
-    logs: tuple[str, ...],
+    arguments: Train, environment: Environment, preset: Preset | None, env: VectorEnv, seed: int, logs: tuple[str, ...]
 ) -> DecidedRun:
     """Returns the configuration of the run: the arguments, then the preset, then the defaults; raises as :func:`decide`."""
     run = replace(arguments, env=environment.env_id, n_envs=env.n_envs)

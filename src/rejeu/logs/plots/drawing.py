@@ -137,11 +137,7 @@ def add_title_and_legend(panel: Axes, title: str) -> None:
     labels = [textwrap.fill(label, round(LEGEND_CHARACTERS * width)) for label in labels]
     style: Settings = {"frameon": False, "fontsize": 8.5, "labelcolor": INK, "handlelength": 1.2}
     position: Settings = {"loc": "lower left", "bbox_to_anchor": (-0.01, 1.0), "borderaxespad": 0.2}
-    heading: Settings = {
-        "title": title,
-        "alignment": "left",
-        "title_fontproperties": {"size": 12, "weight": "bold"},
-    }
+    heading: Settings = {"title": title, "alignment": "left", "title_fontproperties": {"size": 12, "weight": "bold"}}
     legend = panel.legend(
         handles, labels, ncols=legend_columns(labels, width), columnspacing=1.4, **style, **position, **heading
     )
