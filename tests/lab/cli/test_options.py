@@ -16,6 +16,7 @@ from rejeu import demonstrations
 from rejeu.agents import zip_files
 from rejeu.agents.together import sibling
 from rejeu.checkpoints.run_folder import RunFolder
+from rejeu.core import checkpoint
 from rejeu.core.interrupt import Interrupt
 from rejeu.lab import hub
 from rejeu.lab.cli import clone, compare, courses, main, models, sweep, tune
@@ -104,10 +105,10 @@ def game():
     return SimpleNamespace(players=[SimpleNamespace(name="you", scores=[1.0, 3.0], mean=2.0, best=3.0, recording=None)])
 
 
-def test_watch_and_play(spy, monkeypatch, capsys):
+def test_watch_and_play(spy, capsys):
     found, watched, played = spy(models, "find_model"), spy(play, "watch", game()), spy(play, "play", game())
     spy(models, "load", "agent")
-    monkeypatch.setattr("rejeu.lab.cli.models.recorded_id", lambda model: TYPED)
+    spy(checkpoint, "read_header", {"env_id": TYPED})
     common = ["--seed", "5", "--fps", "20", "--episodes", "2", "--which", "last", "--json"]
     assert main(["watch", "run", "--env", TYPED, *common]) == 0
     assert includes(found, which="last")
@@ -117,7 +118,7 @@ def test_watch_and_play(spy, monkeypatch, capsys):
     assert main(["play", TYPED, "--keys", "a=0", "--record", "shown", "--against", "other", *common]) == 0
     assert includes(found, run=Path("other"), which="last")
     assert includes(played, keys={"a": 0}, seed=5, fps=20.0, episodes=2, record=Path("shown"), against="agent")
-    monkeypatch.setattr("rejeu.lab.cli.models.recorded_id", lambda model: "Acrobot-v1")
+    spy(checkpoint, "read_header", {"env_id": "Acrobot-v1"})
     assert main(["play", TYPED, "--against", "other"]) == 2
 
 
@@ -350,7 +351,7 @@ def test_clone(spy, tmp_path):
     spy(demonstrations, "check"), spy(demonstrations, "keeping_policy")
     found = spy(models, "find_model", "model")
     spy(models, "load", agent := mock.Mock(**{"learner.algorithm.recall": None}))
-    spy(models, "recorded_id", TYPED)
+    spy(checkpoint, "read_header", {"env_id": TYPED})
     argv = ["clone", "shown", "--env", TYPED, "--algo", "SAC", "--set", "gamma=0.5", "--updates", "7", "--seed", "5"]
     argv += ["--learning-rate", "0.1", "--evaluate-episodes", "6", "--device", "cpu", "--no-report", "--no-video"]
     with mock.patch.object(clone, "Checkpoint"):
@@ -370,7 +371,7 @@ def test_clone(spy, tmp_path):
     assert taught[-1]["expert"]("obs") == "action"
     agent.predict.assert_called_with("obs", deterministic=True)
     assert len(cloned) == len(offline) == 1
-    spy(models, "recorded_id", "Acrobot-v1")
+    spy(checkpoint, "read_header", {"env_id": "Acrobot-v1"})
     assert main([*argv, "--out", str(tmp_path / "c")]) == 2  # the expert plays another environment
     assert not (tmp_path / "c").exists()
 
