@@ -275,7 +275,7 @@ class DeviceReplay:
         end = lambda times: jnp.minimum(ring.ends[episode(times)], newest)  # noqa: E731
         goals_at = [ring.obs[leaf].__getitem__ for leaf in (self.achieved, self.desired)]
         drawn = lambda: self.draw_rows(ring, key, len(rows.time))  # noqa: E731
-        steps = HindsightSteps(
+        steps: HindsightSteps = HindsightSteps(
             jnp, rows.env, rows.time, newest, self.rows, begin, end, integers, drawn, self.positions, goals_at
         )
         positions: Array = steps.chosen_by(strategy)
