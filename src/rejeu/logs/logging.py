@@ -348,7 +348,7 @@ class Logger:
     def take(self) -> dict[str, float]:
         """Returns and clears the recorded metrics."""
         values, self.values, self.name_to_count = self.values, defaultdict(float), {}
-        return values
+        return dict(values)
 
     def dump(self, step: int = 0) -> None:
         """Writes the recorded metrics as a row, and clears them."""
