@@ -40,6 +40,26 @@ ENVIRONMENTS = {
     "RecurrentPPO": "rejeu/CartPoleNoVelocity-v0",
 }
 
+GOAL_SETTINGS = {
+    "FetchPush-v4": {
+        "FetchPush-v4-SAC": "mixed goals, the preset",
+        "choice/FetchPush-later-states": "later states",
+        "choice/FetchPush-demonstrations-later-states": "later states, demonstrations",
+        "choice/FetchPush-demonstrations-mix": "mixed goals, demonstrations",
+    },
+    "FetchPickAndPlace-v4": {
+        "FetchPickAndPlace-v4-SAC": "mixed goals, the preset",
+        "choice/FetchPickAndPlace-later-states": "later states",
+        "choice/FetchPickAndPlace-demonstrations-later-states": "later states, demonstrations",
+        "demonstrations/FetchPickAndPlace": "mixed goals, demonstrations",
+    },
+    "FetchSlide-v4 of EnvPool": {
+        "choice/FetchSlide-envpool": "mixed goals",
+        "choice/FetchSlide-future": "later states",
+    },
+}
+"""Settings whose success rates are drawn together: files of ``results/learning/goals``, and their labels."""
+
 
 def curve(steps: np.ndarray, returns: np.ndarray, grid: np.ndarray) -> list[float | None]:
     """Returns the mean of the latest episodes at each step of the grid, None before the first episode has ended."""
@@ -91,16 +111,15 @@ def plot(path: Path, published: list[dict[str, Any]]) -> None:
     style.save(figure, PICTURES / f"{data['algorithm']}.png")
 
 
-def plot_goals(panel: Any, title: str, folders: list[Path]) -> None:
+def plot_goals(panel: Any, title: str, labels: dict[Path, str]) -> None:
     """Plots the success rates of files of ``learning.py`` against steps: the mean of the seeds and their range."""
     style.format_axes(panel)
-    runs_by_path = {path: curved(path) for folder in folders for path in sorted(folder.glob("*.json"))}
-    for i, (path, runs) in enumerate((path, runs) for path, runs in runs_by_path.items() if runs):
+    runs_by_label = {label: runs for path, label in labels.items() if (runs := curved(path))}
+    for i, (label, runs) in enumerate(runs_by_label.items()):
         color, _ = style.GROUP_COLORS[i % len(style.GROUP_COLORS)]
         line = "-" if i < len(style.GROUP_COLORS) else "--"
         steps = [step for step, _ in runs[0]["success_curve"]]
         rates = np.array([[rate for _, rate in run["success_curve"]] for run in runs])
-        label = path.stem.removesuffix("-SAC") + " with demonstrations" * (path.parent.name == "demonstrations")
         panel.plot(steps, rates.mean(axis=0), line, color=color, label=f"{label} ({len(runs)})", marker=".")
         panel.fill_between(steps, rates.min(axis=0), rates.max(axis=0), color=color, alpha=0.15, linewidth=0)
     panel.set(xlabel="environment steps", ylabel="success rate", ylim=(0, 1.02))
@@ -134,11 +153,13 @@ def main() -> None:
     published = json.loads((RESULTS / "published.json").read_text(encoding="utf-8"))
     for path in sorted((RESULTS / "curves").glob("*.json")):
         plot(path, published)
-    figure = style.make_figure("success in goal environments", height=7.2)
-    above, below = figure.subplots(2, 1)
+    figure = style.make_figure("success in goal environments", height=12.0)
+    panels = figure.subplots(1 + len(GOAL_SETTINGS), 1)
     folder = RESULTS / "learning" / "goals"
-    plot_goals(above, "Presets (number of seeds)", [folder])
-    plot_goals(below, "What was compared (number of seeds)", [folder / "choice", folder / "demonstrations"])
+    presets_of = {path: path.stem.removesuffix("-SAC") for path in sorted(folder.glob("*.json"))}
+    plot_goals(panels[0], "Presets (number of curves)", presets_of)
+    for panel, (env_id, settings) in zip(panels[1:], GOAL_SETTINGS.items(), strict=True):
+        plot_goals(panel, env_id, {folder / f"{name}.json": label for name, label in settings.items()})
     style.save(figure, PICTURES / "goals.png")
     figure = style.make_figure("returns after equal time", height=7.2)
     shown = [("HalfCheetah-v5",), ("Hopper-v5",), ("Walker2d-v5",), ("Ant-v5", "-without-contact-forces")]
