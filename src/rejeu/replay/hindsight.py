@@ -409,8 +409,7 @@ class HerReplayBuffer(BaseReplayBuffer):
             return np.where((until_end > 0) | (ring.kind[position] == LAST), times + until_end, newest)
 
         def integers(low: np.ndarray, high: np.ndarray) -> np.ndarray:
-            shape = np.broadcast_shapes(np.shape(low), np.shape(high))
-            return low + (rng.random(shape) * (high - low)).astype(np.int64)
+            return low + (rng.random(np.broadcast(low, high).shape) * (high - low)).astype(np.int64)
 
         goals_at = [partial(ring.read_leaf, leaf) for leaf in (self.achieved, self.desired)]
         drawn = partial(ring.draw, rng, len(time))
