@@ -178,7 +178,7 @@ def test_a_hub_that_cannot_be_reached_is_one_line(server, monkeypatch):
 def test_a_folder_with_content_is_not_replaced(server):
     Path("full").mkdir()
     Path("full/file").touch()
-    with pytest.raises(FileExistsError, match="--out"):
+    with pytest.raises(FileExistsError, match="name another, or remove it first"):
         hub.pull("me/full")
 
 

@@ -99,7 +99,7 @@ def test_what_cannot_change_is_named_and_leaves_no_folder(run, tmp_path, capsys,
 
 def test_what_a_run_cannot_begin_from_is_named(run, tmp_path, capsys):
     assert "is no run folder" in error_of(capsys, "branch", str(tmp_path), "--at", "1")
-    assert "--out" in error_of(capsys, "branch", str(run), "--out", str(run))
+    assert "name another, or remove it first" in error_of(capsys, "branch", str(run), "--out", str(run))
     assert "must be a whole number of at least 0" in error_of(capsys, "branch", str(run), "--at", "-1")
     other = shutil.copytree(run, tmp_path / "other")
     for name in ("run_000000000000.safetensors", "run_000000000120.safetensors"):

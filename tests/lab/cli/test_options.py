@@ -78,7 +78,7 @@ def test_evaluate(spy):
     assert includes(made, n_envs=16)
     agent.evaluate.assert_called_with(None, env=env, success_threshold=3.0, minutes=2.0)
     assert main(argv) == 0
-    agent.evaluate.assert_called_with(100, env=env, success_threshold=3.0, minutes=None)
+    agent.evaluate.assert_called_with(None, env=env, success_threshold=3.0, minutes=None)
 
 
 def test_record(spy, tmp_path):
