@@ -139,6 +139,7 @@ def test_expln_continues_the_exponential_smoothly():
 
 def test_policy_parts_agree_with_the_agent():
     model = ppo(**SMALL)
+    assert model.policy.train(mode=False) is model.policy.eval() is model.policy.to(device="cpu") is model.policy
     biases = get_parameters_by_name(model.policy, ["bias"])
     assert 0 < len(biases) < len([*model.policy.parameters()])
     assert {array.ndim for array in biases} == {1}

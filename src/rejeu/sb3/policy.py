@@ -130,7 +130,7 @@ class BaseModel:
     def set_training_mode(self, mode: bool) -> None:
         """Does nothing: no layer of rejeu computes otherwise while it acts."""
 
-    def to(self, device: object = None) -> Self:
+    def to(self, *args: object, **kwargs: object) -> Self:
         """Returns itself: an agent stays on the device that it was made for, and is not told when it is trained."""
         return self
 
