@@ -156,7 +156,7 @@ def pull(repo: str, out: str | Path | None = None) -> Path:
                 zip_files.read(path)
         out.mkdir(exist_ok=True)  # which may be the current folder, or a link to one
         for path in room.iterdir():
-            shutil.move(path, out / path.name)
+            path.rename(out / path.name)
     return out
 
 
